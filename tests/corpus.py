@@ -38,8 +38,6 @@ from jcr.records import (
     Attempt,
     Capture,
     Intrinsics,
-    Pointmaps,
-    Tracks,
 )
 from jcr.records.npz import read_reconstruction, write_reconstruction
 from jcr.result import RunResult
@@ -47,7 +45,7 @@ from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
 from jcr.segments.segments import _read_names
-from scenes import cloud_of, pairs_of, reconstruction_of
+from scenes import NO_TRACKS, capture_of, cloud_of, maps_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
 
@@ -103,13 +101,9 @@ def small_capture(folder: Path, size=SIZE, count: int = COUNT, place: str = "ima
     for name in images:
         Image.fromarray(draw.integers(0, 255, (*size[::-1], 3), dtype=np.uint8)).save(folder / name)
     centre = (size[0] - 1) / 2, (size[1] - 1) / 2
-    capture = Capture(
-        folder=folder,
-        images=images,
-        base_from_gripper=hand_eye_problem(np.random.default_rng(0), count).base_from_gripper,
-        image_size=size,
-        intrinsics=Intrinsics(0.94 * size[0], 0.94 * size[0], *centre, *size, (0.01, 0.0, 0.0, 0.0, 0.0)),
-    )
+    intrinsics = Intrinsics(0.94 * size[0], 0.94 * size[0], *centre, *size, (0.01, 0.0, 0.0, 0.0, 0.0))
+    poses = hand_eye_problem(np.random.default_rng(0), count).base_from_gripper
+    capture = capture_of(poses, folder=folder, images=images, image_size=size, intrinsics=intrinsics)
     capture_json.write(folder, capture)
     return capture
 
@@ -210,21 +204,12 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     folder.mkdir()
     draw, shape = np.random.default_rng(3), (COUNT, SIZE[1], SIZE[0])
     assert capture.intrinsics is not None
+    seen = {"x_px": draw.random((2, 2)), "points_in_recon": draw.random((2, 3))}
     reconstruction = reconstruction_of(
         cameras,
         intrinsics=capture.intrinsics,
-        pointmaps=Pointmaps(
-            intrinsics=capture.intrinsics,
-            points_in_recon=draw.random((*shape, 3)).astype(np.float32),
-            confidence=np.ones(shape, np.float32),
-            colors=np.zeros((*shape, 3), np.uint8),
-        ),
-        tracks=Tracks(
-            image=np.zeros(2, int),
-            x_px=draw.random((2, 2)),
-            point=np.arange(2),
-            points_in_recon=draw.random((2, 3)),
-        ),
+        pointmaps=maps_of(draw.random((*shape, 3)).astype(np.float32), capture.intrinsics),
+        tracks=replace(NO_TRACKS, image=np.zeros(2, int), point=np.arange(2), **seen),
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
     layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]

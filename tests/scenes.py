@@ -10,8 +10,19 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.record import Calibration
 from jcr.geometry import apply, fit_similarity, inverse, transform
-from jcr.records import Capture, PointCloud, PosePairs, Reconstruction, Tracks
+from jcr.records import (
+    Capture,
+    Intrinsics,
+    PointCloud,
+    Pointmaps,
+    PosePairs,
+    Reconstruction,
+    RobotNoise,
+    Tracks,
+    Uncertainty,
+)
 from simulation.problems import INTRINSICS
 
 Change = Callable[[ndarray], ndarray]
@@ -44,6 +55,26 @@ def reconstruction_of(recon_from_camera: Float[ndarray, "n 4 4"], **facts: Any) 
     """Return a reconstruction with these cameras and no tracks, of every image of a capture."""
     usual = {"image_index": np.arange(len(recon_from_camera)), "intrinsics": INTRINSICS, "tracks": NO_TRACKS}
     return Reconstruction(recon_from_camera=recon_from_camera, **(usual | {"backend": "colmap"} | facts))
+
+
+def maps_of(points_in_recon: Float[ndarray, "m h w 3"], intrinsics: Intrinsics, **facts: Any) -> Pointmaps:
+    """Return black pointmaps at these points, all of them as sure as another."""
+    usual = {"confidence": np.ones(points_in_recon.shape[:3])}
+    usual |= {"colors": np.zeros(points_in_recon.shape, np.uint8)}
+    return Pointmaps(points_in_recon=points_in_recon, intrinsics=intrinsics, **(usual | facts))
+
+
+def no_depth(shape: tuple[int, ...]) -> dict[str, ndarray]:
+    """Return the layers of pointmaps in which no pixel has a depth."""
+    nothing = np.zeros(shape)
+    return {"confidence": nothing, "reason": nothing.astype(np.uint8), "depth_std": nothing}
+
+
+def hand_eye_of(on_gripper: Float[ndarray, "4 4"], **facts: Any) -> Calibration:
+    """Return a calibration without images, known exactly, whose recon frame is the base in metres."""
+    usual = {"scale": 1.0, "resting": np.eye(4), "uncertainty": Uncertainty(covariance=np.zeros((7, 7)))}
+    usual |= {"images": (), "robot_noise": RobotNoise(translation=0.0, rotation=0.0, estimated=False)}
+    return Calibration(on_gripper=on_gripper, **(usual | facts))
 
 
 def cloud_of(points_in_base: Float[ndarray, "n 3"], **facts: Any) -> PointCloud:

@@ -18,9 +18,9 @@ from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
 from jcr.pipeline import selection
 from jcr.reconstruct import ReconstructOptions
-from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
-from scenes import capture_of, reconstruction_of
+from scenes import capture_of, maps_of, no_depth, reconstruction_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 
@@ -41,16 +41,9 @@ def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Re
 
 def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
     """Pointmaps in which no pixel has a depth."""
-    nothing = np.zeros((len(made.image_index), 2, 2))
-    pointmaps = Pointmaps(
-        intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
-        points_in_recon=np.zeros((*nothing.shape, 3)),
-        confidence=nothing,
-        colors=np.zeros((*nothing.shape, 3), np.uint8),
-        reason=nothing.astype(np.uint8),
-        depth_std=nothing,
-    )
-    return replace(made, pointmaps=pointmaps)
+    shape = len(made.image_index), 2, 2
+    intrinsics = Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2)
+    return replace(made, pointmaps=maps_of(np.zeros((*shape, 3)), intrinsics, **no_depth(shape)))
 
 
 def auto_result(

@@ -19,7 +19,6 @@ from jcr.reconstruct import (
     tries,
     with_cameras_of,
 )
-from jcr.records import Capture
 from jcr.result import RunOptions
 from scenes import capture_of
 
@@ -98,25 +97,16 @@ def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, fla
 
 
 def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
-    capture = Capture(
-        folder=tmp_path,
-        images=("a.png",),
-        base_from_gripper=np.eye(4)[None],
-        image_size=(64, 48),
-        cameras=tmp_path / "sparse",
-    )
+    capture = capture_of(np.eye(4)[None], folder=tmp_path, cameras=tmp_path / "sparse")
     for options in (ReconstructOptions(), ReconstructOptions(backend="given"), ReconstructOptions(board="b")):
         assert with_cameras_of(capture, options) == replace(options, cameras=tmp_path / "sparse")
         assert candidates(with_cameras_of(capture, options))[0] == "given"
-    for options in (
-        ReconstructOptions(backend="colmap"),
-        ReconstructOptions(cameras=Path("mine")),
-    ):
+    for options in (ReconstructOptions(backend="colmap"), ReconstructOptions(cameras=Path("mine"))):
         assert with_cameras_of(capture, options) == options
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
-    capture = Capture(folder=tmp_path, images=(), base_from_gripper=np.zeros((0, 4, 4)), image_size=(64, 48))
+    capture = capture_of(np.zeros((0, 4, 4)), folder=tmp_path)
     for name in ("predictions", "cameras"):
         path = tmp_path / name
         path.write_text("one")

@@ -43,15 +43,9 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
         Path(file).parent.mkdir(parents=True, exist_ok=True)
         Path(file).write_bytes(b"image")
     other = CellCamera(name="fixed", mount="base", images=("fixed/0.png",), image_size=(64, 48))
-    capture = Capture(
-        folder=Path("cell"),
-        images=("images/0.png",),
-        base_from_gripper=np.eye(4)[None],
-        image_size=(64, 48),
-        urdf=Path("cell/robot.urdf"),
-        depths=("0.depth.png",),
-        others=(other,),
-    )
+    images = {"images": ("images/0.png",), "depths": ("0.depth.png",), "image_size": (64, 48)}
+    facts = {"folder": Path("cell"), "urdf": Path("cell/robot.urdf"), "others": (other,)}
+    capture = capture_of(np.eye(4)[None], **images, **facts)
     run = begun(Path("out"), capture, RunOptions(map=None))
     Path("out/report.html").write_text("")
     complete(run)

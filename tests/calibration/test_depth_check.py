@@ -19,8 +19,8 @@ from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
-from scenes import reconstruction_of
+from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
+from scenes import capture_of, maps_of, no_depth, reconstruction_of
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
@@ -48,15 +48,8 @@ def measured(
         write_bytes(folder / name, encode_png(np.rint(1e3 * depth).clip(0, 65535).astype(np.uint16)))
     gripper = base_from_camera @ inverse(X)
     gripper[:, :3, 3] += 3e-4 * draw.normal(size=(12, 3))
-    images = tuple(f"{k}.png" for k in range(12))
-    capture = Capture(
-        folder=folder,
-        images=images,
-        base_from_gripper=gripper,
-        image_size=(WIDTH, HEIGHT),
-        intrinsics=INTRINSICS,
-        depths=names,
-    )
+    facts = {"image_size": (WIDTH, HEIGHT), "intrinsics": INTRINSICS, "depths": names}
+    capture = capture_of(gripper, folder=folder, **facts)
     base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
     cameras = inverse(base_from_recon) @ base_from_camera
     cameras[:, :3, 3] /= SCALE
@@ -73,24 +66,10 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
     points = np.stack(
         [apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(INTRINSICS)[v, u], strict=True)]
     )
-    tracks = Tracks(
-        image=image,
-        x_px=np.stack([u, v], 1).astype(float),
-        point=np.arange(len(image)),
-        points_in_recon=points,
-    )
-    nothing = np.zeros(true.shape)
-    pointmaps = Pointmaps(
-        intrinsics=INTRINSICS,
-        points_in_recon=np.zeros((*true.shape, 3)),
-        confidence=nothing,
-        colors=np.zeros((*true.shape, 3), np.uint8),
-        reason=nothing.astype(np.uint8),
-        depth_std=nothing,
-    )
-    return reconstruction_of(
-        cameras, intrinsics=INTRINSICS, tracks=tracks, backend="cast", pointmaps=pointmaps
-    )
+    x_px, point = np.stack([u, v], 1).astype(float), np.arange(len(image))
+    tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
+    maps = maps_of(np.zeros((*true.shape, 3)), INTRINSICS, **no_depth(true.shape))
+    return reconstruction_of(cameras, intrinsics=INTRINSICS, tracks=tracks, backend="cast", pointmaps=maps)
 
 
 def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tuple):

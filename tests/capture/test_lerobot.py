@@ -164,7 +164,7 @@ def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: 
     assert not (tmp_path / "frames").exists()
 
 
-def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
+def test_damaged_sets_are_one_line(tmp_path: Path, small: Path):
     video, data = (
         "videos/chunk-000/observation.images.wrist/episode_000000.mp4",
         "data/chunk-000/episode_000000.parquet",

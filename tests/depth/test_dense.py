@@ -20,12 +20,11 @@ from jcr.records import (
     MATCHED,
     NO_DEPTH,
     PRIOR,
-    Capture,
     Intrinsics,
     Pointmaps,
     Tracks,
 )
-from scenes import reconstruction_of
+from scenes import capture_of, reconstruction_of
 
 pytestmark = pytest.mark.slow
 
@@ -96,12 +95,8 @@ def scene() -> Scene:
         image.append(np.full(len(seen), k))
         point.append(seen)
         x_px.append(np.stack([u, v], axis=-1)[seen])
-    tracks = Tracks(
-        image=np.concatenate(image),
-        x_px=np.concatenate(x_px),
-        point=np.concatenate(point),
-        points_in_recon=points,
-    )
+    image, x_px, point = map(np.concatenate, (image, x_px, point))
+    tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
     return Scene(np.stack(images), recon_from_camera, *map(np.stack, zip(*masks, strict=True)), tracks)
 
 
@@ -213,12 +208,7 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: Pointmaps) 
     scale, motion = 7.3, transform(rotation_exp(np.array([0.3, -1.1, 0.7])), np.array([2.0, -3.0, 1.0]))
     moved = motion @ scene.recon_from_camera
     moved[:, :3, 3] *= scale
-    tracks = Tracks(
-        image=scene.tracks.image,
-        x_px=scene.tracks.x_px,
-        point=scene.tracks.point,
-        points_in_recon=scale * apply(motion, scene.tracks.points_in_recon),
-    )
+    tracks = replace(scene.tracks, points_in_recon=scale * apply(motion, scene.tracks.points_in_recon))
     other = _dense(scene, moved, tracks)
     both = (dense.confidence > 0) & (other.confidence > 0)
     assert both.sum() > 0.97 * (dense.confidence > 0).sum()
@@ -235,12 +225,8 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
     names = tuple(f"{k}.png" for k in order)
     for name, image in zip(names, scene.images[order], strict=True):
         (tmp_path / name).write_bytes(encode_png(image))
-    capture = Capture(
-        folder=tmp_path,
-        images=names,
-        base_from_gripper=scene.recon_from_camera[order],
-        image_size=(PINHOLE.width, PINHOLE.height),
-    )
+    size = PINHOLE.width, PINHOLE.height
+    capture = capture_of(scene.recon_from_camera[order], folder=tmp_path, images=names, image_size=size)
     by_name = np.argsort(order)
     sparse = reconstruction_of(
         scene.recon_from_camera[order],

@@ -96,15 +96,8 @@ def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its
     # 1001 units of half a millimetre.
     assert set(depth_mm) <= {0, 500, 501}
     assert (intrinsics["fx"], intrinsics["cy"]) == (600.0, 242.0)
-    found = Intrinsics(
-        intrinsics["fx"],
-        intrinsics["fy"],
-        intrinsics["cx"],
-        intrinsics["cy"],
-        640,
-        480,
-        tuple(intrinsics["distortion"]),
-    )
+    sizes = (intrinsics[name] for name in ("fx", "fy", "cx", "cy"))
+    found = Intrinsics(*sizes, 640, 480, tuple(intrinsics["distortion"]))
     assert np.allclose(project(found, np.array(rays)), pixels, atol=0.05)
 
 

@@ -121,7 +121,7 @@ def test_the_page_says_when_the_requirement_is_met_and_stops_proposing(
 
 
 def test_a_capture_that_is_resumed_opens_without_a_red_message(
-    capture: tuple[LiveSession, Scripted], tmp_path: Path, tabletop: Path
+    capture: tuple[LiveSession, Scripted], tabletop: Path
 ):
     live, scripted = capture
     add(live, scripted, tabletop, 5)
@@ -200,7 +200,7 @@ def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], ta
         LiveServer(live, Listen(port=other.server_port))
 
 
-def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, Scripted], tabletop: Path):
+def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, Scripted]):
     live, _ = capture
     frame = next(iter(live.camera.frames))
     with LiveServer(live) as page:

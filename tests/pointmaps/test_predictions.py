@@ -20,6 +20,7 @@ from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import pairs_from_arrays
 from jcr.pointmaps.predictions import reconstruct_predictions
 from jcr.records import Capture, Intrinsics, Reconstruction
+from scenes import capture_of
 from simulation.pairs import synthetic_pairs
 
 COUNT, WIDTH, HEIGHT = 5, 128, 96
@@ -48,22 +49,15 @@ def truth() -> dict[str, Any]:
 @pytest.fixture
 def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
     """Images five times the size of the grid, with a intrinsics, taken by a camera on a gripper."""
-    names = tuple(f"{k}.png" for k in range(COUNT))
-    for k, name in enumerate(names):
-        Image.new("RGB", (5 * WIDTH, 5 * HEIGHT), (40 * k, 0, 0)).save(tmp_path / name)
+    for k in range(COUNT):
+        Image.new("RGB", (5 * WIDTH, 5 * HEIGHT), (40 * k, 0, 0)).save(tmp_path / f"{k}.png")
     gripper_from_camera = transform(
         Rotation.from_rotvec([0.2, 0.1, 1.5]).as_matrix(), np.array([0.03, 0.05, 0.1])
     )
     focal = 5 * truth["gt_focal"]
     intrinsics = Intrinsics(focal, focal, 2.5 * WIDTH + 2, 2.5 * HEIGHT + 2, 5 * WIDTH, 5 * HEIGHT)
-    base_from_gripper = truth["gt_poses"] @ inverse(gripper_from_camera)
-    return Capture(
-        folder=tmp_path,
-        images=names,
-        base_from_gripper=base_from_gripper,
-        image_size=(5 * WIDTH, 5 * HEIGHT),
-        intrinsics=intrinsics,
-    )
+    base_from_gripper, size = truth["gt_poses"] @ inverse(gripper_from_camera), (5 * WIDTH, 5 * HEIGHT)
+    return capture_of(base_from_gripper, folder=tmp_path, image_size=size, intrinsics=intrinsics)
 
 
 def pair_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:

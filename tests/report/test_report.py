@@ -27,7 +27,7 @@ from jcr.errors import RejectedError
 from jcr.estimation.observability import excitation
 from jcr.findings import no_reconstruction
 from jcr.geometry import inverse, transform
-from jcr.records import COVARIANCE_ORDER, Capture, CellCamera, Reconstruction, Tracks
+from jcr.records import COVARIANCE_ORDER, CellCamera, Reconstruction
 from jcr.report.html import report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
@@ -36,6 +36,7 @@ from jcr.rounding import decimals_of, significant
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.segments.tabletop import label_tabletop
+from scenes import NO_TRACKS, capture_of
 from simulation.truth import read_truth
 
 pytestmark = pytest.mark.slow
@@ -60,13 +61,8 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
     reported = truth.base_from_gripper.copy()
     reported[WRONG, :3, 3] += [0.05, 0.0, 0.03]
     intrinsics = truth.intrinsics
-    capture = Capture(
-        folder=folder,
-        images=tuple(names),
-        base_from_gripper=reported,
-        image_size=(intrinsics.width, intrinsics.height),
-        intrinsics=intrinsics,
-    )
+    size = intrinsics.width, intrinsics.height
+    capture = capture_of(reported, folder=folder, images=tuple(names), image_size=size, intrinsics=intrinsics)
     assert found.image_index[-1] == UNREGISTERED
     rows = np.arange(UNREGISTERED)
     reconstruction = replace(
@@ -262,13 +258,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
 
 
 def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult):
-    nothing = Tracks(
-        image=np.zeros(0, int),
-        x_px=np.zeros((0, 2)),
-        point=np.zeros(0, int),
-        points_in_recon=np.zeros((0, 3)),
-    )
-    page = with_reconstruction(run, replace(run.reconstruction, backend="marker", tracks=nothing))
+    page = with_reconstruction(run, replace(run.reconstruction, backend="marker", tracks=NO_TRACKS))
     ids = {a.get("id") for _, a in Elements(page).found}
     assert "map" not in ids and {"transform", "scene", "images", "residuals", "uncertainty"} < ids
     assert "predicted colour" not in page and "points as measured" not in page
@@ -329,7 +319,7 @@ def test_poses_to_add_are_in_the_notation_of_the_robot(
     assert (f"arm {robot}" if robot else "arm not named") in elements.text
 
 
-def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, tabletop: Path, run: RunResult):
+def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, tabletop: Path):
     scan = shrunk_capture(tabletop, tmp_path / "bin_picking", 3, 160)
     content = json.loads((scan / "capture.json").read_text())
     (scan / "capture.json").write_text(json.dumps(content | {"source": "a key of the user's own"}))

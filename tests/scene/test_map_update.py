@@ -23,14 +23,13 @@ from jcr.records import (
     MATCHED,
     PRIOR,
     Capture,
-    Pointmaps,
     Reconstruction,
-    RobotNoise,
     Tracks,
     Uncertainty,
 )
 from jcr.scene.cloud import LEAST_SURE, point_cloud
 from jcr.scene.options import CloudOptions, MapOptions
+from scenes import hand_eye_of, maps_of, reconstruction_of
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import shown_points
 from simulation.render import View, render
@@ -93,28 +92,14 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
     x = points_in_recon.reshape(-1, 3)[some]
     image, point, x_px = shown_points(x, recon_from_camera, [pinhole] * views, 0.0, np.random.default_rng(0))
     tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=x)
-    reconstruction = Reconstruction(
-        image_index=np.arange(views),
-        recon_from_camera=recon_from_camera,
-        intrinsics=truth.intrinsics,
-        pointmaps=Pointmaps(
-            intrinsics=pinhole,
-            points_in_recon=points_in_recon,
-            confidence=np.stack(confidence),
-            colors=np.stack(colors),
-        ),
-        tracks=tracks,
-        backend="truth",
-    )
-    hand_eye = Calibration(
-        on_gripper=truth.gripper_from_camera,
-        scale=SCALE,
-        resting=base_from_recon,
-        uncertainty=Uncertainty(covariance=1e-10 * np.eye(7)),
-        images=(),
-        robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
-    )
-    return reconstruction, hand_eye
+    maps = maps_of(points_in_recon, pinhole, confidence=np.stack(confidence), colors=np.stack(colors))
+    facts = {"intrinsics": truth.intrinsics, "tracks": tracks, "backend": "truth", "pointmaps": maps}
+    known = {
+        "scale": SCALE,
+        "resting": base_from_recon,
+        "uncertainty": Uncertainty(covariance=1e-10 * np.eye(7)),
+    }
+    return reconstruction_of(recon_from_camera, **facts), hand_eye_of(truth.gripper_from_camera, **known)
 
 
 def beside(truth: Truth, row: int, count: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 import scenes
-from jcr.calibration.record import Calibration
 from jcr.cli.use import sizes_lines
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
@@ -20,16 +19,13 @@ from jcr.records import (
     Capture,
     Intrinsics,
     PointCloud,
-    Pointmaps,
     Reconstruction,
-    RobotNoise,
-    Uncertainty,
 )
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
 from jcr.segments.segments import image_labels, label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
-from scenes import reconstruction_of
+from scenes import capture_of, hand_eye_of, maps_of, reconstruction_of
 
 NOISE = 5e-4
 UPRIGHT = np.eye(4)
@@ -222,13 +218,8 @@ PINHOLE = Intrinsics(60.0, 60.0, 19.5, 14.5, 40, 30)
 
 
 def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capture, Reconstruction]:
-    capture = Capture(
-        folder=folder,
-        images=("images/a.png", "images/b.png"),
-        base_from_gripper=np.stack([np.eye(4)] * 2),
-        image_size=(80, 60),
-        intrinsics=INTRINSICS,
-    )
+    images = {"images": ("images/a.png", "images/b.png"), "image_size": (80, 60), "intrinsics": INTRINSICS}
+    capture = capture_of(np.stack([np.eye(4)] * 2), folder=folder, **images)
     m = len(rows)
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
     points = np.concatenate([grid, np.full((30, 40, 1), 0.5)], -1)
@@ -236,12 +227,7 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
         np.stack([np.eye(4)] * m),
         intrinsics=INTRINSICS,
         image_index=np.array(rows),
-        pointmaps=Pointmaps(
-            intrinsics=PINHOLE,
-            points_in_recon=np.stack([points] * m),
-            confidence=np.ones((m, 30, 40)),
-            colors=np.zeros((m, 30, 40, 3), np.uint8),
-        ),
+        pointmaps=maps_of(np.stack([points] * m), PINHOLE),
     )
     (folder / "labels").mkdir(exist_ok=True)
     return capture, reconstruction
@@ -312,22 +298,13 @@ def test_label_images_that_cannot_be_used_are_named(
     assert read_labels(*labelled_capture(tmp_path, rows=(0,))) is not None
 
 
-def hand_eye() -> Calibration:
-    return Calibration(
-        on_gripper=np.eye(4),
-        scale=1.0,
-        resting=np.eye(4),
-        uncertainty=Uncertainty(covariance=np.zeros((7, 7))),
-        images=(),
-        robot_noise=RobotNoise(translation=0.0, rotation=0.0, estimated=False),
-    )
-
-
 def test_labels_are_asked_for_only_where_they_are_wanted(tmp_path: Path):
     capture, reconstruction = labelled_capture(tmp_path)
 
     def asked(segments) -> object:
-        return image_labels(capture, reconstruction, hand_eye(), SegmentOptions(segments=segments))
+        return image_labels(
+            capture, reconstruction, hand_eye_of(np.eye(4)), SegmentOptions(segments=segments)
+        )
 
     assert asked("auto") is None and asked("tabletop") is None and asked("none") is None
     with pytest.raises(InputError, match="holds no PNG"):
@@ -426,7 +403,7 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     labels = sam_labels(
         model,
         replace(reconstruction, pointmaps=replace(reconstruction.dense, colors=np.stack([image, image]))),
-        hand_eye(),
+        hand_eye_of(np.eye(4)),
     )
     assert labels[0].max() == len(labels[1]) - 1 > 0
     np.testing.assert_array_equal(labels[0][0], labels[0][1])

@@ -10,17 +10,10 @@ from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.estimation.pose_equations import fit_known_scale
 from jcr.geometry import apply, inverse, rotation_angle, rotation_log
-from simulation.arms import BentArm, error_names, hand_eye_on, table_center, views
+from simulation.arms import hand_eye_on, table_center, views
 from simulation.capture import SimulateOptions, simulate
 from simulation.problems import bent_problem
 from simulation.truth import read_truth, true_depth, true_labels
-
-
-def only(arm, name: str, value: float) -> BentArm:
-    names = error_names(arm)
-    errors = np.zeros(len(names))
-    errors[names.index(name)] = value
-    return BentArm(arm, errors)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)

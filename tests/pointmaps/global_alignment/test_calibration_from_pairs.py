@@ -22,6 +22,7 @@ from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.records import Capture, Reconstruction
 from jcr.records.npz import read_reconstruction, write_reconstruction
+from scenes import capture_of
 from simulation.pairs import PairErrors, synthetic_pairs
 
 SIZE = (48, 36)
@@ -78,13 +79,7 @@ def case(
     names = tuple(f"{k:02d}.png" for k in range(count))
     colors = np.zeros((count, SIZE[1], SIZE[0], 3), np.uint8)
     return Case(
-        Capture(
-            folder=Case.folder,
-            images=names,
-            base_from_gripper=poses,
-            image_size=SIZE,
-            intrinsics=truth.intrinsics,
-        ),
+        capture_of(poses, folder=Case.folder, images=names, image_size=SIZE, intrinsics=truth.intrinsics),
         PreparedImages(
             colors=colors,
             grid=ImageGrid(SIZE, SIZE, (0, 0), SIZE),
