@@ -249,6 +249,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
 def networks(folder: Path) -> dict[str, Target]:
     """Return predictions and weights of networks."""
     import torch
+    from safetensors.torch import save_file
 
     from jcr.hub import Weights
     from jcr.pointmaps.dust3r.weights import load_weights
@@ -258,10 +259,11 @@ def networks(folder: Path) -> dict[str, Target]:
     arrays = {name: np.zeros((*shape, 3), np.float32) for name in ("pts3d", "pts3d_in_other_view")}
     arrays |= {name: np.ones(shape, np.float32) for name in ("conf", "conf2")}
     np.savez(folder / "pairs.npz", edges=np.array([[0, 1], [1, 0]]), allow_pickle=False, **arrays)
-    torch.save({"model": {"weight": torch.zeros(4)}}, folder / "weights.pth")
+    save_file({"weight": torch.zeros(4)}, folder / "model.safetensors")
+    (folder / "config.json").write_text("{}")
     readers: dict[str, Read] = {
         "pairs.npz": lambda file: pairs_from_arrays(read_arrays(file), file.name),
-        "weights.pth": lambda file: load_weights(Weights(file, file.name, "unknown")),
+        "model.safetensors": lambda file: load_weights(Weights(file, file.name, "unknown")),
     }
     return {name: Target(folder / name, read) for name, read in readers.items()}
 

@@ -427,7 +427,7 @@ def network_weights(options: ReconstructOptions) -> Weights:
         found = f"only revision {other[0].parent.name[:12]} is" if other else "not"
         raise InputError(f"{name}: {found} on this machine; {weights_command(published)}")
     remedy = "give a file, a folder or a hub id (jcr models)"
-    if HUB_ID.fullmatch(name) and Path(name).suffix not in (".pth", ".pt", ".safetensors"):
+    if HUB_ID.fullmatch(name) and Path(name).suffix != ".safetensors":
         remedy = f"jcr models get {name} downloads them"
     raise InputError(f"--weights {name}: no such weights on this machine; {remedy}")
 

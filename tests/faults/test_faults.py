@@ -91,12 +91,6 @@ def pickled(path: Path) -> None:
     np.savez(path, edges=np.array([Evil(path.with_name("executed"))], dtype=object))
 
 
-def torch_pickled(path: Path) -> None:
-    import torch
-
-    torch.save({"model": {"a": torch.zeros(2)}, "args": Evil(path.with_name("executed"))}, path)
-
-
 def nothing(path: Path) -> None:
     """Change no file: the command itself is wrong."""
 
@@ -130,7 +124,6 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
         "a pipe or a device",
     ),
     "cloud that is a pipe": ("done/cloud.ply", pipe, "measure done", "a pipe or a device"),
-    "weights with code": ("w.pth", torch_pickled, f"{CALIBRATE} --backend dust3r --weights w.pth", r"w\.pth"),
     "predictions with code": ("pairs.npz", pickled, f"{CALIBRATE} --predictions pairs.npz", r"pairs\.npz"),
     "no such kind of board": ("out", nothing, f"{CALIBRATE} --board chess:9x6:0.025", "--board"),
 }

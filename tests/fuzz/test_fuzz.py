@@ -81,7 +81,7 @@ def test_every_target_reads_as_it_is(targets: dict[str, Target]):
         try:
             target.read(target.file)
         except InputError:
-            assert name == "weights.pth"  # of no network
+            assert name == "model.safetensors"  # of no network
         target.file.write_bytes(valid)  # a capture that is resumed is written again
 
 

@@ -15,7 +15,7 @@ from jcr.records import Intrinsics
 from simulation.pairs import write_pairs
 
 if TYPE_CHECKING:
-    from jcr.pointmaps.dust3r.weights import LoadedNetwork
+    from jcr.pointmaps.dust3r.network import Dust3r
 
 pytestmark = pytest.mark.slow
 
@@ -23,17 +23,17 @@ NAMES = ("a.png", "b.png", "c.png", "d.png")
 
 
 @pytest.fixture(scope="module")
-def loaded() -> "LoadedNetwork":
+def loaded() -> "Dust3r":
     import torch
 
     from jcr.pointmaps.dust3r.network import Dust3r
-    from jcr.pointmaps.dust3r.weights import LoadedNetwork
 
     torch.manual_seed(0)
     network = Dust3r(
         enc_embed_dim=32, enc_depth=2, enc_num_heads=2, dec_embed_dim=32, dec_depth=2, dec_num_heads=2
     )
-    return LoadedNetwork(network.eval().requires_grad_(False), is_metric=True)
+    network.is_metric = True
+    return network.eval().requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def images() -> PreparedImages:
     return PreparedImages(colors=colors, grid=grid, intrinsics_of_capture=None, pinhole=None)
 
 
-def predicted(loaded: "LoadedNetwork", images: PreparedImages) -> PairPredictions:
+def predicted(loaded: "Dust3r", images: PreparedImages) -> PairPredictions:
     from jcr.pointmaps.dust3r.dust3r import predict_pairs
 
     return predict_pairs(loaded, images, NAMES, complete_pairs(4))[0]
@@ -56,7 +56,7 @@ def test_pair_graphs() -> None:
 
 
 def test_each_pair_is_what_the_network_shows_of_its_two_images(
-    loaded: "LoadedNetwork", images: PreparedImages
+    loaded: "Dust3r", images: PreparedImages
 ) -> None:
     import torch
 
@@ -66,13 +66,13 @@ def test_each_pair_is_what_the_network_shows_of_its_two_images(
     tensors = (torch.from_numpy(images.colors).permute(0, 3, 1, 2) / 255 - 0.5) / 0.5
     for e, (first, second) in enumerate(pairs.edges):
         with torch.inference_mode():
-            view1, view2 = loaded.network(tensors[first, None], tensors[second, None])
+            view1, view2 = loaded(tensors[first, None], tensors[second, None])
         np.testing.assert_allclose(pairs.pts3d[e], view1.points[0], rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
 
 
 def test_a_batch_that_does_not_fit_is_halved_and_reported(
-    loaded: "LoadedNetwork", images: PreparedImages, monkeypatch: pytest.MonkeyPatch
+    loaded: "Dust3r", images: PreparedImages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 

@@ -11,9 +11,9 @@ from numpy import ndarray
 from jcr.allocator import give_back
 from jcr.errors import InputError, RejectedError
 from jcr.hub import Weights
-from jcr.pointmaps.dust3r.network import EncodedImages
+from jcr.pointmaps.dust3r.network import Dust3r, EncodedImages
 from jcr.pointmaps.dust3r.pair_graph import pairs_to_predict
-from jcr.pointmaps.dust3r.weights import LoadedNetwork, load_weights
+from jcr.pointmaps.dust3r.weights import load_weights
 from jcr.pointmaps.grid import PreparedImages, prepare_images
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
@@ -35,12 +35,12 @@ def reconstruct_dust3r(
 
     Raises InputError for images or weights that cannot be used.
     """
-    loaded = load_weights(weights, device)
+    network = load_weights(weights, device)
     images = prepare_images(capture)
     edges = pairs_to_predict(capture.base_from_gripper)
-    predictions, notes = predict_pairs(loaded, images, capture.images, edges, progress)
-    del loaded
-    give_back()  # the network's memory
+    predictions, notes = predict_pairs(network, images, capture.images, edges, progress)
+    del network
+    give_back()  # its memory
     notes = (weights.note, *notes)
     try:
         maps = align_pairs(predictions, images, progress)
@@ -51,7 +51,7 @@ def reconstruct_dust3r(
 
 
 def predict_pairs(
-    loaded: LoadedNetwork,
+    network: Dust3r,
     images: PreparedImages,
     names: tuple[str, ...],
     edges: Int[ndarray, "e 2"],
@@ -61,7 +61,7 @@ def predict_pairs(
 
     Where CUDA runs out of memory the batch is halved. Raises InputError where the memory does not suffice for one pair.
     """
-    network, report = loaded.network, progress or silent
+    report = progress or silent
     features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
     height, width = images.colors.shape[1:3]
     arrays = [np.empty((len(edges), height, width, *point), np.float32) for point in ((3,), ()) * 2]
@@ -96,7 +96,7 @@ def predict_pairs(
         colors=images.colors,
         intrinsics=images.intrinsics,
         grid=images.grid,
-        is_metric=loaded.is_metric,
+        is_metric=network.is_metric,
     )
     return predictions, notes
 

@@ -90,6 +90,8 @@ class Dust3r(nn.Module):
         self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
         self.mixed_precision: bool | None = None
         """Whether encoder, decoder and heads use bfloat16; None: where the device is CUDA."""
+        self.is_metric = False
+        """Whether its points are meant to be in metres."""
 
         self.patch_embed = PatchEmbed(enc_dim)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
