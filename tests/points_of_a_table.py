@@ -69,4 +69,4 @@ def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) ->
     """Return the pairs of all images, by these gripper poses."""
     matcher = matcher_of_points(features)
     names = [f"{k}.png" for k in range(IMAGES)]
-    return match_with_robot(matcher, base_from_gripper, INTRINSICS, names, (640, 480))
+    return match_with_robot(matcher, base_from_gripper, INTRINSICS, names)

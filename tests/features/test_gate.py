@@ -5,8 +5,8 @@ import pytest
 
 from jcr.estimation.closed_form import motions
 from jcr.features.gate import Pair, judge, rolls, rotation_of_x
+from jcr.features.matchers import hidden, still_cells
 from jcr.features.pairs import translation_of_x
-from jcr.features.stage import hidden, still_cells
 from jcr.features.two_view import TwoViewMotion, readings
 from jcr.geometry import rotation_angle, rotation_exp, transform
 from simulation.problems import HandEyeProblem, hand_eye_problem

@@ -1,7 +1,7 @@
 """Two-view geometries of matched keypoints by COLMAP's robust estimation, with all their readings, for any features."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.ndimage import binary_dilation, label
 
 from jcr.camera import HALF_PIXEL, unproject
 from jcr.features.gate import Key, Pair
@@ -24,6 +25,12 @@ MIN_INLIERS = 25
 """Least number of inliers; with COLMAP's 15 a view of a board was registered 30 cm off, by the wrong squares."""
 STATIONARY_PX = 4.0
 """Largest way of a match that keeps its pixel while the gripper moves: of its fingers, or text drawn into the images."""
+CELL_PX = 16
+NEAR_PX = 2.5
+"""Largest distance of a keypoint's positions in two images that counts as no motion."""
+LEAST_PAIRS, LEAST_SHARE = 4, 0.2
+"""Least number and share of the pairs with matches in a cell; by chance a point keeps its pixel in one or two."""
+LEAST_CELLS = 3
 
 
 @runtime_checkable
@@ -78,6 +85,8 @@ class Matcher:
         self._camera, self.known, self.seed = camera, known, seed
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
         """All matches of the pairs that were tried last, right or wrong."""
+        self.still: Bool[ndarray, "r c"] | None = None
+        """Cells of the image that do not move while the gripper does, whose matches are left out."""
         self._verified: dict[tuple[Key, bytes], pycolmap.TwoViewGeometry | None] = {}
         """Geometries by pair and matches."""
         self._pairs: dict[tuple[Key, int, Intrinsics], tuple[Pair, pycolmap.TwoViewGeometry]] = {}
@@ -112,15 +121,25 @@ class Matcher:
     ) -> pycolmap.TwoViewGeometry | None:
         """Return the geometry of some of a pair's matches, kept in memory; None where too few agree on one.
 
-        Matches that keep their pixel are left out where the gripper `moved`.
+        Matches that keep their pixel are left out where the gripper `moved`, and those in `still` cells.
         """
         if moved:
-            way = np.linalg.norm(x_px[key[0]][rows[:, 0]] - x_px[key[1]][rows[:, 1]], axis=1)
-            rows = rows[way > STATIONARY_PX]
+            x_i, x_j = (x_px[image][own] for image, own in zip(key, rows.T, strict=True))
+            rows = rows[np.linalg.norm(x_i - x_j, axis=1) > STATIONARY_PX]
         depends = key, np.ascontiguousarray(rows).tobytes()
         if depends not in self._verified:
             self._verified[depends] = matched(x_px, self._camera, key, rows, self.seed, self.known)
-        return self._verified[depends]
+        found = self._verified[depends]
+        if found is None or self.still is None:
+            return found
+        inliers = np.asarray(found.inlier_matches, dtype=int).reshape(-1, 2)
+        shown, usable = (
+            ~np.any(
+                [hidden(x_px[image][own], self.still) for image, own in zip(key, of.T, strict=True)], axis=0
+            )
+            for of in (inliers, rows)
+        )
+        return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return a geometry with its readings through the view's intrinsics, kept in memory."""
@@ -180,3 +199,39 @@ def matrices(
     if essential is None and found.F is not None:
         essential = k.T @ found.F @ k
     return essential, None if homography is None else np.linalg.inv(k) @ homography @ k
+
+
+def still_cells(
+    x_px: Sequence[Float[ndarray, "_ 2"]],
+    raw: Mapping[Key, Int[ndarray, "_ 2"]],
+    size: tuple[int, int],
+    moving: Iterable[Key],
+) -> Bool[ndarray, "r c"]:
+    """Return cells of the image in which matches keep their pixel in many of the `moving` pairs.
+
+    Such are the gripper's own fingers, a logo, text drawn into the images.
+    """
+    shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
+    kept, seen = np.zeros(shape), np.zeros(shape)
+    for key in moving:
+        rows = raw[key]
+        x_i, x_j = x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]
+        stays = np.linalg.norm(x_i - x_j, axis=1) < NEAR_PX
+        cells = _cells(x_i, shape)
+        for counts, some in ((seen, cells), (kept, cells[stays])):
+            counts[tuple(np.unique(some, axis=0).T)] += 1
+    still = (kept >= LEAST_PAIRS) & (kept > LEAST_SHARE * np.maximum(seen, 1))
+    parts = np.zeros(shape, dtype=np.int32)
+    label(still, structure=np.ones((3, 3)), output=parts)
+    still &= (np.bincount(parts.ravel()) >= LEAST_CELLS)[parts]
+    return binary_dilation(still, np.ones((3, 3))) if still.any() else still
+
+
+def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
+    """Test which keypoints lie in a part that does not move."""
+    return still[tuple(_cells(x_px, still.shape).T)]
+
+
+def _cells(x_px: Float[ndarray, "k 2"], shape: tuple[int, int]) -> Int[ndarray, "k 2"]:
+    """Return the row and column of the cell of each keypoint."""
+    return np.clip((x_px // CELL_PX).astype(int), 0, [shape[1] - 1, shape[0] - 1])[:, ::-1]

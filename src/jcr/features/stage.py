@@ -4,14 +4,13 @@ Pairs with little rotation between them are matched first; they give X's rotatio
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.ndimage import binary_dilation, find_objects, label
 
 from jcr.camera import guessed_intrinsics, unproject
 from jcr.estimation.closed_form import motions
@@ -26,7 +25,7 @@ from jcr.features.gate import (
     judge,
     rolls,
 )
-from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices
+from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices, still_cells
 from jcr.features.pairs import (
     FEW,
     FIRST_NEIGHBOURS,
@@ -56,12 +55,6 @@ LEAST_SUPPORT = 3.0
 """Pairs that must agree at the best one; with fewer any focal length does."""
 FOCAL_MATCHES = 200
 """Largest number of a pair's matches by which points in front of both cameras are counted."""
-CELL_PX = 16
-NEAR_PX = 2.5
-"""Largest distance of a keypoint's positions in two images that counts as no motion."""
-LEAST_PAIRS, LEAST_SHARE = 4, 0.2
-"""Least number and share of the pairs with matches in a cell; by chance a point keeps its pixel in one or two."""
-LEAST_CELLS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +80,6 @@ class _Search:
     repeats: Bool[ndarray, "n n"]
     """Pairs between whose images the gripper did not move."""
     pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
-    still: Bool[ndarray, "r c"] | None = None
-    """Parts of the image that do not move."""
     rotations: dict[Key, tuple[float, float]] = field(default_factory=dict)
     """Angles (rad) by which the images of each pair were rotated."""
     tried: set[tuple[int, int, int, int, bool]] = field(default_factory=set)
@@ -118,9 +109,8 @@ class _Search:
         if self.matcher.features.minds_roll:  # an image that is rotated brings keypoints of its own
             self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
-            clean = self._without_still(key, geometry)
-            if clean is not None and self._is_better(pair := self.matcher.pair(self.view, key, clean)):
-                self.pairs[key], self.rotations[key] = (pair, clean), todo[key]
+            if self._is_better(pair := self.matcher.pair(self.view, key, geometry)):
+                self.pairs[key], self.rotations[key] = (pair, geometry), todo[key]
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs rotated by multiples of 90° until X's rotation is known, and return the gate."""
@@ -155,29 +145,14 @@ class _Search:
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
         if not still.any():
             return
-        self.still = still
-        for key, (_, geometry) in list(self.pairs.items()):
-            clean = self._without_still(key, geometry)
-            if clean is None:
+        self.matcher.still = still
+        for key in list(self.pairs):
+            rows, moved = self.matcher.raw[key], not self.repeats[key]
+            geometry = self.matcher.verified(key, rows, self.view.x_px, moved)
+            if geometry is None:
                 del self.pairs[key]
-            elif clean is not geometry:
-                self.pairs[key] = self.matcher.pair(self.view, key, clean), clean
-
-    def _without_still(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
-        """Return the geometry, verified again without matches in parts that do not move."""
-        still = self.still
-        if still is None:
-            return geometry
-
-        def moves(rows: Int[ndarray, "m 2"]) -> Bool[ndarray, " m"]:
-            of_pair = zip(key, rows.T, strict=True)
-            dark = [hidden(self.view.x_px[image][own], still) for image, own in of_pair]
-            return ~(dark[0] | dark[1])
-
-        if moves(np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)).all():
-            return geometry
-        raw = self.matcher.raw[key]
-        return self.matcher.verified(key, raw[moves(raw)], self.view.x_px, not self.repeats[key])
+            else:
+                self.pairs[key] = self.matcher.pair(self.view, key, geometry), geometry
 
     def _is_better(self, new: Pair) -> bool:
         """Test whether a pair's new geometry is confirmed where the old one is not, or has more matches."""
@@ -236,19 +211,17 @@ def match_with_robot(
     base_from_gripper: Float[ndarray, "n 4 4"],
     intrinsics: Intrinsics,
     names: Sequence[str],
-    original: tuple[int, int],
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Matched:
     """Match pairs of images and return those that the gripper poses do not contradict.
 
-    `original` is the size of the images as they were taken, for notes. `intrinsics` are at the working size, and a first
-    guess unless the matcher's are known. Where X's rotation cannot be found from the pairs, the robot poses are not
-    used: they may be of another convention, or too few pairs match.
+    `intrinsics` are at the working size, and a first guess unless the matcher's are known. Where X's rotation cannot be
+    found from the pairs, the robot poses are not used: they may be of another convention, or too few pairs match.
     """
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    view = ImageGeometry.of(matcher.x_px, intrinsics)
+    matcher.still, view = None, ImageGeometry.of(matcher.x_px, intrinsics)
     search = _Search(matcher=matcher, motion=motion, view=view, repeats=repeats(motion))
     everything = all_pairs(n) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not features.minds_roll
@@ -277,10 +250,10 @@ def match_with_robot(
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
         kept, notes, warnings = _believed(search, found, names)
-    if search.still is not None:
-        place = _in_words(search.still, (intrinsics.width, intrinsics.height), original)
+    if matcher.still is not None:
+        percent = 100 * matcher.still.mean()
         notes += (
-            f"a part of the image does not move while the gripper does, fingers or a logo: {place} px: left out",
+            f"{percent:.0f} % of the image do not move while the gripper does, fingers or a logo: left out",
         )
     report(1.0)
     return Matched(geometries=kept, intrinsics=search.view.intrinsics, notes=notes, warnings=warnings)
@@ -329,56 +302,3 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
             if np.median(together) < math.radians(3):
                 stale.add(row)
     return stale
-
-
-def still_cells(
-    x_px: Sequence[Float[ndarray, "_ 2"]],
-    raw: Mapping[Key, Int[ndarray, "_ 2"]],
-    size: tuple[int, int],
-    moving: Iterable[Key],
-) -> Bool[ndarray, "r c"]:
-    """Return cells of the image in which matches keep their pixel in many of the `moving` pairs.
-
-    Such are the gripper's own fingers, a logo, text drawn into the images.
-    """
-    shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
-    kept, seen = np.zeros(shape), np.zeros(shape)
-    for key in moving:
-        rows = raw[key]
-        x_i, x_j = x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]
-        stays = np.linalg.norm(x_i - x_j, axis=1) < NEAR_PX
-        cells = _cells(x_i, shape)
-        for counts, some in ((seen, cells), (kept, cells[stays])):
-            counts[tuple(np.unique(some, axis=0).T)] += 1
-    still = (kept >= LEAST_PAIRS) & (kept > LEAST_SHARE * np.maximum(seen, 1))
-    parts = _parts(still)
-    still &= (np.bincount(parts.ravel()) >= LEAST_CELLS)[parts]
-    return binary_dilation(still, np.ones((3, 3))) if still.any() else still
-
-
-def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
-    """Test which keypoints lie in a part that does not move."""
-    return still[tuple(_cells(x_px, still.shape).T)]
-
-
-def _in_words(still: Bool[ndarray, "r c"], size: tuple[int, int], original: tuple[int, int]) -> str:
-    """Return the parts as text: rectangles in pixels of the original images."""
-    scale = np.array(original) / np.array(size)
-    places = []
-    for rows, columns in find_objects(_parts(still)):
-        left, top = (scale * CELL_PX * [columns.start, rows.start]).round().astype(int)
-        right, bottom = np.minimum(scale * CELL_PX * [columns.stop, rows.stop], original).round().astype(int)
-        places.append(f"x {left} to {right}, y {top} to {bottom}")
-    return "; ".join(places)
-
-
-def _parts(still: Bool[ndarray, "r c"]) -> Int[ndarray, "r c"]:
-    """Return cells numbered by the part that they belong to; 0 for none."""
-    parts = np.zeros(still.shape, dtype=np.int32)
-    label(still, structure=np.ones((3, 3)), output=parts)
-    return parts
-
-
-def _cells(x_px: Float[ndarray, "k 2"], shape: tuple[int, int]) -> Int[ndarray, "k 2"]:
-    """Return the row and column of the cell of each keypoint."""
-    return np.clip((x_px // CELL_PX).astype(int), 0, [shape[1] - 1, shape[0] - 1])[:, ::-1]

@@ -141,7 +141,6 @@ def matched_database(
             capture.base_from_gripper,
             resized(intrinsics, camera.width, camera.height),
             capture.images,
-            (intrinsics.width, intrinsics.height),
             lambda fraction: report("matching", fraction),
         )
         yield write_database(Path(folder), camera, matcher.x_px, matched.geometries), camera
@@ -209,7 +208,6 @@ def map_images(
         base_from_gripper,
         working,
         names,
-        (intrinsics.width, intrinsics.height),
         lambda fraction: report("matching", fraction),
     )
     matched = replace(found, geometries=_thinned(found.geometries, len(names), matcher.seed))
