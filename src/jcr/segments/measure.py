@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
@@ -69,7 +69,10 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
     # Seen from the others alone, the plane lies a little higher or lower.
-    plane_without = _without_each(x_in_support[support.on_plane, 2], cloud.image[support.on_plane])
+    off, shown_by = x_in_support[support.on_plane, 2], cloud.image[support.on_plane]
+    n = len(cloud.camera_centers_in_base)
+    total, count = np.bincount(shown_by, off, n), np.bincount(shown_by, minlength=n)
+    plane_without = (off.sum() - total) / np.maximum(len(off) - count, 1)
     bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
     sizes = []
     for label in np.unique(cloud.label):
@@ -84,7 +87,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
         for k in np.unique(image):
             if (image != k).sum() >= FEWEST:
                 part = _shape(x[image != k], support.roughness, rotation_rad)
-                parts.append([*part[4], part[0] - plane_without.get(k, 0.0)])
+                parts.append([*part[4], part[0] - plane_without[k]])
         size, jackknife = np.array([*sides, top]), np.zeros(3)
         if len(parts) > 1:
             jackknife = np.sqrt((len(parts) - 1) * np.var(parts, axis=0))
@@ -107,13 +110,6 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
             )
         )
     return Measurement(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
-
-
-def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> dict[int, float]:
-    """Return the mean of the values of all images but one, for each image left out."""
-    total, count = np.bincount(image, values), np.bincount(image)
-    left = len(values) - count
-    return {int(k): float((values.sum() - total[k]) / left[k]) for k in np.flatnonzero(count) if left[k] > 0}
 
 
 def _shape(

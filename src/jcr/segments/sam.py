@@ -19,7 +19,7 @@ from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.hub import cached_files
-from jcr.progress import Progress
+from jcr.progress import Progress, silent, steps
 from jcr.records import Reconstruction
 from jcr.segments.options import LabelImages
 
@@ -78,11 +78,9 @@ def sam_labels(
     progress: Progress | None = None,
 ) -> LabelImages:
     """Return labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
-    masks, dense = [], reconstruction.dense
-    for k, image in enumerate(dense.colors):
-        if progress:
-            progress("segment anything", k / len(dense.colors))
-        masks.append(image_masks(model, image))
+    dense = reconstruction.dense
+    images = steps(progress or silent, "segment anything", list(dense.colors))
+    masks = [image_masks(model, image) for image in images]
     x_in_base = hand_eye.base_from_recon(dense.points_in_recon.astype(np.float64))
     return merged(masks, x_in_base, dense.confidence > 0)
 
