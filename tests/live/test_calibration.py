@@ -90,16 +90,17 @@ def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path, mon
 
 
 @pytest.mark.slow
-def test_the_end_depends_neither_on_names_nor_on_the_order_of_the_images(small_capture: Path, tmp_path: Path):
-    capture = jcr.read_capture(small_capture)
-    batch = jcr.calibrate(small_capture, tmp_path / "batch")
+def test_the_end_depends_neither_on_names_nor_on_the_order_of_the_images(
+    small_capture: Path, small_done: Path, tmp_path: Path
+):
+    capture, batch = jcr.read_capture(small_capture), jcr.load_run(small_done)
     with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
         for k in (3, 0, 4, 2, 1):
             live.add(read_image(small_capture / capture.images[k]), capture.base_from_gripper[k])
         result = live.finish()
     assert batch.covariance is not None
     away = step_between(result.gripper_from_camera, batch.gripper_from_camera)
-    assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-5
+    assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-3, "the files round"
 
 
 @pytest.mark.slow
