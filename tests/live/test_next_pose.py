@@ -9,7 +9,7 @@ from numpy import ndarray
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.live.next_pose import AIMED, ELSEWHERE_M, Reach, propose
+from jcr.live.next_pose import AIMED, ELSEWHERE_M, propose
 from jcr.records import Capture, Uncertainty
 from scenes import capture_of
 from simulation.poses import looking_at
@@ -37,8 +37,7 @@ def next_pose(
     hand_eye: Calibration | None = None,
     refused: tuple[ndarray, ...] = (),
 ) -> ndarray:
-    reach = Reach(refused=refused)
-    return propose(capture, np.arange(registered), reach, hand_eye)["next_pose"].base_from_gripper
+    return propose(capture, np.arange(registered), hand_eye, refused=refused)["next_pose"].base_from_gripper
 
 
 def past_scene(base_from_gripper: ndarray) -> float:

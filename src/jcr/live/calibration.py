@@ -24,7 +24,7 @@ from jcr.estimation.prediction import FEWEST
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
-from jcr.live.next_pose import Reach, propose
+from jcr.live.next_pose import propose
 from jcr.live.progress import Progress
 from jcr.options import checked_options
 from jcr.records import Capture, Intrinsics, Tracks
@@ -200,7 +200,7 @@ class LiveCalibration:
 
         def propose_next() -> dict[str, Any]:
             """Return the next pose away from the gripper poses refused until now."""
-            return propose(capture, rows, Reach(arm, self._box, tuple(self._refused)), found, case)
+            return propose(capture, rows, found, case, arm=arm, box=self._box, refused=self._refused)
 
         self._propose = propose_next
         state = replace(state, registered=tuple(names[row] for row in rows), **self._propose())

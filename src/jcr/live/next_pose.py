@@ -1,6 +1,7 @@
 """Gripper pose that improves the calibration most, within reach and with an image that is likely to register."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -30,71 +31,64 @@ APART = np.radians(15.0)
 Poses = Float[ndarray, "k 4 4"]
 
 
-@dataclass(frozen=True)
-class Reach:
-    """Limits of the gripper poses that can be proposed."""
-
-    arm: Arm | None = None
-    """Arm within whose joint limits the poses are."""
-    box: Float[ndarray, "2 3"] | None = None
-    """Lower and upper corner (m, base frame) of gripper positions."""
-    refused: tuple[Float[ndarray, "4 4"], ...] = ()
-    """Gripper poses (base_from_gripper) at which no image was kept since the last one that was."""
-
-
 def propose(
     capture: Capture,
     registered: Int[ndarray, " m"],
-    reach: Reach,
     hand_eye: Calibration | None = None,
     case: Case | None = None,
+    *,
+    arm: Arm | None = None,
+    box: Float[ndarray, "2 3"] | None = None,
+    refused: Sequence[Float[ndarray, "4 4"]] = (),
 ) -> dict[str, Any]:
     """Return the next pose as fields of Progress; empty below two images.
 
     `registered` are the rows of the capture whose images registered; with fewer than two, all count as such. With a
-    sound calibration `case` the errors that it found are expected, else a usual robot and usual images.
+    sound calibration `case` the errors that it found are expected, else a usual robot and usual images. The pose is
+    within the joint limits of `arm` and in the `box` (m, base frame), and away from gripper poses that were `refused`.
     """
     if len(capture) < 2:
         return {}
-    poses, has_camera = capture.base_from_gripper, np.ones(len(capture), bool)
-    if len(registered) >= 2:
-        has_camera = np.isin(np.arange(len(capture)), registered)
-    rows, is_limited_by_rotation, best = np.flatnonzero(has_camera), True, None
+    poses, rows = capture.base_from_gripper, registered if len(registered) >= 2 else np.arange(len(capture))
+    has_camera, is_limited_by_rotation, best = np.isin(np.arange(len(capture)), rows), True, None
     if case is not None and case.hand_eye.is_sound:
         rows, required = registered[case.used], case.hand_eye.requirement
         assumptions, robot = assumptions_of(case), case.robot.of(case.used)
         best = next(iter(case.hand_eye.next_poses), None)
-        is_limited_by_rotation = (
-            best is not None and required is not None and required.reached_deg > required.rotation_deg
-        )
+        is_limited_by_rotation = bool(best and required and required.reached_deg > required.rotation_deg)
     else:
         assumptions, robot = _assumed(capture, poses[rows], hand_eye), errors_of(poses[rows])
+    x, known = assumptions.gripper_from_camera, poses[has_camera]
+    failed = np.concatenate([poses[~has_camera], np.reshape(refused, (-1, 4, 4))])
 
     def wanted(added: Poses, *, or_likely: bool = False) -> Bool[ndarray, " k"]:
-        """Test which poses are likely to register and, where that limits the accuracy, rotated enough.
+        """Test at which poses an image is likely to register and, where that limits the accuracy, rotated enough.
 
-        `or_likely`: where there are none, return which are likely to register.
+        The camera looks along nearly the same line as in an image that registered, and is not where an image did not;
+        after one that did not, `x` may be wrong, and the rotation of the gripper is compared. `or_likely`: where there
+        are none, return where an image is likely to register.
         """
-        likely = _is_likely(added, assumptions.gripper_from_camera, poses, has_camera, reach.refused)
-        found = likely
-        if is_limited_by_rotation:
-            found = likely & (_least_rotation(added, poses) >= APART)
+        cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
+        angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
+        if len(refused) or not has_camera[-1]:
+            angle = _least_rotation(added, known)
+        between = (added @ x)[:, None, :3, 3] - (failed @ x)[:, :3, 3]
+        likely = (angle < ALIKE) & (np.linalg.norm(between, axis=2).min(1, initial=np.inf) > ELSEWHERE_M)
+        found = likely & (_least_rotation(added, poses) >= APART) if is_limited_by_rotation else likely
         return found if found.any() or not or_likely else likely
 
-    is_free = reach.arm is None and reach.box is None
-    if best is not None and is_free and wanted(best.base_from_gripper[None])[0]:
+    if best is not None and arm is None and box is None and wanted(best.base_from_gripper[None])[0]:
         return {"next_pose": best}
-    count, joints = 1 if reach.arm is None else PROPOSALS, None
-    names = [capture.images[row] for row in rows]
-    is_likely = partial(wanted, or_likely=True)
-    added = better_poses(assumptions, poses[rows], robot, count, reach.box, is_likely=is_likely)
-    if reach.arm is not None:
+    count, joints, is_likely = 1 if arm is None else PROPOSALS, None, partial(wanted, or_likely=True)
+    added = better_poses(assumptions, poses[rows], robot, count, box, is_likely=is_likely)
+    if arm is not None:
         recorded = None if capture.joints is None else capture.joints[rows]
         for pose in added:
-            if (joints := joints_at(reach.arm, poses[rows], recorded, pose)) is not None:
+            if (joints := joints_at(arm, poses[rows], recorded, pose)) is not None:
                 added = pose[None]
                 break
     predicted = predictions(assumptions, poses[rows], robot, added)
+    names = [capture.images[row] for row in rows]
     return {"next_pose": next_poses(poses[rows], names, added[:1], predicted)[0], "next_joints": joints}
 
 
@@ -110,28 +104,6 @@ def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibra
         if std[:3].max() < AIMED[0] and std[3:6].max() < AIMED[1]:
             return replace(assumptions, gripper_from_camera=x, distance_m=median_distance(poses @ x))
     return assumptions
-
-
-def _is_likely(
-    added: Poses,
-    x: Float[ndarray, "4 4"],
-    poses: Float[ndarray, "n 4 4"],
-    has_camera: Bool[ndarray, " n"],
-    refused: tuple[Float[ndarray, "4 4"], ...],
-) -> Bool[ndarray, " k"]:
-    """Test which gripper poses are likely to give an image that registers, by gripper_from_camera `x`.
-
-    The camera looks along nearly the same line as in an image that registered, and is not where an image did not.
-    After an image that did not register `x` may be wrong; then the rotation of the gripper is compared.
-    """
-    known, failed = poses[has_camera], np.concatenate([poses[~has_camera], np.reshape(refused, (-1, 4, 4))])
-    if len(refused) or not has_camera[-1]:
-        angle = _least_rotation(added, known)
-    else:
-        cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
-        angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
-    between = (added @ x)[:, None, :3, 3] - (failed @ x)[:, :3, 3]
-    return (angle < ALIKE) & (np.linalg.norm(between, axis=2).min(1, initial=np.inf) > ELSEWHERE_M)
 
 
 def _least_rotation(added: Poses, known: Float[ndarray, "n 4 4"]) -> Float[ndarray, " k"]:
