@@ -28,7 +28,6 @@ from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
 from .live.progress import Progress as Progress
 from .live.robot import RobotState as RobotState
-from .live.server import Listen as Listen
 from .live.server import LiveServer as LiveServer
 from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions

@@ -18,7 +18,7 @@ from chromium import Chromium
 from jcr.capture.images import read_image
 from jcr.live.progress import Notation, progress_lines
 from jcr.live.robot import RobotState
-from jcr.live.server import Listen, LiveServer
+from jcr.live.server import LiveServer
 from jcr.live.session import LiveSession
 from jcr.records import NextPose
 from scripted_capture import Scripted, a_capture, still_frames
@@ -197,7 +197,7 @@ def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], ta
     other = LiveServer(live)
     assert other.key != page.key and len(other.key) >= 22
     with pytest.raises(jcr.InputError, match="--page-port"), other:
-        LiveServer(live, Listen(port=other.server_port))
+        LiveServer(live, port=other.server_port)
 
 
 def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, Scripted]):

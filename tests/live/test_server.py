@@ -21,7 +21,7 @@ import pytest
 import jcr
 from jcr.capture.images import read_image
 from jcr.live.robot import RobotState
-from jcr.live.server import MAX_SAMPLE, Listen, LiveServer
+from jcr.live.server import MAX_SAMPLE, LiveServer
 from places import ROOT
 from scripted_capture import a_capture, poses, still_frames, video
 
@@ -44,7 +44,7 @@ def serving(tmp_path: Path, tabletop: Path) -> Callable[..., Any]:
             return {"accepted": True, "done": False}
 
         session.take = take  # pyright: ignore[reportAttributeAccessIssue]
-        with LiveServer(session, Listen(**listen), takes_samples=True) as server:
+        with LiveServer(session, **listen, takes_samples=True) as server:
             yield server, taken
 
     return served
@@ -119,13 +119,13 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
 
 
 def test_other_machines_need_a_token_and_the_name_of_the_host(serving: Callable[..., Any]):
-    with pytest.raises(jcr.InputError, match="set a token"):
-        Listen("192.168.0.5", 7464, None, "--listen")
-    for host in ("0.0.0.0", "::", ""):
-        with pytest.raises(jcr.InputError, match="names no host"):
-            Listen(host, 7464, "sesame", "--listen")
-    with pytest.raises(jcr.InputError, match="letters, digits"):
-        Listen(token="a key")
+    for words, listen in (
+        ("set a token", {"host": "192.168.0.5", "port": 7464}),
+        *(("names no host", {"host": host, "token": "sesame"}) for host in ("0.0.0.0", "::", "")),
+        ("letters, digits", {"token": "a key"}),
+    ):
+        with pytest.raises(jcr.InputError, match=words), serving(**listen):
+            pass
     with serving(host="127.0.0.2", token="sesame") as (server, taken):
 
         def status(host: str, key: str = "sesame") -> int:

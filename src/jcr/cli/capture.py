@@ -104,14 +104,14 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
     from jcr.live.calibration import LiveCalibration
     from jcr.live.folder import LiveFolder
-    from jcr.live.server import Listen, LiveServer
+    from jcr.live.server import LOOPBACK, LiveServer
 
     options, token = arguments.session, arguments.token or os.environ.get("JCR_TOKEN") or None
     if options.until_accurate and options.require is None:
         raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-    states, listen = states_of(arguments.poses), Listen(port=arguments.page_port, token=token)
+    states, address = states_of(arguments.poses), (LOOPBACK, arguments.page_port)
     if arguments.listen is not None:
-        listen = Listen(*address_of(arguments.listen, 7464, "--listen "), token, "--listen")
+        address = address_of(arguments.listen, 7464, "--listen ")
     source = arguments.intrinsics_from
     given = None if source is None else read_intrinsics(source)
     if states is None and arguments.poses not in ("typed", "http"):
@@ -133,7 +133,7 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
         notation = Notation(convention, arguments.pose_units, calibration.arm)
         session = LiveSession(calibration, camera, options, tell, notation, gripper)
         try:
-            with LiveServer(session, listen, arguments.poses == "http") as server:
+            with LiveServer(session, *address, token, arguments.poses == "http") as server:
                 _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
                 session.run(_source(arguments, session, states, server))
                 result = session.finish()

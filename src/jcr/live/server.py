@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -51,34 +50,6 @@ HEADERS = {
 }
 
 
-@dataclass(frozen=True)
-class Listen:
-    """Address, port and key of the server."""
-
-    host: str = LOOPBACK
-    """Loopback, or the one host name that is answered; any other than loopback needs a token."""
-    port: int = 0
-    """0: any free port."""
-    token: str | None = None
-    """Key of the session; None: a random one."""
-    option: str = "--page-port"
-    """Option that the user gave, for messages."""
-
-    def __post_init__(self) -> None:
-        """Raise InputError where the address would be open to others or cannot be named."""
-        if self.token is not None and not re.fullmatch(r"[\w.~-]+", self.token, re.ASCII):
-            raise InputError(
-                "--token: has characters that an address cannot have; use letters, digits, - and _"
-            )
-        where, is_any_host = f"{self.option} {self.host}:{self.port}", self.host == ""
-        with suppress(ValueError):
-            is_any_host |= ipaddress.ip_address(self.host).is_unspecified
-        if is_any_host:
-            raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
-        if self.option == "--listen" and self.token is None:
-            raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
-
-
 class _Command(BaseModel):
     """Command of the page."""
 
@@ -93,23 +64,40 @@ class LiveServer(ThreadingHTTPServer):
     daemon_threads = False
 
     def __init__(
-        self, session: LiveSession, listen: Listen | None = None, takes_samples: bool = False
+        self,
+        session: LiveSession,
+        host: str = LOOPBACK,
+        port: int = 0,
+        token: str | None = None,
+        takes_samples: bool = False,
     ) -> None:
-        """Bind the address; raise InputError where that fails. `takes_samples`: programs post gripper poses."""
-        listen = listen or Listen()
-        self.session, self.key, self.host = session, listen.token or secrets.token_urlsafe(16), listen.host
+        """Bind the address; raise InputError where that fails, or the address would be open to others.
+
+        `host` is loopback, or the one host name that is answered, which needs a `token`, the key of the session; None:
+        a random one. `port` 0 is any free one. `takes_samples`: programs post gripper poses.
+        """
+        if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
+            raise InputError(
+                "--token: has characters that an address cannot have; use letters, digits, - and _"
+            )
+        where = f"{'--page-port' if host == LOOPBACK else '--listen'} {host}:{port}"
+        is_any_host = host == ""
+        with suppress(ValueError):
+            is_any_host |= ipaddress.ip_address(host).is_unspecified
+        if is_any_host:
+            raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
+        if host != LOOPBACK and token is None:
+            raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
+        self.session, self.key, self.host = session, token or secrets.token_urlsafe(16), host
         self.takes_samples = takes_samples
         self.sampled_s = time.monotonic()
         """Time of the last sample; infinite while one is answered."""
         self._page_version, self._page_s = -1, -np.inf
         """Version of the state that the page has, and the time of its last request."""
         try:
-            super().__init__((self.host, listen.port), _Handler)
+            super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
-            raise InputError(
-                f"{listen.option} {listen.host}:{listen.port}: {error}; choose an address of this machine "
-                "and a free port"
-            ) from None
+            raise InputError(f"{where}: {error}; choose an address of this machine and a free port") from None
         names = (LOOPBACK, "localhost") if self.host == LOOPBACK else (self.host,)
         self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
         """Accepted values of the header Host."""
