@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
-from jcr.scene.fields import Field, Fields, FieldShape, Lattice
+from jcr.scene.fields import Field, Fields, Lattice
 from jcr.scene.options import MapOptions
 from jcr.scene.paper import train_paper
 from jcr.scene.scene_map import SceneMap
@@ -67,13 +67,12 @@ def build_scene(
             rays = workspace_rays(cloud, values or {}, box, cell, device)
             heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
             heads |= {"label": len(cloud.label_names)} if "label" in rays.targets else {}
-            shapes = (
-                FieldShape({"occupancy": 1}, HIDDEN, grids=OCCUPANCY_GRIDS),
-                FieldShape(heads, HIDDEN, grids=SURFACE_GRIDS),
-            )
             lattices, generator = feature_lattices(seen), torch.Generator().manual_seed(options.map_seed)
-            untrained = [Field(shape, seen.box, lattices, generator) for shape in shapes]
-            fields = Fields(untrained, lattices).to(device)
+            occupancy, surface = (
+                Field(own, HIDDEN, seen.box, lattices, grids=grids, generator=generator)
+                for own, grids in (({"occupancy": 1}, OCCUPANCY_GRIDS), (heads, SURFACE_GRIDS))
+            )
+            fields = Fields([occupancy, surface], lattices).to(device)
 
             def fit(field: Field) -> int:
                 """Train a field and return the number of steps."""

@@ -4,28 +4,14 @@ Positions are metres of the base frame; each encoding scales them by itself.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-
-@dataclass(frozen=True)
-class FieldShape:
-    """Architecture of a field, from which it is built before its weights are loaded."""
-
-    heads: dict[str, int]
-    """Property and its number of outputs."""
-    hidden: int
-    frequencies: int = 0
-    """Frequencies of the sinusoidal encoding; 0 for feature grids."""
-    grids: tuple[tuple[int, int], ...] = ()
-    """(lattice, features) of each feature grid."""
 
 
 class Lattice(nn.Module):
@@ -129,36 +115,38 @@ class Field(nn.Module):
 
     def __init__(
         self,
-        shape: FieldShape,
+        heads: Mapping[str, int],
+        hidden: int,
         box: Float[Tensor, "2 3"],
-        lattices: Sequence[Lattice],
+        lattices: Sequence[Lattice] = (),
+        frequencies: int = 0,
+        grids: Sequence[tuple[int, int]] = (),
         generator: torch.Generator | None = None,
     ) -> None:
-        """Initialise the layers from `generator`."""
+        """Initialise the layers from `generator`: `heads` are properties and their numbers of outputs.
+
+        The encoding has sinusoids of so many `frequencies`, or features of `grids`: (row of `lattices`, features).
+        """
         super().__init__()
-        self.shape = shape
+        self.about = {"heads": heads, "hidden": hidden, "frequencies": frequencies, "grids": grids}
         # One scale for all axes: the longest side of the box spans [-1, 1].
         scale = 2.0 / (box[1] - box[0]).max()
-        frequency = scale * math.pi * 2.0 ** torch.arange(shape.frequencies, device=box.device)
+        frequency = scale * math.pi * 2.0 ** torch.arange(frequencies, device=box.device)
         self.register_buffer("frequency", frequency, persistent=False)
         self.register_buffer("center", box.mean(0), persistent=False)
-        self._lattices = [lattices[k] for k, _ in shape.grids]
-        features = [n for _, n in shape.grids]
+        self._lattices = [lattices[k] for k, _ in grids]
         tables = (
-            torch.zeros(len(lattice.nodes) + 1, n, device=lattice.lower.device)
-            for lattice, n in zip(self._lattices, features, strict=True)
+            torch.zeros(len(lattices[k].nodes) + 1, n, device=lattices[k].lower.device) for k, n in grids
         )
         self.encoding = nn.ModuleDict({"tables": nn.ParameterList(tables)})
         self._dense: list[Tensor] | None = None
-        self.hidden = linear(sum(features, 6 * shape.frequencies), shape.hidden, generator)
-        self.heads = nn.ModuleDict(
-            {name: linear(shape.hidden, n, generator) for name, n in shape.heads.items()}
-        )
+        self.hidden = linear(sum((n for _, n in grids), 6 * frequencies), hidden, generator)
+        self.heads = nn.ModuleDict({name: linear(hidden, n, generator) for name, n in heads.items()})
         # Mean and deviation of plain values, whose unit is anyone's: the heads learn them standardised.
         self.standard = nn.ParameterDict(
             {
                 name: nn.Parameter(torch.tensor([[0.0], [1.0]]).repeat(1, n), requires_grad=False)
-                for name, n in shape.heads.items()
+                for name, n in heads.items()
                 if name not in ("occupancy", "label")
             }
         )
@@ -184,7 +172,7 @@ class Field(nn.Module):
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Return the features (f,n) of points: of lattices, or sin and cos of 2^k·π·x (Mildenhall 2020, eq. 4)."""
-        if self.shape.frequencies:
+        if len(self.frequency):
             angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
             return torch.cat([angle.sin(), angle.cos()])
         if self._dense is None:
@@ -209,21 +197,18 @@ class Field(nn.Module):
 class Fields(nn.Module):
     """All fields of a map, one for all properties or one for each, and the lattices they share."""
 
+    of: Iterable[Field]
+    """The fields."""
+
     def __init__(self, fields: Sequence[Field], lattices: Sequence[Lattice] = ()) -> None:
         super().__init__()
-        self.lattices = nn.ModuleList(lattices)
-        self.of = nn.ModuleList(fields)
-
-    @property
-    def shapes(self) -> list[FieldShape]:
-        """Architecture of each field."""
-        return [cast(Field, field).shape for field in self.of]
+        self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
         """Return the outputs (n, outputs) of the named heads at points (n,3)."""
         out: dict[str, Tensor] = {}
-        for shape, field in zip(self.shapes, self.of, strict=True):
-            if not shape.heads.keys().isdisjoint(names):
+        for field in self.of:
+            if not field.heads.keys().isdisjoint(names):
                 out |= field(x_in_base)
         return {name: out[name] for name in names}
 

@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 
 from jcr.records import PointCloud
-from jcr.scene.fields import Field, FieldShape
+from jcr.scene.fields import Field
 from jcr.scene.train import rows_inside, workspace_box
 
 FREQUENCIES, HIDDEN, BATCH, RATE = 10, 256, 6144, 5e-3
@@ -19,7 +19,7 @@ class PaperField(Field):
 
     def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
         """Initialise the layers of one property from `generator`; positions are scaled by `box` (2,3) m."""
-        super().__init__(FieldShape({name: outputs}, HIDDEN, FREQUENCIES), box, [], generator)
+        super().__init__({name: outputs}, HIDDEN, box, frequencies=FREQUENCIES, generator=generator)
 
 
 def train_paper(

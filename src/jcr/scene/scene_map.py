@@ -4,11 +4,10 @@ import copy
 import json
 import threading
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Field, Fields, FieldShape, Lattice, in_chunks
+from jcr.scene.fields import Field, Fields, Lattice, in_chunks
 from jcr.scene.robot import JointValues, RobotSpheres, load_robot
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
@@ -144,11 +143,11 @@ class SceneMap:
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
         """Preset, steps and seconds of the training."""
-        self.properties = tuple(name for shape in fields.shapes for name in shape.heads)
+        self.properties = tuple(name for field in fields.of for name in field.heads)
         """Properties of the fields: occupancy, color, and label or further values where they were given."""
-        for shape, field in zip(fields.shapes, fields.of, strict=True):
-            if "occupancy" in shape.heads and shape.grids:
-                cast(Field, field).expand()
+        for field in fields.of:
+            if "occupancy" in field.heads and len(field.tables):
+                field.expand()
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
 
@@ -321,7 +320,7 @@ class SceneMap:
     def save(self, path: Path) -> None:
         """Write the map whole or not at all."""
         about = {
-            "fields": [asdict(shape) for shape in self.fields.shapes],
+            "fields": [field.about for field in self.fields.of],
             "lattices": [(lattice.cell, lattice.shape) for lattice in self.fields.lattices],
             "label_names": self.label_names,
             "cell": self.seen.cell,
@@ -349,11 +348,7 @@ def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> Scene
         Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
         for k, (cell, shape) in enumerate(about["lattices"])
     ]
-    shapes = [
-        FieldShape(**shape | {"grids": tuple((lattice, n) for lattice, n in shape["grids"])})
-        for shape in about["fields"]
-    ]
-    fields = Fields([Field(shape, seen.box, lattices) for shape in shapes], lattices)
+    fields = Fields([Field(**of, box=seen.box, lattices=lattices) for of in about["fields"]], lattices)
     fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
     return SceneMap(fields, seen, tuple(about["label_names"]), about["history"])
 
