@@ -59,7 +59,6 @@ from jcr.records import (
     Requirement,
     RobotErrors,
     RobotNoise,
-    ScaleCheck,
     Uncertainty,
     WithGivenIntrinsics,
 )
@@ -266,8 +265,6 @@ class Calibration(Outcome):
     """Gripper poses that would shrink the reported uncertainty most."""
     with_given_intrinsics: WithGivenIntrinsics | None = None
     """Transform for the intrinsics that were given; None where none were, or they were not estimated beside that."""
-    scale_check: ScaleCheck | None = None
-    """None where the reconstruction's unit is not meant to be the metre."""
     depth_check: DepthCheck | None = None
     """None without depth images, or where too few features have a depth."""
     lengths: tuple[LengthCheck, ...] = ()

@@ -227,16 +227,6 @@ COVARIANCE_ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "log_scal
 relative scale error (scale_true = exp(s)·scale)."""
 
 
-@dataclass(frozen=True)
-class ScaleCheck:
-    """The robot's metre against that of a metric network: an independent check of the scale."""
-
-    off_percent: float
-    """By how much the network's lengths are too long (negative: too short)."""
-    std_percent: float
-    """One-sigma uncertainty that the calibration leaves in that."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class DepthCheck:
     """A depth camera's lengths against the robot's, at features whose depth the images and the robot give."""

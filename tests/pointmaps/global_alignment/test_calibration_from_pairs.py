@@ -205,15 +205,17 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
     )
     reconstruction = replace(made, predictions=network).reconstruction()
     found = calibrate_reconstruction(made.capture, reconstruction)
-    check = found.scale_check
-    assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
-    assert check.std_percent < 0.2 * factor
+    (network,) = found.lengths
+    assert network.name == "network"
+    off, std_percent = 100 / (1 + network.robot_longer_percent / 100) - 100, 100 * found.uncertainty.std[6]
+    assert abs(off - off_percent) < 4 * std_percent * factor
+    assert std_percent < 0.2
     assert any("check the unit of the gripper poses" in text for text in found.warnings) == (factor > 10)
 
 
 def test_a_network_without_a_metre_shows_nothing_of_the_scale():
     made = case(4, 3, (1e-4, 2e-4))
-    assert calibrate_reconstruction(made.capture, made.reconstruction()).scale_check is None
+    assert calibrate_reconstruction(made.capture, made.reconstruction()).lengths == ()
 
 
 def test_evidence_survives_the_file(tmp_path: Path):

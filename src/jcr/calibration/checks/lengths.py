@@ -25,7 +25,7 @@ from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse
-from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruction, ScaleCheck
+from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruction
 from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
@@ -139,17 +139,14 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A network's length of 1 is `scale` metres by the robot.
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
-        std_percent = 100 * float(np.sqrt(variance)) / hand_eye.scale
-        check = ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
-        hand_eye = replace(hand_eye, scale_check=check)
     return hand_eye, found
 
 
 def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
     """Return the finding that two lengths contradict each other; the robot is the first where it is one of them."""
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
-    if of_robot and other.name == "network" and (check := hand_eye.scale_check) is not None:
-        size = {"value": check.off_percent / 100, "std": check.std_percent / 100}
+    if of_robot and other.name == "network":
+        size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
         return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", **size)
     exact = of_robot and max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
     found = Finding(
@@ -193,7 +190,7 @@ def _fused(
         # What is measured with depth images is in the metre that the map has.
         percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
         depth = replace(depth, off_percent=percent)
-    measured = {name: getattr(hand_eye, name) for name in ("findings", "scale_check", "lengths", "board")}
+    measured = {name: getattr(hand_eye, name) for name in ("findings", "lengths", "board")}
     return judged(replace(refined, depth_check=depth, **measured)), adjusted
 
 
