@@ -60,7 +60,6 @@ from .records import Pointmaps as Pointmaps
 from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
-from .records import RobotErrors as RobotErrors
 from .records import RobotNoise as RobotNoise
 from .records import Seen as Seen
 from .records import Uncertainty as Uncertainty

@@ -46,7 +46,6 @@ from jcr.records import (
     DepthCheck,
     ImageVerdict,
     IntrinsicsAndStd,
-    JointError,
     JointOffsets,
     LeaveOneOut,
     LengthCheck,
@@ -57,7 +56,6 @@ from jcr.records import (
     PosePairs,
     Reconstruction,
     Requirement,
-    RobotErrors,
     RobotNoise,
     Uncertainty,
     WithGivenIntrinsics,
@@ -282,16 +280,18 @@ class Calibration(Outcome):
 
     @computed_field
     @property
-    def robot_errors(self) -> RobotErrors:
-        """Systematic errors of the gripper poses, as estimated."""
+    def robot_errors(self) -> dict[str, Any]:
+        """Systematic errors of the gripper poses: one sigma, the part left in the poses per axis, and of each joint."""
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
-            joints = tuple(JointError(offset_deg=offset, std_deg=std) for offset, std in degrees)
-        left = mm_and_deg(*self.robot_noise.systematic_left)
-        return RobotErrors(
-            systematic_deg=rounded(np.degrees(self.robot_noise.systematic)), **left, joints=joints
-        )
+            joints = [{"offset_deg": offset, "std_deg": std} for offset, std in degrees]
+        systematic = rounded(np.degrees(self.robot_noise.systematic))
+        return {
+            "systematic_deg": systematic,
+            **mm_and_deg(*self.robot_noise.systematic_left),
+            "joints": joints,
+        }
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:

@@ -197,10 +197,10 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
             depth[f"noise at {z:.2f} m, 1 σ"] = f"{significant(1e3 * float(check.std_m(z)))} mm"
         depth["looked at"] = f"{check.features} features of {check.images} images"
     if (errors := content.robot_errors) is not None:
-        shared = f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis"
+        shared = "{translation_mm:.2g} mm {rotation_deg:.2g}° per axis".format_map(errors)
         robot["errors shared by neighbouring poses"] = shared
-        for k, joint in enumerate(errors.joints or [], start=1):
-            robot[f"joint {k} off by"] = f"{joint.offset_deg:+.3f} ± {joint.std_deg:.3f}°"
+        for k, joint in enumerate(errors["joints"] or [], start=1):
+            robot[f"joint {k} off by"] = "{offset_deg:+.3f} ± {std_deg:.3f}°".format_map(joint)
     lengths = {
         LENGTHS[
             one.name

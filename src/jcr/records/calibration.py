@@ -139,27 +139,6 @@ class JointOffsets:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointError:
-    """True angle of a joint less the reported one, and its standard deviation."""
-
-    offset_deg: float
-    std_deg: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class RobotErrors:
-    """Systematic errors of the gripper poses, as estimated."""
-
-    systematic_deg: float
-    """One sigma of the joint offsets where the arm is known, else of the gripper's rotation."""
-    translation_mm: float
-    """Part that is left in the poses per axis, after the effective hand-eye transform took its own."""
-    rotation_deg: float
-    joints: tuple[JointError, ...] | None
-    """The joints from the base on; null where the arm is not known."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Share:
     """Part of the uncertainty: one sigma, root mean square over the axes; squares of the parts add up to the whole."""
 
