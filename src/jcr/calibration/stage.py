@@ -10,7 +10,7 @@ from jcr.calibration.case import Case, with_findings
 from jcr.calibration.checks.boards import check_boards
 from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
 from jcr.calibration.checks.convention import better_reading, check_convention, convention_finding
-from jcr.calibration.checks.effects import check_effects, effects_of_fit, with_rejected_runs
+from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot
@@ -23,7 +23,7 @@ from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_error
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.point_uncertainty import with_given_intrinsics
-from jcr.estimation.problem import offset_prior, pose_problem, scale_prior
+from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, PosePairs, Reconstruction
@@ -155,15 +155,13 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
     is taken as 1.
     """
     check_options(options := options or CalibrateOptions())
-    gripper, noise = pairs.base_from_gripper, options.robot_noise_m_rad
+    gripper = pairs.base_from_gripper
     robot = errors_of(gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
     if hand_eye.observability.observable and not is_explained(hand_eye.findings):
-        start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
-        poses = {"error_covariance": robot.systematic, "noise_floor": noise}
-        problem, state = pose_problem(gripper, pairs.recon_from_camera, start, **poses)
-        problem = replace(problem, used=with_rejected_runs(hand_eye.inliers))
-        hand_eye = with_findings(hand_eye, effects_of_fit(problem, state, hand_eye, pairs.images))
+        known = {"error_covariance": robot.systematic, "noise_floor": options.robot_noise_m_rad}
+        found = effects_of_fit(gripper, pairs.recon_from_camera, hand_eye, pairs.images, **known)
+        hand_eye = with_findings(hand_eye, found)
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
     assumptions = assumptions_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
     return advised(hand_eye, gripper, options, robot, assumptions).of_capture(pairs, pairs)

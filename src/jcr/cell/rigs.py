@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit, with_rejected_runs
+from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.camera import guessed_intrinsics, usable_intrinsics
@@ -21,7 +21,7 @@ from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses, State, pose_problem, scale_prior
+from jcr.estimation.problem import ReportedPoses, State, scale_prior
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
@@ -271,10 +271,8 @@ def fit_views(
 ) -> tuple[Calibration, tuple[Finding, ...]]:
     """Return the fit of a camera to the poses of what carries it, and the effect of the order, such as a slip."""
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
-    start = found.gripper_from_camera, found.scale, found.base_from_recon.rigid
-    problem, state = pose_problem(carrier, seen.places, start, priors=(scale_prior(1.0, scale_std),))
-    used = with_rejected_runs(found.inliers)
-    return found, effects_of_fit(replace(problem, used=used), state, found, seen.names)
+    known = (scale_prior(1.0, scale_std),)
+    return found, effects_of_fit(carrier, seen.places, found, seen.names, priors=known)
 
 
 def _apart(

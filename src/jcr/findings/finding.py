@@ -51,27 +51,11 @@ class Finding:
 
     @classmethod
     def of(
-        cls,
-        kind: FindingKind,
-        severity: Severity,
-        concerns: Concerns = "none",
-        *images: str,
-        value: float | None = None,
-        std: float | None = None,
-        p: float | None = None,
-        **details: float | str,
+        cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Make a finding about these images, with further numbers and names as `details`."""
-        return cls(
-            kind=kind,
-            severity=severity,
-            concerns=concerns,
-            images=images,
-            value=value,
-            std=std,
-            p=p,
-            details=details,
-        )
+        """Make a finding about these images; `known` are its value, std and p, and details by their names."""
+        sizes = {name: known.pop(name) for name in ("value", "std", "p") if name in known}
+        return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:

@@ -43,7 +43,7 @@ from jcr.estimation.hypotheses import (
     order_rows,
 )
 from jcr.estimation.pose_equations import Region, pose_equations
-from jcr.estimation.problem import SCALE, UNKNOWNS, Problem, State, columns_of_arm, pose_problem
+from jcr.estimation.problem import SCALE, UNKNOWNS, columns_of_arm, pose_problem
 from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_equations
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, kinds_of
@@ -71,7 +71,18 @@ def check_effects(case: Case) -> Case:
         return case
     longer = _with_rejected_runs(case)
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
-        return case.after(_effects_of_poses(longer))
+        evidence = case.reconstruction.evidence
+        found = effects_of_fit(
+            case.base_from_gripper,
+            case.recon_from_camera,
+            case.hand_eye,
+            case.names,
+            camera_covariance=None if evidence is None else evidence.covariance,
+            error_covariance=case.robot.systematic,
+            noise_floor=case.options.robot_noise_m_rad,
+            priors=case.priors,
+        )
+        return case.after(found)
     state, findings = effects(of_case(longer))
     return case.after(findings) if longer is not case else _adopted(case, state, findings)
 
@@ -351,37 +362,34 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
     return used | rejected[:-2] | rejected[2:]
 
 
-def _effects_of_poses(case: Case) -> tuple[Finding, ...]:
-    """Return the most significant effect of the order where camera poses alone decide the calibration."""
-    evidence = case.reconstruction.evidence
-    fit = case.pose_fit
-    problem, state = pose_problem(
-        case.base_from_gripper,
-        case.recon_from_camera,
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
-        camera_covariance=None if evidence is None else evidence.covariance,
-        error_covariance=case.robot.systematic,
-        noise_floor=case.options.robot_noise_m_rad,
-        priors=case.priors,
-    )
-    return effects_of_fit(replace(problem, used=case.hand_eye.inliers), state, case.hand_eye, case.names)
-
-
 def effects_of_fit(
-    problem: Problem, state: State, hand_eye: Calibration, names: Sequence[str]
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    hand_eye: Calibration,
+    names: Sequence[str],
+    **known: Any,
 ) -> tuple[Finding, ...]:
-    """Return the most significant effect of the order on a fit to camera poses; `names` are those of its poses."""
-    found = pose_equations(problem, state, None)
-    equations, used = found.equations, np.flatnonzero(found.used)
+    """Return the most significant effect of the order on a fit to camera poses.
+
+    `names` are those of the poses, `known` is what `pose_problem` takes beside them.
+    """
+    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
+    problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
+    used = with_rejected_runs(hand_eye.inliers)
+    equations = pose_equations(replace(problem, used=used), state, None).equations
     poses = ArmEquations(
         equations=equations,
         log_sizes=most_likely(equations)[0],
-        base_from_gripper=problem.arms[0].base_from_gripper[used],
-        rows=slice(0, 6 * len(used)),
+        base_from_gripper=base_from_gripper[used],
+        rows=slice(0, 6 * int(used.sum())),
         columns=columns_of_arm(0),
     )
     # Errors of camera poses that come from features look like a strained arm; only the adjustment separates them.
     test = best_pose_effect(poses, kinds_of("strain"))
     std = np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged
-    found = None if test is None else pose_finding(test, poses, [names[row] for row in used.tolist()], std)
+    found = (
+        None
+        if test is None
+        else pose_finding(test, poses, [names[k] for k in np.flatnonzero(used).tolist()], std)
+    )
     return () if found is None else (found,)
