@@ -25,6 +25,7 @@ from jcr.errors import InputError
 from jcr.geometry import scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import Capture
+from jcr.report.images import image_numbers
 from jcr.report.render import TRACK_COLOR, label_colors, render
 from jcr.report.verdict import head
 from jcr.result import RunResult
@@ -124,16 +125,16 @@ class Viewer:
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
         self.cloud, self.scene = run.cloud, run.scene
-        assert self.calibration.scale is not None  # wherever there is a transform
-        base_from_recon, scale = self.calibration.base_from_recon.rigid, self.calibration.scale
+        base_from_recon = self.calibration.base_from_recon
         self.image_index = self.reconstruction.image_index
-        self.base_from_camera = base_from_recon @ scale_translation(
-            self.reconstruction.recon_from_camera, scale
-        )
-        tracked = self.reconstruction.tracks.points_in_recon
-        self.tracks_in_base = self.calibration.base_from_recon(tracked)
+        recon_from_camera = scale_translation(self.reconstruction.recon_from_camera, base_from_recon.scale)
+        self.base_from_camera = base_from_recon.rigid @ recon_from_camera
+        self.tracks_in_base = base_from_recon(self.reconstruction.tracks.points_in_recon)
         server.scene.set_up_direction("+z")
-        server.gui.add_markdown(self._verdict(run))
+        headline = head(self.calibration)[0].content
+        lines = [f"**{headline['verdict']}:** {headline['reason']}."]
+        lines += [f"No map yet: make one with `jcr map {run.out}`."] * (self.scene is None)
+        server.gui.add_markdown("\n\n".join(lines))
         report("view", 0.1)
         self._add_capture()
         self.robot = None
@@ -143,9 +144,10 @@ class Viewer:
             self.robot = ViserUrdf(server, robot, root_node_name="/robot")
         report("view", 0.3)
         self._add_points()
+        self._solid = self.tracks_in_base if self.cloud is None else self.cloud.points_in_base
         if self.scene is not None:
             self._surface = sample_surface(self.scene, MAP_POINTS)
-            self._palette = label_colors(len(self.scene.label_names))
+            self._palette, self._solid = label_colors(len(self.scene.label_names)), self._surface[0]
             report("view", 0.6)
             self._add_map(self.scene)
             self._add_sphere()
@@ -154,14 +156,6 @@ class Viewer:
         self.choose_image()
         self._place_eye()
         report("view", 1.0)
-
-    def _verdict(self, run: RunResult) -> str:
-        """Return the headline of the report, and the remedy for a missing map."""
-        headline = head(self.calibration)[0].content
-        lines = [f"**{headline['verdict']}:** {headline['reason']}."]
-        if self.scene is None:
-            lines.append(f"No map yet: make one with `jcr map {run.out}`.")
-        return "\n\n".join(lines)
 
     def _add_capture(self) -> None:
         """Add base, cameras with their images, grippers, and the controls of the chosen image."""
@@ -241,7 +235,7 @@ class Viewer:
         with gui.add_folder("Sphere to drag", expand_by_default=False):
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
             self.answer = gui.add_markdown("")
-        start = np.array([*np.median(self._solid(), axis=0)[:2], self._support() + 0.15])
+        start = np.array([*_middle(self._solid)[:2], self._support() + 0.15])
         self.gizmo = self.server.scene.add_transform_controls(
             "/sphere", scale=0.12, disable_rotations=True, position=start
         )
@@ -265,16 +259,16 @@ class Viewer:
         """Show the numbers of the chosen image, mark its camera and move the robot to its pose."""
         with self._lock:
             row = self.image.value
-            image, camera = self.calibration.images[row], self._camera_of_image()
-            parts = [f"**{image.image}**", "used" if image.used else f"rejected: {image.reason}"]
-            if image.translation_residual_mm is not None and image.rotation_residual_deg is not None:
-                parts.append(
-                    f"residual {image.translation_residual_mm:.2f} mm, {image.rotation_residual_deg:.3f}°"
-                )
-            self._about_image.content = " · ".join(parts)
-            for k, frustum in enumerate(self.frusta):
-                used = self.calibration.images[int(self.image_index[k])].used
-                frustum.color = CHOSEN if k == camera else CAMERA if used else REJECTED
+            image = self.calibration.images[row]
+            parts = (
+                f"**{image.image}**",
+                "used" if image.used else f"rejected: {image.reason}",
+                image_numbers(image),
+            )
+            self._about_image.content = " · ".join(filter(None, parts))
+            for own, frustum in zip(self.image_index.tolist(), self.frusta, strict=True):
+                used = self.calibration.images[own].used
+                frustum.color = CHOSEN if own == row else CAMERA if used else REJECTED
             if self.robot is not None:
                 self.robot.update_cfg(self._configurations[row])
 
@@ -376,32 +370,25 @@ class Viewer:
                 rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
         return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
 
-    def _camera_of_image(self) -> int | None:
-        """Return the row of the chosen image among the registered cameras; None where it is not registered."""
-        rows = np.flatnonzero(self.image_index == self.image.value)
-        return int(rows[0]) if len(rows) else None
-
-    def _solid(self) -> Float[ndarray, "n 3"]:
-        """Return points of the map's surface, of the cloud, or of the tracks."""
-        points = self.tracks_in_base if self.cloud is None else self.cloud.points_in_base
-        if self.scene is not None:
-            points = self._surface[0]
-        return points if len(points) else np.zeros((1, 3))
-
     def _support(self) -> float:
         """Return the most frequent height (m) of the surface, inside the workspace."""
         assert self.scene is not None
-        counts, edges = np.histogram(self._solid()[:, 2], bins=100)
+        counts, edges = np.histogram(self._solid[:, 2], bins=100)
         low, high = self.scene.box[:, 2]
         return float(np.clip(edges[counts.argmax()], low, high - 0.02))
 
     def _place_eye(self) -> None:
         """Set the initial view obliquely from above, with points and cameras in it."""
-        target = np.median(self._solid(), axis=0)
+        target = _middle(self._solid)
         cameras = self.base_from_camera[:, :3, 3]
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
         eye = target + 1.6 * reach * np.array([0.62, -0.62, 0.6])
         self.server.initial_camera.position, self.server.initial_camera.look_at = eye, target
+
+
+def _middle(points: Float[ndarray, "n 3"]) -> Value:
+    """Return the median of points; the origin where there are none."""
+    return np.median(points, axis=0) if len(points) else np.zeros(3)
 
 
 def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:
