@@ -138,7 +138,7 @@ def test_options_that_cannot_be_are_refused_before_any_work(
     options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(
-        "jcr.pipeline.stages.select_reconstruction", lambda *_: pytest.fail("images were reconstructed")
+        "jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("images were reconstructed")
     )
     with pytest.raises(InputError, match=message):
         run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))

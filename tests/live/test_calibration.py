@@ -83,7 +83,7 @@ def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path, mon
     assert np.allclose(result.covariance, batch.covariance, rtol=1e-4, atol=0)
     # A run of the same folder begins with that reconstruction.
     with monkeypatch.context() as patched:
-        patched.setattr("jcr.pipeline.stages.select_reconstruction", lambda *_: pytest.fail("made again"))
+        patched.setattr("jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("made again"))
         run = jcr.calibrate(folder, tmp_path / "run")
     assert np.allclose(run.gripper_from_camera, result.gripper_from_camera, rtol=0, atol=1e-9)
     assert (tmp_path / "run" / "reconstruction.npz").is_file()
