@@ -55,20 +55,14 @@ def refined(
     The result is that of a camera mounted on the base; residuals are of the gripper poses as they were reported. One
     that is rejected stays as it was, or is named as a camera on the gripper.
     """
-    return _refined(capture, reconstruction, found, options or CalibrateOptions()).on_fixed_camera()
-
-
-def _refined(
-    capture: Capture, reconstruction: Reconstruction, found: Calibration, options: CalibrateOptions
-) -> Calibration:
-    """Return the refined calibration, whose gripper_from_camera is base_from_camera."""
+    options = options or CalibrateOptions()
     rows = reconstruction.image_index
     if not found.is_sound:
         on_gripper = solve_hand_eye(
             capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
         )
         why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
-        return found.with_findings(why) if on_gripper.converged else found
+        return (found.with_findings(why) if on_gripper.converged else found).on_fixed_camera()
     case = Case(
         capture=capture,
         reconstruction=reconstruction,
@@ -79,7 +73,7 @@ def _refined(
         carries="scene",
     )
     if found.source == "poses" or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
-        return found
+        return found.on_fixed_camera()
     case = replace(case, adjusted=adjust_case(case))
     state, effects_found = effects(of_case(case))
     adjusted, effects_found = with_effects(case, state, effects_found)
@@ -99,4 +93,4 @@ def _refined(
         next_poses=(),
         findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
     )
-    return judged(with_findings(judged(again), effects_found))
+    return judged(with_findings(judged(again), effects_found)).on_fixed_camera()

@@ -119,15 +119,13 @@ class CameraViews:
         used = {k: one for k, one in self.used.items() if k not in reasons}
         return replace(self, used=used, reasons={**self.reasons, **reasons})
 
-    def refused(self, *why: Finding) -> CameraPlacement:
-        """Return the camera with the findings for which it is not placed."""
-        return CameraPlacement.of(self.camera, why, self.points, self.reasons)
-
-    def refused_for(
-        self, kind: FindingKind, concerns: Concerns = "none", *images: str, **numbers: Any
+    def refused(
+        self, why: FindingKind | Sequence[Finding], concerns: Concerns = "none", *images: str, **numbers: Any
     ) -> CameraPlacement:
-        """Return the camera rejected for a finding, as Finding.of makes it."""
-        return self.refused(Finding.of(kind, "rejects", concerns, *images, **numbers))
+        """Return the camera rejected for findings, or for one as Finding.of makes it."""
+        if isinstance(why, FindingKind):
+            why = (Finding.of(why, "rejects", concerns, *images, **numbers),)
+        return CameraPlacement.of(self.camera, why, self.points, self.reasons)
 
     def parent_from_camera(self, state: State) -> Float[ndarray, "4 4"]:
         """Return base_from_camera of a fixed camera, else gripper_from_camera."""
@@ -164,22 +162,21 @@ class Rigs:
         if not seen.used:
             most = int(np.argmax(seen.points))
             best, count = seen.camera.images[most], float(seen.points[most])
-            return seen.refused_for(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
+            return seen.refused(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
-        return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
-
-    def _fixed(self, seen: CameraViews) -> CameraViews:
+        if seen.camera.mount == "gripper":
+            return self._on_same_gripper(seen)
         place = seen.places[int(np.trace(seen.covariances, axis1=1, axis2=2).argmin())]
-        rig = np.full(len(seen.used), len(self.poses))
+        seen = replace(seen, rig=np.full(len(seen.used), len(self.poses)))
         self.poses.append(place)
         metres, radians = _apart(self.known.recon_from_camera, place)
         near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
         if not len(near):
-            return replace(seen, rig=rig)
+            return seen
         image, own = self.case.capture.images[self.rows[near[0]]], self.case.capture.camera_name
         at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
-        return replace(seen, rig=rig, findings=(*seen.findings, at_own))
+        return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         assert seen.camera.frame is not None
@@ -193,13 +190,13 @@ class Rigs:
             }
         )
         if not seen.used:
-            return seen.refused_for(FindingKind.NO_COMMON_POSE, "images")
+            return seen.refused(FindingKind.NO_COMMON_POSE, "images")
         rig = np.array([rig_of[frame[k]] for k in seen.used])
         moved = ()
         if len(seen.used) >= MIN_IMAGES:
             moved = fit_views(seen, self.known.recon_from_camera[rig], EXACT_SCALE)[1]
         if any(one.severity == "rejects" for one in moved):
-            return seen.refused(*moved)
+            return seen.refused(moved)
         for one in moved:
             if one.kind is FindingKind.SLIP:
                 first, before = seen.names.index(one.images[1]), one.details["longer"] == "before"
@@ -209,7 +206,7 @@ class Rigs:
         wrist = self.known.recon_from_camera[rig]
         metres, radians = _apart(wrist[:, None], wrist)
         if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
-            return seen.refused_for(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
+            return seen.refused(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
         on_rig = inverse(wrist) @ seen.places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -218,7 +215,7 @@ class Rigs:
         astray = (step * np.linalg.solve(covariance, step[..., None])[..., 0]).sum(-1) > APART
         if astray.mean() > 0.4:
             most_m, own = float(np.linalg.norm(step[:, :3], axis=1).max()), capture.camera_name
-            return seen.refused_for(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
+            return seen.refused(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
         why = "its place on the gripper is not that of its other images"
         kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
@@ -226,16 +223,16 @@ class Rigs:
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused_for(FindingKind.SECOND_ON_ARM, arm=arm)
+            return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
         if len(seen.used) < LEAST_POSES:
             counts = {"value": float(len(seen.used)), "needed": float(LEAST_POSES)}
-            return seen.refused_for(FindingKind.FEW_LOCALISED, "images", **counts)
+            return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
         gripper = seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self.case.hand_eye.covariance[6, 6])), 1e-4)
         found, effects = fit_views(seen, gripper, std)
         if not found.converged:
             explained = tuple(replace(one, severity="rejects") for one in effects)
-            return seen.refused(*(explained or found.findings))
+            return seen.refused(explained or found.findings)
         used = found.inliers
         kept = seen.without({int(seen.rows[k]): str(found.images[k].reason) for k in np.flatnonzero(~used)})
         rig = len(self.poses) + np.arange(used.sum())

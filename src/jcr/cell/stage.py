@@ -89,7 +89,7 @@ def place_cameras(
         )
         moved = _moved(rigs, views) if camera.mount == "base" and len(views.used) > 1 else ()
         refused = any(one.severity == "rejects" for one in moved)
-        views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
+        views = views.refused(moved) if refused else rigs.add(replace(views, findings=moved))
         if isinstance(views, CameraPlacement):
             cameras[camera.name] = views
         else:

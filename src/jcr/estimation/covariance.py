@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.distributions import chi2
-from jcr.estimation.elimination import cholesky, lower
+from jcr.estimation.elimination import cholesky, lower, upper
 from jcr.estimation.pose_equations import Region
 from jcr.estimation.problem import UNKNOWNS
 from jcr.estimation.robot_noise import (
@@ -160,7 +160,9 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
         images = images + gain @ exact.known @ gain.T
     intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
     whole, parts = covariance[:7, :7], [part[:7, :7] for part in (random, systematic, intrinsics, images)]
-    to_whole = _between(sum(parts[1:], parts[0]), whole)
+    # A linear map takes errors of the covariance of all parts to those of the whole.
+    known = sum(parts[1:], parts[0])
+    to_whole = upper(cholesky(known), cholesky(whole).T).T
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     images = whole - random - systematic - intrinsics
     parts = [positive_part((part + part.T) / 2) for part in (random, systematic, intrinsics, images)]
@@ -176,18 +178,3 @@ def positive_part(part: Square, whole: Square | None = None) -> Square:
     std = np.sqrt(np.maximum(np.diag(part if whole is None else whole), 0.0))
     values, vectors = np.linalg.eigh(part / np.outer(*[np.where(std > 0, std, np.inf)] * 2))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(std, std)
-
-
-def _between(one: Square, other: Square) -> Square:
-    """Return the linear map of least displacement that takes errors of one covariance to those of another.
-
-    The map is symmetric where lengths are counted in standard deviations (Knott and Smith, J. Optim. Theory Appl. 43,
-    1984).
-    """
-    std = np.sqrt(np.diag(one))
-    values, vectors = np.linalg.eigh(one / np.outer(std, std))
-    values = np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
-    root, inverse = (vectors * values @ vectors.T, vectors / values @ vectors.T)
-    squared, axes = np.linalg.eigh(root @ (other / np.outer(std, std)) @ root)
-    by = inverse @ (axes * np.sqrt(np.maximum(squared, 0.0)) @ axes.T) @ inverse
-    return std[:, None] * by / std

@@ -5,7 +5,6 @@ et al., "Bundle adjustment: a modern synthesis", 2000, section 6).
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -95,41 +94,21 @@ def in_order(order: Int[ndarray, " k"], *parts: Derivatives) -> Derivatives:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Group:
-    """Points that are eliminated together, because few of many images show them."""
-
-    points: Int[ndarray, " n"]
-    rows: Int[ndarray, " k"]
-    """Row numbers of their observations, point by point."""
-    batches: list[tuple[slice, slice]]
-    """Points with equally many observations, and these observations."""
-    images: Int[ndarray, " i"]
-    """Images that show any of them."""
-    pairs: Int[ndarray, " j"]
-    """First observation of each point in each image: rigs see a point by several cameras."""
-    point: Int[ndarray, " j"]
-    """Index of each pair's point in `points`."""
-    image: Int[ndarray, " j"]
-    """Index of each pair's image in `images`."""
-
-
 @dataclass(frozen=True)
 class Sightings:
-    """Points and the images that show them."""
+    """Observations sorted by point and then by image, and the images that they are in."""
 
-    rows: list[Int[ndarray, "..."]]
-    """Observations of each image."""
+    image: Int[ndarray, " k"]
     starts: Int[ndarray, " p"]
     """Each point's first observation."""
-    groups: list[_Group]
+    rows: list[Int[ndarray, "..."]]
+    """Observations of each image."""
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Return the sightings of observations sorted by point and then by image, each point with at least one."""
-        starts = np.flatnonzero(np.diff(point, prepend=-1))
+        """Return the sightings of sorted observations, each point with at least one."""
         rows = [np.flatnonzero(image == i) for i in range(images)]
-        return Sightings(rows, starts, _groups(starts, image))
+        return Sightings(image, np.flatnonzero(np.diff(point, prepend=-1)), rows)
 
 
 @dataclass(frozen=True)
@@ -178,27 +157,31 @@ def without_points(
 ) -> Normal:
     """Return the equations of all unknowns but the points, in place, with the Schur complement of the points."""
     s, o = rows.shared.shape[2], rows.own.shape[2]
-    blocks = []
-    for group in seen.groups:
-        own_columns = s + o * np.arange(len(group.images))[:, None] + np.arange(o)
-        columns = np.r_[:s, (s + o * group.images[:, None] + np.arange(o)).ravel()]
-        root, half = np.empty((len(group.points), 3, 3)), np.zeros((len(group.points), 3, len(columns) + 1))
-        by_point = np.empty((len(group.rows), 2, 3))
-        for points, observations in group.batches:
-            of_batch, count = group.rows[observations], points.stop - points.start
-            of_point = rows.by_point[of_batch].reshape(count, -1, 3)
-            block = _regular(np.swapaxes(of_point, 1, 2) @ of_point, damping)
-            root[points] = np.linalg.inv(np.linalg.cholesky(block))
-            of_point = of_point @ np.swapaxes(root[points], 1, 2)
-            by_point[observations], flat = of_point.reshape(-1, 2, 3), np.swapaxes(of_point, 1, 2)
-            half[points, :, :s] = flat @ rows.shared[of_batch].reshape(count, flat.shape[2], s)
-            half[points, :, -1:] = flat @ rows.residual[of_batch].reshape(count, -1, 1)
-        places = group.point[:, None, None], np.arange(3)[:, None], own_columns[group.image][:, None]
-        half[places] = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ rows.own[group.rows], group.pairs)
+    blocks, ends = [], np.append(seen.starts, len(seen.image))
+    # Few of many images show the points of a group, which are in the order of the first image that shows them.
+    by_first = np.argsort(seen.image[seen.starts], kind="stable")
+    for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)) if len(by_first) else []:
+        counts = ends[points + 1] - ends[points]
+        begins, of_point = np.cumsum(counts) - counts, np.repeat(np.arange(len(points)), counts)
+        of_group = np.repeat(ends[points] - begins, counts) + np.arange(counts.sum())
+        images, of_image = np.unique(seen.image[of_group], return_inverse=True)
+        # First observation of each point in each image: rigs see a point by several cameras.
+        pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
+        own_columns = s + o * np.arange(len(images))[:, None] + np.arange(o)
+        columns = np.r_[:s, (s + o * images[:, None] + np.arange(o)).ravel()]
+        by_point = rows.by_point[of_group]
+        block = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, begins)
+        root = np.linalg.inv(np.linalg.cholesky(_regular(block, damping)))
+        by_point = root[of_point] @ np.swapaxes(by_point, 1, 2)
+        half = np.zeros((len(points), 3, len(columns) + 1))
+        half[:, :, :s] = np.add.reduceat(by_point @ rows.shared[of_group], begins)
+        half[:, :, -1:] = np.add.reduceat(by_point @ rows.residual[of_group, :, None], begins)
+        places = of_point[pairs, None, None], np.arange(3)[:, None], own_columns[of_image[pairs]][:, None]
+        half[places] = np.add.reduceat(by_point @ rows.own[of_group], pairs)
         flat = half.reshape(3 * len(half), -1)
         hessian[np.ix_(columns, columns)] -= flat[:, :-1].T @ flat[:, :-1]
         right[columns] += flat[:, :-1].T @ flat[:, -1]
-        blocks.append((group.points, columns, root, half))
+        blocks.append((points, columns, root, half))
     return Normal(hessian, right, blocks)
 
 
@@ -212,37 +195,3 @@ def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v
-
-
-def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Group]:
-    """Return groups of points in the order of the first image that shows them, which few other images share.
-
-    Within a group the points are in the order of the number of their observations.
-    """
-    if len(starts) == 0:
-        return []
-    seen = np.diff(np.r_[starts, len(image)])
-    by_first = np.argsort(image[starts], kind="stable")
-    groups = []
-    for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)):
-        points = points[np.argsort(seen[points], kind="stable")]
-        counts = seen[points]
-        begins = np.cumsum(counts) - counts
-        rows = np.repeat(starts[points] - begins, counts) + np.arange(counts.sum())
-        images, of_image = np.unique(image[rows], return_inverse=True)
-        of_point = np.repeat(np.arange(len(points)), counts)
-        pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
-        edges = np.r_[np.flatnonzero(np.diff(counts, prepend=-1)), len(counts)].tolist()
-        ends = np.r_[0, np.cumsum(counts)].tolist()
-        groups.append(
-            _Group(
-                points=points,
-                rows=rows,
-                batches=[(slice(a, b), slice(ends[a], ends[b])) for a, b in pairwise(edges)],
-                images=images,
-                pairs=pairs,
-                point=of_point[pairs],
-                image=of_image[pairs],
-            )
-        )
-    return groups
