@@ -52,8 +52,8 @@ def damped_gauss_newton(
     enough: Callable[[Any], Any],
     damping: Any = START_DAMPING,
     iterations: int = 100,
-) -> tuple[Unknowns, Any, Any, bool]:
-    """Minimise a cost from `start`; return the unknowns, their cost, the damping, and whether the steps settled.
+) -> tuple[Unknowns, Any, bool]:
+    """Minimise a cost from `start`; return the unknowns, their cost, and whether the steps settled.
 
     `step` takes the unknowns, their linearisation and the relative damping of its diagonal. The iteration ends where a
     step changes the cost by less than `enough` of it. Of independent problems each has its own damping.
@@ -72,7 +72,7 @@ def damped_gauss_newton(
         damping = np.where(better, np.maximum(damping / 10, LEAST_DAMPING), damping * 10)[()]
         if settled or np.all(damping > MOST_DAMPING):
             break
-    return unknowns, least, damping, settled
+    return unknowns, least, settled
 
 
 def _where(better: Any, tried: Any, before: Any) -> Any:
@@ -112,7 +112,7 @@ def minimise(
 
     begin = (start, *linearised(start))
     exact, damping = EXACT * _cost(loss, begin[1]), np.full(begin[1].shape[:-2], START_DAMPING)[()]
-    found, cost, _, settled = damped_gauss_newton(
+    found, cost, settled = damped_gauss_newton(
         lambda now: _equations(loss, *now[1:]),
         step,
         lambda now: _cost(loss, now[1]),

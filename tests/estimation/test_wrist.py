@@ -19,7 +19,7 @@ from jcr.estimation.intrinsics_prior import (
     camera_with_prior,
 )
 from jcr.estimation.pixel_noise import PixelNoise
-from jcr.estimation.problem import Observations, image_problem
+from jcr.estimation.problem import NO_ARM, wrist_problem
 from jcr.estimation.solve import Solution, adjust_wrist, recon_frame
 from jcr.records import Intrinsics, Tracks
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
@@ -157,9 +157,9 @@ def estimated_noise(seed: int, stated: str) -> PixelNoise:
         points_in_recon=exact.points_in_recon,
         std_px=of[stated],
     )
-    camera, observations = camera_with_prior(INTRINSICS, FIXED), Observations.of_one_camera(tracks, 12)
-    given = image_problem(problem.recon_from_camera, camera, observations, exact.points_in_recon)
-    found = adjust_images(*given).state.pixel_noise
+    camera = camera_with_prior(INTRINSICS, FIXED)
+    given = wrist_problem(None, NO_ARM, problem.recon_from_camera, camera, tracks)
+    found = adjust_images(*given).pixel_noise
     assert found is not None
     return found
 

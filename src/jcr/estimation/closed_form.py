@@ -79,7 +79,7 @@ def rotations(
     batch, n = weights.shape[:-1], weights.shape[-1]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
     weights = weights.reshape(-1, n)
-    a, b = (_between(of) for of in (gripper, camera))
+    a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
     pairs = (weights[:, :, None] * weights[:, None]).reshape(-1, 1, n * n)
     of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))
     rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) * pairs @ of_b)
@@ -96,14 +96,6 @@ def rotations(
         rows = np.flatnonzero(near)[better]
         rotation[rows], base[rows] = rival[0][better], rival[1][better]
     return rotation.reshape(*batch, 3, 3), base.reshape(*batch, 3, 3)
-
-
-def _between(rotation: Float[ndarray, "h n 3 3"]) -> Float[ndarray, "h n n 3 3"]:
-    """Return R_iᵀ R_j of all pairs, by one product for each problem."""
-    h, n = rotation.shape[:2]
-    transposed = np.swapaxes(rotation, -1, -2).reshape(h, 3 * n, 3)
-    product = transposed @ np.moveaxis(rotation, 1, 2).reshape(h, 3, 3 * n)
-    return product.reshape(h, n, 3, n, 3).swapaxes(2, 3)
 
 
 def _polished(
@@ -129,12 +121,6 @@ def _polished(
     return rotation, base, (weights * (gap**2).sum((-1, -2))).sum(-1)
 
 
-def _centred(x: Float[ndarray, "*#batch n k"], weights: Weights) -> Float[ndarray, "... n k"]:
-    """Return values without their weighted mean over the images."""
-    w = weights / weights.sum(-1, keepdims=True)
-    return x - w[..., None, :] @ x
-
-
 def _translations(
     base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations, weights: Weights
 ) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
@@ -147,7 +133,8 @@ def _translations(
     in_base = center @ np.swapaxes(base_rotation, -1, -2)
     position = base_from_gripper[..., :3, 3]
     rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
-    rows = _centred(rows.reshape(*in_base.shape[:-1], 15), weights).reshape(rows.shape)
+    share = weights / weights.sum(-1, keepdims=True)
+    rows = rows - np.einsum("...n,...nij->...ij", share, rows)[..., None, :, :]
     # The column has unit size, so that the cut of unobservable directions does not depend on the reconstruction's unit.
     # Centres that differ by rounding alone count as one.
     size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
@@ -157,4 +144,4 @@ def _translations(
     solution = np.linalg.pinv(rows[..., :4], rcond=RELATIVE_CUT) @ rows[..., 4:]
     translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
     gap = (rotation @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * in_base
-    return translation, scale, np.einsum("...n,...ni->...i", weights, gap) / weights.sum(-1)[..., None]
+    return translation, scale, np.einsum("...n,...ni->...i", share, gap)

@@ -26,17 +26,16 @@ from jcr.estimation.projection import (
     shape_residuals,
     view_of,
 )
-from jcr.geometry import apply, inverse, scale_translation, step_between
-from jcr.least_squares import START_DAMPING, damped_gauss_newton, one_blas_thread
+from jcr.geometry import step_between
+from jcr.least_squares import damped_gauss_newton, one_blas_thread
 
-ROUNDS = 12
-"""Largest number of adjustments of images alone, between which the sizes of errors are estimated."""
+ROUNDS = 3
+"""Number of adjustments of images alone, between which the sizes of errors are estimated."""
 SIZES_SETTLED = 0.01
 """Relative change of the sizes of errors, of pixels and of robots, that ends the rounds."""
 ENOUGH = 1e-5
 """Change of the cost, in squared standard deviations, that ends an adjustment."""
 STEPS = 60
-LARGEST_DAMPING = 1e8
 FAINT = 1e-6
 """Information added to every column (1/m², 1/rad²): an image without observations is anywhere within a kilometre."""
 
@@ -82,34 +81,14 @@ class ImageEvidence:
 
 
 @one_blas_thread
-def adjust_images(problem: Problem, state: State) -> ImageEvidence:
-    """Adjust images alone from an initial state; the first rig stays fixed, and the depths keep their median."""
-    start, view = state.world_from_rig, view_of(problem, state)
-    state = with_pixel_noise(problem, state, view)
-    depth, damping = view.depth, START_DAMPING
-    unseen = information_along(similarities_of_rigs(start), 1.0)
-    world = RigInformation(start, unseen, np.zeros(len(unseen)))
+def adjust_images(problem: Problem, state: State) -> State:
+    """Adjust images of exact cameras alone; the rigs keep their mean place, rotation and extent."""
+    unseen = information_along(similarities_of_rigs(state.world_from_rig), 1.0)
+    world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
     for _ in range(ROUNDS):
-        before = state.pixel_noise
-        state, view, damping = adjusted_images(problem, state, [world], damping)
-        state = with_pixel_noise(problem, state, view)
-        images, change = with_model_error_of(image_evidence(problem, state))
-        state = images.state
-        assert before is not None and state.pixel_noise is not None
-        if max(state.pixel_noise.change(before), change) < SIZES_SETTLED:
-            break
-    unit = float(np.median(np.abs(depth / view.depth)))
-    back = inverse(scale_translation(state.world_from_rig[0], unit))
-    steps = state.camera_steps.copy()
-    steps[problem.columns.boards][:1] += np.log(unit)
-    state = replace(
-        state,
-        camera_steps=steps,
-        world_from_rig=start[0] @ back @ scale_translation(state.world_from_rig, unit),
-        rig_from_camera=scale_translation(state.rig_from_camera, unit),
-        points_in_world=apply(start[0] @ back, unit * state.points_in_world),
-    )
-    return image_evidence(problem, state)
+        state = with_pixel_noise(problem, state, view_of(problem, state))
+        state = adjusted_images(problem, state, [world])
+    return state
 
 
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
@@ -133,10 +112,8 @@ def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> F
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
 
-def adjusted_images(
-    problem: Problem, state: State, known: Sequence[RigInformation], damping: float = START_DAMPING
-) -> tuple[State, ProjectedObservations, float]:
-    """Adjust the columns of the images with the weights that observations have at the start; return also the damping.
+def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
+    """Adjust the columns of the images with the weights that observations have at the start.
 
     `known` is information about the rigs beside that of the images and `known_rigs`.
     """
@@ -155,16 +132,14 @@ def adjusted_images(
         tried = replace(stepped(problem, now[0], None, along), points_in_world=points)
         return tried, view_of(problem, tried)
 
-    found, _, damping, _ = damped_gauss_newton(
+    return damped_gauss_newton(
         lambda _: None,
         step,
         lambda now: _cost(problem, *now, weight, known),
         (state, view),
         enough=lambda _: ENOUGH,
-        damping=damping,
         iterations=STEPS,
-    )
-    return *found, START_DAMPING if damping > LARGEST_DAMPING else damping
+    )[0][0]
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:

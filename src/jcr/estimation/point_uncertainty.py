@@ -54,9 +54,7 @@ def point_covariance(
     `x` is gripper_from_camera, whose uncertainty is joint with that of the `intrinsics`. `x_px` (...,2) are pixels of
     the distorted image, `distance_m` (...) is along the ray, in the metres of the reconstruction.
     """
-    by_unknown, by_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
-    model_error = by_pixel @ _model_error_px2(uncertainty, intrinsics, x_px) @ np.swapaxes(by_pixel, -1, -2)
-    return by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2) + model_error
+    return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
 
 
 def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a gripper pose)
@@ -94,18 +92,16 @@ def bounds_at(
     distance_m: float,
 ) -> Seen:
     """Return the bounds of 95 % of the errors of a point: across the ray, along it, and in direction."""
-    by_unknown, by_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
     ray = unproject(intrinsics, x_px)
     # Two directions across the ray, and the ray: rows.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
-    moved = axes @ point_covariance(x, uncertainty, intrinsics, x_px, distance_m) @ axes.T
+    by_unknown, by_pixel, of_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    by_unknown, by_pixel = axes @ by_unknown, axes @ by_pixel
+    moved = _covariance(uncertainty, by_unknown, by_pixel, of_pixel)
     # The direction is not changed by a translation; the rotation about the ray takes the place of the distance.
-    by_direction = axes @ by_unknown / distance_m
-    by_direction[:, :3] = by_direction[2] = 0.0
-    by_direction[2, 3:6] = axes[2] @ x[:3, :3].T
-    by_pixel = axes @ by_pixel / distance_m
-    rotated = by_direction @ uncertainty.whole @ by_direction.T
-    rotated += by_pixel @ _model_error_px2(uncertainty, intrinsics, x_px) @ by_pixel.T
+    by_unknown[:, :3] = by_unknown[2] = 0.0
+    by_unknown[2, 3:6] = distance_m * axes[2] @ x[:3, :3].T
+    rotated = _covariance(uncertainty, by_unknown, by_pixel, of_pixel) / distance_m**2
     return Seen(
         distance_mm=1e3 * distance_m,
         within_95_mm=1e3 * within_95(moved),
@@ -263,21 +259,27 @@ def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Flo
     return by_unknown, left
 
 
-def _model_error_px2(
-    uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels
-) -> Float[ndarray, "*points 2 2"]:
-    """Return the covariance of pixels by the remaining error of the camera model."""
-    x_px = np.asarray(x_px, float)
-    if uncertainty.model_error is None:
-        return np.zeros((*x_px.shape, 2))
-    return second_moment_px2(uncertainty.model_error, intrinsics, x_px)
+def _covariance(
+    uncertainty: Uncertainty,
+    by_unknown: Float[ndarray, "*points 3 j"],
+    by_pixel: Float[ndarray, "*points 3 2"],
+    of_pixel: Float[ndarray, "*points 2 2"],
+) -> Covariances:
+    """Return the covariance of points with these derivatives."""
+    of_unknowns = by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2)
+    return of_unknowns + by_pixel @ of_pixel @ np.swapaxes(by_pixel, -1, -2)
 
 
 def _derivatives(
     x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
-) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"]]:
-    """Return derivatives of points on the gripper, in camera axes, by the joint unknowns and by their pixels."""
-    ray = unproject(intrinsics, np.asarray(x_px, float))
+) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"], Float[ndarray, "*points 2 2"]]:
+    """Return derivatives of points on the gripper, in camera axes, by the joint unknowns and by their pixels.
+
+    Return also the covariance of the pixels by the remaining error of the camera model.
+    """
+    x_px, left = np.asarray(x_px, float), uncertainty.model_error
+    of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)
+    ray = unproject(intrinsics, x_px)
     length = np.linalg.norm(ray, axis=-1)[..., None, None]
     unit, distance = ray / length[..., 0], np.asarray(distance_m)[..., None]
     across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
@@ -288,7 +290,7 @@ def _derivatives(
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
     if uncertainty.joint is None:
-        return by_unknown, by_pixel
+        return by_unknown, by_pixel, of_pixel
     # The pixel is fixed: the ray compensates a change of the projection by the parameters.
     by_intrinsics = -by_pixel @ by_parameters(intrinsics, ray)
-    return np.concatenate([by_unknown, by_intrinsics], axis=-1), by_pixel
+    return np.concatenate([by_unknown, by_intrinsics], axis=-1), by_pixel, of_pixel

@@ -62,19 +62,6 @@ class Observations:
     point_rows: Int[ndarray, " p"] | None = None
     """Row of each point among those that were given; None: all points."""
 
-    @staticmethod
-    def of_one_camera(tracks: Tracks, images: int) -> "Observations":
-        """Return the observations of one camera, each of whose images is a rig."""
-        each = np.arange(images)
-        return Observations(
-            rig=each,
-            camera=np.zeros_like(each),
-            image=tracks.image,
-            x_px=tracks.x_px,
-            point=tracks.point,
-            std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
-        )
-
 
 CELLS = 8
 """Cells across the width of an image, within which features share errors."""
@@ -555,6 +542,8 @@ def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarr
 
 Start = tuple[Transform, float, Transform]
 """Initial estimate of gripper_from_camera, scale and base_from_recon."""
+NO_ARM: Start = np.eye(4), 1.0, np.eye(4)
+"""Start of a problem of images alone."""
 
 
 def wrist_arm(
@@ -590,7 +579,7 @@ def pose_problem(
 
 
 def wrist_problem(
-    arm: ReportedPoses,
+    arm: ReportedPoses | None,
     start: Start,
     recon_from_camera: Poses,
     camera: CameraPrior,
@@ -601,43 +590,38 @@ def wrist_problem(
 ) -> tuple[Problem, State]:
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
-    `arm` moves rig i at image i. `noise` is a lower bound on the random errors of the poses (m, rad), and
-    `combinations` of the columns of hypotheses.Alternatives are free.
+    `arm` moves rig i at image i; None: images alone, without boards. `noise` is a lower bound on the random errors of
+    the poses (m, rad), and `combinations` of the columns of hypotheses.Alternatives are free.
     """
     x, scale, z = start
+    arms, n = () if arm is None else (arm,), len(recon_from_camera)
     points_in_world = scale * tracks.points_in_recon.astype(float)
     twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
-    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(arm.rigs))
+    bodies = None if arm is None else tracks.boards
+    boards, world_from_board = shapes_of(bodies, points_in_world, twice, n)
     problem = Problem(
-        arms=(arm,),
-        n_rigs=len(arm.rigs) + len(world_from_board),
+        arms=arms,
+        n_rigs=n + len(world_from_board),
         cameras=(camera,),
         boards=boards,
         robot_noise_floor=noise,
     )
     state = State(
-        x=x[None],
+        x=x[None][: len(arms)],
         scale=1.0,
-        z=z[None],
+        z=z[None][: len(arms)],
         world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
         points_in_world=points_in_world,
     )
+    each = np.arange(n)
     if combinations is not None:
-        problem = freed(problem, combinations, arm.rigs, len(arm.rigs))
-    return with_observations(problem, state, Observations.of_one_camera(tracks, len(arm.rigs)))
-
-
-def image_problem(
-    world_from_rig: Float[ndarray, "m 4 4"],
-    camera: CameraPrior,
-    observations: Observations,
-    points_in_world: Float[ndarray, "p 3"],
-    boards: BoardShapes | None = None,
-) -> tuple[Problem, State]:
-    """Return the problem of the images of one camera without an arm, and its initial state."""
-    nothing = np.zeros((0, 4, 4))
-    state = State(
-        x=nothing, scale=1.0, z=nothing, world_from_rig=world_from_rig, points_in_world=points_in_world
+        problem = freed(problem, combinations, each, n)
+    observations = Observations(
+        rig=each,
+        camera=np.zeros_like(each),
+        image=tracks.image,
+        x_px=tracks.x_px,
+        point=tracks.point,
+        std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
     )
-    problem = Problem(arms=(), n_rigs=len(world_from_rig), cameras=(camera,), boards=boards)
     return with_observations(problem, state, observations)

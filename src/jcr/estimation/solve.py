@@ -211,7 +211,7 @@ def solve(
         state = with_pixel_noise(problem, start, view_of(problem, start))
         noise = np.repeat(problem.robot_noise_floor or start_noise, 3)
         white = np.tile(noise, sum(len(arm.rigs) for arm in problem.arms))
-        start = adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])[0]
+        start = adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])
     state, images, settled, rounds, last_step = _rounds(problem, start)
     found = with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
@@ -342,7 +342,7 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
             state = _state_at(problem, start, moved, _accelerated(ends, steps, judged, std))
         else:
             information = _rig_information(problem, state, root)
-            state = adjusted_images(problem, state, [information])[0]
+            state = adjusted_images(problem, state, [information])
             state = _most_likely_arms(problem, state, image_evidence(problem, state), STEP_SETTLED**2)
             ends, steps = [], []
     state = replace(state, robot_log_sizes=log_sizes)
