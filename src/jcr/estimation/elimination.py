@@ -86,14 +86,6 @@ class Derivatives:
     residual: Float[ndarray, "k 2"]
 
 
-def in_order(order: Int[ndarray, " k"], *parts: Derivatives) -> Derivatives:
-    """Return the rows of several parts, one after the other, in another order."""
-    names = ("shared", "own", "by_point", "residual")
-    return Derivatives(
-        **{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
-    )
-
-
 @dataclass(frozen=True)
 class Sightings:
     """Observations sorted by point and then by image, and the images that they are in."""

@@ -22,7 +22,6 @@ from jcr.estimation.projection import (
     ProjectedObservations,
     by_points,
     derivatives,
-    shape_information,
     shape_residuals,
     view_of,
 )
@@ -101,7 +100,10 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
     if before is None or (layout.groups == 1 and not layout.states_variances):
         noise = pixel_noise(layout, residual_px, depth, np.ones(layout.groups))
     else:
-        by, known = by_points(problem, state, view), shape_information(problem, state)
+        by, known = by_points(problem, state, view), None
+        if problem.boards is not None:
+            shape = state.camera_steps[problem.columns.boards]
+            known = problem.boards.point_information(state.world_from_rig, shape, len(state.points_in_world))
         noise = refined_noise(layout, before, residual_px, depth, by, problem.seen.starts, known)
     return replace(state, pixel_noise=noise)
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import by_parameters, by_point, project
-from jcr.estimation.elimination import Derivatives, in_order
+from jcr.estimation.elimination import Derivatives
 from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State
 from jcr.geometry import skew
 from jcr.records import Intrinsics
@@ -117,7 +117,8 @@ def derivatives(
         columns.boards,
         columns.first_rig,
     )
-    return in_order(problem.rows[0], of_images, of_boards)
+    both, order = [vars(of_images), vars(of_boards)], problem.rows[0]
+    return Derivatives(**{name: np.concatenate([part[name] for part in both])[order] for name in both[0]})
 
 
 def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
@@ -126,14 +127,6 @@ def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
         return np.zeros((0, 3))
     shape = state.camera_steps[problem.columns.boards]
     return problem.boards.residual(state.world_from_rig, state.points_in_world, shape)
-
-
-def shape_information(problem: Problem, state: State) -> Float[ndarray, "p 3 3"] | None:
-    """Return the information that the shapes of boards give about each point; None without boards."""
-    if problem.boards is None:
-        return None
-    shape = state.camera_steps[problem.columns.boards]
-    return problem.boards.point_information(state.world_from_rig, shape, len(state.points_in_world))
 
 
 def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
