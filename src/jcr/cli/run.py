@@ -61,14 +61,12 @@ class CalibrateCommand:
 
         with progress_bars() as progress:
             capture = _source(self, read_source, progress)
-            if isinstance(capture, PosePairs):
-                result, is_marker = calibrate_poses(capture, self.out, self.calibrate), True
-                show_calibration(result, capture, self.output)
-            else:
-                result, is_marker = _run(self, capture, run_options(self, map=None), progress), False
-        if is_marker and result.converged and is_one(result.found):
-            return show(result, self.output, *labelled("Scale", "1, as the marker's size says"))
-        return show(result, self.output)
+            if not isinstance(capture, PosePairs):
+                return show(_run(self, capture, run_options(self, map=None), progress), self.output)
+            result = calibrate_poses(capture, self.out, self.calibrate)
+        show_calibration(result, capture, self.output)
+        is_marker = result.converged and is_one(result.found)
+        return show(result, self.output, *labelled("Scale", *["1, as the marker's size says"] * is_marker))
 
 
 @dataclass(frozen=True, kw_only=True)

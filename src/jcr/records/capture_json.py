@@ -28,7 +28,6 @@ NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
 Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
 MOST_ROTATION = 6 * np.pi + 0.01
 """Largest joint angle, rad: no joint rotates farther to either side."""
-PARAMETERS = ("fx", "fy", "cx", "cy")
 Std = Annotated[float, Field(ge=0, lt=HUGE)] | None
 
 
@@ -96,7 +95,7 @@ class IntrinsicsEntry(Entry):
     def of(intrinsics: Intrinsics) -> "IntrinsicsEntry":
         """Return the entry of intrinsics."""
         model = {} if intrinsics.model == "pinhole" else {"model": intrinsics.model}
-        numbers = {key: getattr(intrinsics, key) for key in PARAMETERS}
+        numbers = {key: getattr(intrinsics, key) for key in ("fx", "fy", "cx", "cy")}
         return IntrinsicsEntry(**model, **numbers, distortion=list(intrinsics.distortion))
 
     def record(self, size: tuple[int, int], where: str) -> Intrinsics:
@@ -127,22 +126,6 @@ class StdEntry(Entry, extra="forbid"):
     cx: Std = None
     cy: Std = None
     distortion: list[Std] = []
-
-    @staticmethod
-    def of(std: Float[ndarray, " p"]) -> "StdEntry":
-        """Return the entry of standard deviations, NaN where one is not stated."""
-        values = [None if np.isnan(value) else value for value in std.tolist()]
-        return StdEntry(**dict(zip(PARAMETERS, values, strict=False)), distortion=values[4:])
-
-    def array(self, intrinsics: Intrinsics | None, where: str) -> Float[ndarray, " p"]:
-        """Return the standard deviations in the order of `intrinsics`, NaN where one is not stated."""
-        if intrinsics is None:
-            raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
-        count = len(intrinsics.distortion)
-        if len(self.distortion) > count:
-            raise InputError(f"{where}: distortion must be a list of at most {count} numbers")
-        values = [*(getattr(self, name) for name in PARAMETERS), *self.distortion]
-        return np.array([*values, *[None] * (4 + count - len(values))], dtype=np.float64)
 
 
 class FrameEntry(Entry):

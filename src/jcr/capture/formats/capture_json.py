@@ -180,15 +180,27 @@ def _stated_intrinsics(
     """Return the fields `intrinsics` and `intrinsics_std` of a record of images of `size`."""
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
-    spread = None if std is None else std.array(intrinsics, f"{where}: intrinsics_std")
-    return {"intrinsics": intrinsics, "intrinsics_std": spread}
+    if std is None:
+        return {"intrinsics": intrinsics}
+    where = f"{where}: intrinsics_std"
+    if intrinsics is None:
+        raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
+    if (missing := len(intrinsics.distortion) - len(std.distortion)) < 0:
+        raise InputError(
+            f"{where}: distortion must be a list of at most {len(intrinsics.distortion)} numbers"
+        )
+    values = [std.fx, std.fy, std.cx, std.cy, *std.distortion, *[None] * missing]
+    return {"intrinsics": intrinsics, "intrinsics_std": np.array(values, np.float64)}
 
 
 def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
     """Return the entries of the intrinsics of a record, the inverse of `_stated_intrinsics`."""
     given, std = record.intrinsics, record.intrinsics_std
     entries: dict[str, Any] = {"intrinsics": None if given is None else IntrinsicsEntry.of(given)}
-    return entries if std is None else entries | {"intrinsics_std": StdEntry.of(std)}
+    if std is not None:
+        fx, fy, cx, cy, *distortion = (None if np.isnan(value) else value for value in std.tolist())
+        entries["intrinsics_std"] = StdEntry(fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion)
+    return entries
 
 
 def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
