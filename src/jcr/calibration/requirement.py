@@ -206,8 +206,9 @@ def advised(
         return hand_eye
     systematic = uncertainty.budget is not None and uncertainty.budget.mostly_systematic
     concerns: Concerns = "images" if more is not None else "robot" if systematic else "none"
-    short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects" if required.asked else "warns", concerns)
-    return hand_eye.with_findings(replace(short, value=1e-3 * required.reached_mm, details=required.details))
+    severity, size = "rejects" if required.asked else "warns", 1e-3 * required.reached_mm
+    short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, severity, concerns, value=size, **required.details)
+    return hand_eye.with_findings(short)
 
 
 def _required(uncertainty: Uncertainty, options: CalibrateOptions) -> Requirement:

@@ -18,6 +18,8 @@ Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", 
 """Part of the capture that the remedy changes: another reconstruction of the same images, other motions, more or other
 images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles; or nothing."""
 Verdict = Literal["accepted", "accepted with warnings", "rejected"]
+NUMBERS = ("joints", "value", "std", "p", "shift", "intrinsics_shift")
+"""Fields of a finding that are its numbers."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
@@ -53,8 +55,8 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Make a finding about these images; `known` are its value, std and p, and details by their names."""
-        sizes = {name: known.pop(name) for name in ("value", "std", "p") if name in known}
+        """Make a finding about these images; `known` are its numbers, and details by their names."""
+        sizes = {name: known.pop(name) for name in NUMBERS if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
     @property
@@ -170,7 +172,7 @@ def unobservable(finding: Finding) -> str:
 
 def reached_in_words(required: Requirement) -> str:
     """Return the bound of 95 % of the errors beside the requirement, in words."""
-    short = Finding(kind=FindingKind.NOT_EXACT_ENOUGH, severity="informs", details=required.details)
+    short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "informs", "none", **required.details)
     return REACHED.format_map(Quantities.of(short))
 
 
@@ -191,10 +193,8 @@ def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
 
 def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
     """Return the failure of every back end as findings."""
-    details = {"text": error.what, "remedy": "; ".join(error.remedies)}
-    failed = Finding(
-        kind=FindingKind.NO_RECONSTRUCTION, severity="rejects", concerns="reconstruction", details=details
-    )
+    words = {"text": error.what, "remedy": "; ".join(error.remedies)}
+    failed = Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", **words)
     return (failed, *(Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in error.also))
 
 

@@ -26,12 +26,8 @@ def check_boards(case: Case) -> Case:
         return case
     findings = list[Finding]()
     if not boards.bodies and not boards.elsewhere:
-        details = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
-        findings.append(
-            Finding(
-                kind=FindingKind.BOARD_NOT_FOUND, severity="warns", concerns="reconstruction", details=details
-            )
-        )
+        names = {"board": boards.spec} | ({"proposed": boards.proposed} if boards.proposed else {})
+        findings.append(Finding.of(FindingKind.BOARD_NOT_FOUND, "warns", "reconstruction", **names))
     if boards.elsewhere:
         elsewhere = [case.names[row] for row in boards.elsewhere]
         findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
@@ -41,10 +37,8 @@ def check_boards(case: Case) -> Case:
     findings += board_faults(case)
     found = board_found(case.adjusted, boards)
     if boards.size_std is None and hand_eye.source == "images":
-        side = 1e-3 * found.side_mm, 1e-3 * found.side_std_mm
-        findings.append(
-            Finding.of(FindingKind.BOARD_SIDE, "informs", value=side[0], std=side[1], board=boards.spec)
-        )
+        side = {"value": 1e-3 * found.side_mm, "std": 1e-3 * found.side_std_mm}
+        findings.append(Finding.of(FindingKind.BOARD_SIDE, "informs", "none", **side, board=boards.spec))
     return case.after(tuple(findings), replace(hand_eye, board=found))
 
 

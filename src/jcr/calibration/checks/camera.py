@@ -351,11 +351,12 @@ def camera_finding(after: CameraAdjustment, before: CameraAdjustment) -> Finding
         log_p = min(log_p, before.log_p_of_given)
     step = step_between(place(before.adjusted.state), place(after.adjusted.state)).tolist()
     growth = float(np.log(after.adjusted.state.scale / before.adjusted.state.scale))
-    return Finding(
-        kind=best.kind,
-        severity="warns",
-        concerns=CONCERNS.get(best.kind, "images"),
-        images=tuple(after.names[best.after : best.after + 2]) if best.kind is FindingKind.ZOOM else (),
+    changed = after.names[best.after : best.after + 2] if best.kind is FindingKind.ZOOM else ()
+    return Finding.of(
+        best.kind,
+        "warns",
+        CONCERNS.get(best.kind, "images"),
+        *changed,
         p=float(np.exp(max(log_p, -700))),
         shift=(*step, growth),
         intrinsics_shift=tuple((parameters(after.intrinsics) - parameters(before.intrinsics)).tolist()),
@@ -372,7 +373,7 @@ def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[st
     if best.kind is FindingKind.INTRINSICS:
         units = dict(zip(after.equations.names, after.equations.units, strict=True))
         stds = {name: float(one * units[name]) for name, one in zip(_freed(after), std, strict=True)}
-        return {"details": _intrinsics(after, stds)}
+        return _intrinsics(after, stds)
     value = after.estimates(best)
     if best.kind is FindingKind.THIN_PRISM:
         moved = after.adjusted.problem.prism @ value

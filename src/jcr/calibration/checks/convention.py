@@ -6,7 +6,7 @@ are solved. A reading that fits is named, and never applied.
 
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -135,8 +135,8 @@ def convention_finding(
         for reading in found
     )
     details = {"reading": found[0].name, "fits": fits, "given": given, "remedy": found[0].remedy}
-    finding = Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=1e-3 * found[0].translation_mm)
-    return replace(finding, details=details)
+    size = 1e-3 * found[0].translation_mm
+    return Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=size, **details)
 
 
 def _solved(

@@ -210,31 +210,26 @@ def pose_finding(
         straight = straight_shift(poses.equations, poses.log_sizes, columns)[poses.columns[:6]]
         if not (np.abs([own, straight]) > MATERIAL * std).any():
             return None
-        return replace(Finding.of(kind, "warns", "robot", p=p), **_size_of_strain(test))
+        return Finding.of(kind, "warns", "robot", p=p, **_size_of_strain(test))
     if kind is FindingKind.DELAY:
         moved = own
     if not (np.abs(moved) > MATERIAL * std).any():
         return None
-    found = Finding.of(kind, "warns", "mount", p=p)
-    if kind is FindingKind.DELAY:
-        size, std_of_size = float(test.estimate[0]), float(np.sqrt(test.covariance[0, 0]))
-        found = replace(found, concerns="poses", value=size, std=std_of_size, details={"unit": "interval"})
-        return replace(found, shift=(*own.tolist(), 0.0))
-    metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1).tolist()
-    found = replace(found, value=metres, details={"rotation": radians})
-    if kind is FindingKind.DRIFT:
-        return replace(found, shift=(*(moved / 2).tolist(), 0.0))
-    count, longer = max((place, "before"), (len(names) - place, "after"))
     # A base that moves takes no part in the hand-eye transform: its shift is what it does to the fit.
-    shift, concerns = (moved, "mount") if kind is FindingKind.SLIP else (own, "poses")
-    return replace(
-        found,
-        severity="rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns",
-        concerns=concerns,
-        images=(names[place - 1], names[place]),
-        shift=(*shift.tolist(), 0.0),
-        details={"rotation": radians, "longer": longer, "count": float(count)},
-    )
+    shift = {FindingKind.SLIP: moved, FindingKind.DRIFT: moved / 2}.get(kind, own)
+    known: dict[str, Any] = {"p": p, "shift": (*shift.tolist(), 0.0)}
+    if kind is FindingKind.DELAY:
+        size = {"value": float(test.estimate[0]), "std": float(np.sqrt(test.covariance[0, 0]))}
+        return Finding.of(kind, "warns", "poses", unit="interval", **size, **known)
+    metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1).tolist()
+    known |= {"value": metres, "rotation": radians}
+    if kind is FindingKind.DRIFT:
+        return Finding.of(kind, "warns", "mount", **known)
+    count, longer = max((place, "before"), (len(names) - place, "after"))
+    severity = "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns"
+    concerns = "mount" if kind is FindingKind.SLIP else "poses"
+    known |= {"longer": longer, "count": float(count)}
+    return Finding.of(kind, severity, concerns, names[place - 1], names[place], **known)
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
@@ -253,11 +248,7 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
         by = np.einsum("a,kab,b->k", axis, STRAINS, axis)
         # The two other axes are shorter by half of the strain each.
         value, std = 1.5 * float(values[k]), 1.5 * float(np.sqrt(by @ covariance @ by))
-    return {
-        "value": value,
-        "std": std,
-        "details": {"frame": frame} | dict(zip("xyz", axis.tolist(), strict=True)),
-    }
+    return {"value": value, "std": std, "frame": frame, **dict(zip("xyz", axis.tolist(), strict=True))}
 
 
 def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]) -> Case:

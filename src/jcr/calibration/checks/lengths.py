@@ -149,16 +149,10 @@ def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding
         size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
         return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", **size)
     exact = of_robot and max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
-    found = Finding(
-        kind=FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES,
-        severity="rejects" if exact else "warns",
-        concerns="poses",
-        value=float(np.expm1(off)),
-        std=std,
-        details={"one": one.name, "other": other.name},
-    )
-    is_shifted = of_robot and other.std < EXACT
-    return replace(found, shift=tuple(_shift(off, hand_eye).tolist())) if is_shifted else found
+    kind = FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES
+    shift = tuple(_shift(off, hand_eye).tolist()) if of_robot and other.std < EXACT else None
+    size = {"value": float(np.expm1(off)), "std": std, "shift": shift, "one": one.name, "other": other.name}
+    return Finding.of(kind, "rejects" if exact else "warns", "poses", **size)
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
@@ -204,16 +198,12 @@ def check_predicted_focal(case: Case) -> Case:
     if abs(off) < OF_NETWORK * np.hypot(relative_std, MEASURED["f"]):
         return case
     sizes = f"{focal:.0f} ± {significant(focal * relative_std)} px where {given.fx:.0f} is given"
-    details = {
-        "source": "pointmaps",
-        "shown": f"a focal length of {sizes}",
-        "fx": focal,
-        "fx_given": given.fx,
-    }
+    shown = {"source": "pointmaps", "shown": f"a focal length of {sizes}"}
     by_focal = camera_with_prior(case.reconstruction.intrinsics, {"f": abs(off)})
     moved = tuple((by_focal.directions @ by_focal.std).tolist())
-    found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **details)
-    return case.after((replace(found, shift=(0.0,) * 7, intrinsics_shift=moved),))
+    shifts = {"shift": (0.0,) * 7, "intrinsics_shift": moved}
+    found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **shown, **shifts)
+    return case.after((found,))
 
 
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:

@@ -1,6 +1,7 @@
 """Check of the joints of a known arm."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,15 +40,10 @@ def check_robot(case: Case) -> Case:
         return replace(case, hand_eye=hand_eye)
     degrees = np.degrees([found.offset, found.std]).T
     sizes = joined(f"{degrees[k, 0]:+.2f} ± {degrees[k, 1]:.2f}°" for k in off)
-    details = {"shown": f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)} seem off by {sizes}"}
+    details: dict[str, Any] = {
+        "shown": f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)} seem off by {sizes}"
+    }
     for k in off:
         details |= {f"joint_{k + 1}": float(found.offset[k]), f"joint_{k + 1}_std": float(found.std[k])}
-    finding = Finding(
-        kind=FindingKind.JOINT_OFFSETS,
-        severity="informs",
-        concerns="robot",
-        joints=tuple(k + 1 for k in off),
-        value=float(np.abs(found.offset[off]).max()),
-        details=details,
-    )
-    return case.after((finding,), hand_eye)
+    details |= {"joints": tuple(k + 1 for k in off), "value": float(np.abs(found.offset[off]).max())}
+    return case.after((Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", **details),), hand_eye)
