@@ -40,9 +40,8 @@ def check_robot(case: Case) -> Case:
         return replace(case, hand_eye=hand_eye)
     degrees = np.degrees([found.offset, found.std]).T
     sizes = joined(f"{degrees[k, 0]:+.2f} ± {degrees[k, 1]:.2f}°" for k in off)
-    details: dict[str, Any] = {
-        "shown": f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)} seem off by {sizes}"
-    }
+    named = f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)}"
+    details: dict[str, Any] = {"shown": f"{named} seem off by {sizes}"}
     for k in off:
         details |= {f"joint_{k + 1}": float(found.offset[k]), f"joint_{k + 1}_std": float(found.std[k])}
     details |= {"joints": tuple(k + 1 for k in off), "value": float(np.abs(found.offset[off]).max())}
