@@ -91,9 +91,9 @@ def derived(findings: Sequence[Finding]) -> dict[str, Any]:
     }
 
 
-def require_one_verdict(findings: Sequence[Finding], verdict: Verdict, converged: bool) -> None:
+def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
     """Raise ValueError where the verdict contradicts the findings."""
-    if verdict != verdict_of(findings) or converged is (verdict == "rejected"):
+    if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 
 
@@ -387,14 +387,13 @@ class Calibration(Outcome):
 
     def as_html(self, note: str = "") -> str:
         """Return the transform with its standard deviations, the verdict and the warnings as a table, `note` below."""
-        uncertainty, matrix = self.uncertainty, self.parent_from_camera
-        degrees = np.degrees(rotation_log(matrix[:3, :3]))
+        mm, degrees = (
+            1e3 * self.parent_from_camera[:3, 3],
+            np.degrees(rotation_log(self.parent_from_camera[:3, :3])),
+        )
+        std_mm, std_deg = self.uncertainty.translation_std_mm, self.uncertainty.rotation_std_deg
         rows = [("", "translation", "rotation vector")] + [
-            (
-                axis,
-                f"{1e3 * matrix[k, 3]:.2f} ± {uncertainty.translation_std_mm[k]:.2f} mm",
-                f"{degrees[k]:.3f} ± {uncertainty.rotation_std_deg[k]:.3f}°",
-            )
+            (axis, f"{mm[k]:.2f} ± {std_mm[k]:.2f} mm", f"{degrees[k]:.3f} ± {std_deg[k]:.3f}°")
             for k, axis in enumerate("xyz")
         ]
         used = f"{self.images_used} of {len(self.images)} images used"
@@ -503,12 +502,10 @@ def validated(content: dict[str, object], file: Path) -> AnyCalibration:
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
         found = adapter(record).validate_json(json.dumps(content), strict=True)
-    except ValidationError as error:
-        raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
+        require_one_verdict(found.findings, content.get("verdict"), content.get("converged"))
+    except ValueError as error:
+        fault = first_fault(error) if isinstance(error, ValidationError) else error
+        raise InputError(f"{file}: {fault}; run the calibration again") from None
     if unknown := content.keys() - found.as_json().keys():
         raise InputError(f"{file}: {min(unknown)}: no such key; run the calibration again")
-    if (content.get("verdict"), content.get("converged")) != (found.verdict, found.converged):
-        raise InputError(
-            f"{file}: converged, verdict and findings contradict one another; run the calibration again"
-        )
     return found

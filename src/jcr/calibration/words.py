@@ -54,7 +54,10 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
 
     A rejected calibration has its cause and remedy instead of the transform.
     """
-    limit = "" if content.requirement is None else f" ({_limit(content)})"
+    limit = ""
+    if (required := content.requirement) is not None:
+        unmet = "" if required.met else " not met"
+        limit = f" (limit {required.translation_mm:g} mm, {required.rotation_deg:g}°{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {len(content.images)} images"
     seconds = sum(content.timings_s.values())
@@ -69,21 +72,6 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     if content.converged and content.short is None and proposed:
         lines += labelled("To improve", proposed)
     return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines), proposed)]) + "\n"
-
-
-def _limit(content: AnyCalibration) -> str:
-    """Return the requirement, and where in the image it is not met."""
-    required = content.requirement
-    assert required is not None
-    limit = f"limit {required.translation_mm:g} mm, {required.rotation_deg:g}°"
-    if not required.met:
-        return f"{limit} not met"
-    corner = None if content.uncertainty is None else content.uncertainty.corner
-    if corner is None or required.at != "seen":
-        return limit
-    exceeded = [f"{significant(corner.within_95_mm)} mm"] * (corner.within_95_mm > required.translation_mm)
-    exceeded += [f"{significant(corner.rotation_95_deg)}°"] * (corner.rotation_95_deg > required.rotation_deg)
-    return f"{limit} met at the image centre, not in the corner: {', '.join(exceeded)}" if exceeded else limit
 
 
 def _result(content: Calibration) -> list[str]:
