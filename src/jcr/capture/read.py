@@ -127,9 +127,9 @@ def _extracted(path: Path, options: ReadOptions, into: Path, form: Any, progress
     digest = hashlib.sha256(json.dumps(states).encode()).hexdigest()
     made_from = [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]
     file = into / capture_json.FILE
-    before = capture_json.read_capture_json(file).model_extra if file.is_file() else None
-    if before is None or before.get("made_from") != made_from:
+    extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
+    if extra.get("made_from") != made_from:
         capture = _inverted(form.read(path, options, into, progress), options)
-        capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
-    extra = capture_json.read_capture_json(file).model_extra or {}
+        extra = {"notes": capture.notes, "made_from": made_from}
+        capture_json.write(into, capture, **extra)
     return replace(capture_json.read(into), notes=tuple(extra["notes"]))
