@@ -25,8 +25,6 @@ USUAL_FOCAL = 0.8
 """Focal length of an unknown camera in long sides of its image, 64° wide; wrist cameras have 0.5 to 1.2."""
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
-PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2")
-"""The parameters with which every model begins; the other coefficients follow, as records.COEFFICIENTS has them."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
 """Its pixels are x/z, y/z."""
 Coordinate = Float[ndarray, "*batch"] | np.floating
@@ -45,7 +43,7 @@ def parameter_names(camera: Intrinsics) -> tuple[str, ...]:
 
 
 def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
-    """Return the camera as a vector: PARAMETERS, and the other coefficients of its model."""
+    """Return the camera as a vector: focal lengths, principal point, and the coefficients of its model."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
