@@ -119,9 +119,8 @@ def check_capture(
     if move_m < 5e-3 and rotation_rad > np.radians(5):
         moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
         notes.append(f"the gripper moves {moved}: the positions may have been divided by 1000")
-    mm_deg = robot_noise and (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
-    options, camera, sharpness = CalibrateOptions(robot_noise=mm_deg), None, np.zeros(0)
-    views, shown = (), _Comparison()
+    options = CalibrateOptions(robot_noise=robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1])))
+    camera, sharpness, views, shown = None, np.zeros(0), (), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear, shown = errors_of(given), np.arange(len(capture)), _compare_pairs(capture, options)
     else:
