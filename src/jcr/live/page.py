@@ -25,7 +25,7 @@ from jcr.live.progress import (
 )
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
-from jcr.report.render import Section, render
+from jcr.report.render import render
 from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
 from jcr.rounding import significant
@@ -53,7 +53,7 @@ def whole_page(session: LiveSession) -> str:
     """Return the page as a browser loads it; its script requests the parts after that."""
     checks = [(name, label, True) for name, label in LAYERS.items()]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
-    content = {"folder": str(session.folder.folder), "scene": Section("view", view)}
+    content = {"folder": str(session.folder.folder), "scene": view}
     return render("live.html", content, PACKAGE)
 
 

@@ -13,7 +13,7 @@ from jcr.calibration.record import AnyCalibration
 from jcr.calibration.words import facts
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
-from jcr.report.render import Section, label_colors
+from jcr.report.render import Content, label_colors
 from jcr.rounding import significant
 from jcr.segments.measure import Measurement
 
@@ -24,7 +24,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
-) -> Section:
+) -> Content:
     """Return blocks of names and values."""
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
@@ -34,10 +34,10 @@ def details_section(
         }
     versions = {"jcr": calibration.version, "python": platform.python_version()}
     blocks["Versions"] = versions | {name: metadata.version(name) for name in PACKAGES if is_installed(name)}
-    return Section("details", {"blocks": {title: rows for title, rows in blocks.items() if rows}})
+    return {"blocks": {title: rows for title, rows in blocks.items() if rows}}
 
 
-def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Section:
+def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Content:
     """Return height and box of every object with one standard deviation, beside the colour of its label."""
     colors = label_colors(len(label_names)).tolist()
     rows = []
@@ -50,10 +50,10 @@ def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Sect
             height = f"at least {1e3 * one.height:.1f}"
         x, y = one.base_from_box[:2, 3]
         rows.append((one.name, colors[one.label], (height, length, width, f"{x:.3f}, {y:.3f}")))
-    return Section("objects", {"rows": rows, "noise": f"{1e3 * measured.support.noise:.1f}"})
+    return {"rows": rows, "noise": f"{1e3 * measured.support.noise:.1f}"}
 
 
-def cameras_section(cameras: CamerasFile) -> Section:
+def cameras_section(cameras: CamerasFile) -> Content:
     """Return a card for each camera, with its images, and for each arm."""
     cards = []
     for camera in cameras.cameras:
@@ -75,7 +75,7 @@ def cameras_section(cameras: CamerasFile) -> Section:
         name, matrix = "base_from_other_base", _matrix(np.array(arm.base_from_other_base), arm.uncertainty)
         about = {"rejected": False, "remarks": (), "images": ()}
         cards.append({"title": f"arm {arm.name}: {name}", "name": name, **about, **matrix})
-    return Section("cameras", {"cards": cards})
+    return {"cards": cards}
 
 
 def _matrix(

@@ -1,6 +1,6 @@
 """report.html: one file with the verdict on a calibration, the transform to copy, and the evidence."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
 from jcr.report.images import images_section
 from jcr.report.motion import motion_section
-from jcr.report.render import Section, render
+from jcr.report.render import Content, render
 from jcr.report.residuals import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
-from jcr.report.verdict import failure_section, head, notes_section
+from jcr.report.verdict import failure_section, head
 from jcr.result import RunResult
 from jcr.rounding import significant
 
@@ -55,38 +55,37 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
         given = "given" if capture.intrinsics is not None else "estimated"
         about = f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
-    if isinstance(calibration, FailedCalibration):
-        sections = [
-            failure_section(calibration),
-            images_section(capture),
-            details_section(calibration, options),
-        ]
-        return _page(about, source, calibration, sections)
     has_images = isinstance(capture, Capture)
     is_wrist, scene = has_images and capture.mount != "base", result.scene if has_images else None
-    measured = None if scene is None else result.measured
-    sections = [
-        *head(calibration),
-        transform_section(result.found),
-        scene_section(result) if is_wrist else None,
-        images_section(capture, result) if has_images else None,
-        cameras_section(result.cameras) if has_images and result.cameras is not None else None,
-        residuals_section(result),
-        motion_section(result) if is_wrist or not has_images else None,
-        None if scene is None or measured is None else objects_section(measured, scene.label_names),
-        *notes_section(calibration),
-        details_section(calibration, options, None if scene is None else scene.history),
-    ]
-    return _page(about, source, calibration, sections)
+    measured, sections = None if scene is None else result.measured, dict[str, Content | None]()
+    if isinstance(calibration, FailedCalibration):
+        sections |= {"failure": failure_section(calibration), "images": images_section(capture)}
+    else:
+        sections |= head(calibration)
+        sections |= {
+            "transform": transform_section(result.found),
+            "view": scene_section(result) if is_wrist else None,
+            "images": images_section(capture, result) if has_images else None,
+            "cameras": cameras_section(result.cameras) if has_images and result.cameras is not None else None,
+            "residuals": residuals_section(result),
+            "uncertainty": motion_section(result) if is_wrist or not has_images else None,
+            "objects": None
+            if scene is None or measured is None
+            else objects_section(measured, scene.label_names),
+            "notes": {"remarks": calibration.notes} if calibration.notes else None,
+        }
+    sections["details"] = details_section(calibration, options, None if scene is None else scene.history)
+    shown = {name: content for name, content in sections.items() if content is not None}
+    return _page(about, source, calibration, shown)
 
 
-def _page(about: str, source: Path, calibration: AnyCalibration, sections: Iterable[Section | None]) -> str:
+def _page(about: str, source: Path, calibration: AnyCalibration, sections: Mapping[str, Content]) -> str:
     """Return the whole page; `source` is the capture as the user named it."""
     # The table or the bag's metadata are called alike in every capture: their folder has the name.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
-    shown, lines = [section for section in sections if section is not None], [about]
+    lines = [about]
     if (found := calibration.intrinsics) is not None:
         focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
         lines.append(
@@ -96,8 +95,8 @@ def _page(about: str, source: Path, calibration: AnyCalibration, sections: Itera
     content = {
         "name": printable(named.resolve().name),
         "about": [*lines, run, printable(str(source))],
-        "sections": shown,
+        "sections": sections,
         "open": OPEN,
-        "links": {one.name: LINKS[one.name] for one in shown if one.name in LINKS},
+        "links": {name: LINKS[name] for name in sections if name in LINKS},
     }
     return render("report.html", content)

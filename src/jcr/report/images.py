@@ -12,7 +12,7 @@ from jcr.camera import is_distorted, project, resized, undistortion, unproject, 
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics
-from jcr.report.render import Section, image_url
+from jcr.report.render import Content, image_url
 from jcr.result import RunResult
 from jcr.rounding import significant
 
@@ -42,7 +42,7 @@ def image_numbers(image: ImageVerdict) -> str:
     return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
 
 
-def images_section(capture: Capture, result: RunResult | None = None) -> Section:
+def images_section(capture: Capture, result: RunResult | None = None) -> Content:
     """Return every image, of a calibration with its numbers, and the reason where it was rejected."""
     intrinsics = capture.intrinsics if result is None else result.intrinsics
     cards: list[dict[str, Any]] = [
@@ -64,7 +64,7 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Section
         "size": (intrinsics.width, intrinsics.height) if is_calibrated and intrinsics else capture.image_size,
         "pixels": pixels_of_file(intrinsics or capture.intrinsics, capture.image_size),
     }
-    return Section("images", content)
+    return content
 
 
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:

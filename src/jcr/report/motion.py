@@ -10,7 +10,7 @@ from jcr.calibration.words import given_in_words, seen_in_words
 from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.estimation.observability import WEAK, excitation
 from jcr.records import Capture, Excitation, NextPose
-from jcr.report.render import Section
+from jcr.report.render import Content
 from jcr.result import RunResult
 from jcr.rounding import significant
 
@@ -28,7 +28,7 @@ Bar = tuple[str, float, float, str]
 """Name, begin and width (percent), and number."""
 
 
-def motion_section(result: RunResult) -> Section:
+def motion_section(result: RunResult) -> Content:
     """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     calibration, spreads, seen = result.calibration, list[list[Bar]](), list[str]()
     observed, uncertainty = calibration.observability, calibration.uncertainty
@@ -54,7 +54,7 @@ def motion_section(result: RunResult) -> Section:
         "scale_percent": "" if uncertainty is None else significant(uncertainty.scale_std_percent),
         "next_poses": _next_poses(result),
     }
-    return Section("uncertainty", content)
+    return content
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:

@@ -4,7 +4,6 @@ import base64
 import colorsys
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -20,14 +19,8 @@ TRACK_COLOR = (229, 40, 40)
 JPEG_QUALITY = 80
 
 
-@dataclass(frozen=True)
-class Section:
-    """Section of the report."""
-
-    name: str
-    """Id in the page, and name of the template in templates/."""
-    content: Mapping[str, Any]
-    """Content, the variable `it` of the template."""
+Content = Mapping[str, Any]
+"""Content of a section of the report: the variable `it` of its template."""
 
 
 def render(template: str, content: Mapping[str, Any], package: str = REPORT) -> str:

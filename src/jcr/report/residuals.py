@@ -4,7 +4,7 @@ import numpy as np
 
 from jcr.calibration.words import leave_one_out_text
 from jcr.report.images import shown_names
-from jcr.report.render import Section
+from jcr.report.render import Content
 from jcr.result import RunResult
 from jcr.rounding import significant
 
@@ -12,7 +12,7 @@ NOTICEABLE = 1.05
 """Times the random noise, from which the noise with systematic errors is named beside it."""
 
 
-def residuals_section(result: RunResult) -> Section:
+def residuals_section(result: RunResult) -> Content:
     """Return residuals by image and of the whole fit."""
     fit = result.found
     named = zip(shown_names(fit.images), fit.images, strict=True)
@@ -40,4 +40,4 @@ def residuals_section(result: RunResult) -> Section:
         "translation": f"{significant(1e3 * fit.residuals.translation)} mm",
         "rotation": significant(fit.residuals.rotation),
     }
-    return Section("residuals", content)
+    return content

@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.geometry import inverse, scale_translation
 from jcr.records import Intrinsics
 from jcr.report.images import image_numbers, shown_names
-from jcr.report.render import TRACK_COLOR, Section, label_colors
+from jcr.report.render import TRACK_COLOR, Content, label_colors
 from jcr.result import RunResult
 from jcr.scene.surface import point_size, sample_surface
 
@@ -27,7 +27,7 @@ PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
 squares that are drawn in their place."""
 
 
-def scene_section(result: RunResult) -> Section:
+def scene_section(result: RunResult) -> Content:
     """Return the section of the 3D view: cameras, grippers and points in the base frame."""
     calibration, reconstruction = result.found, result.reconstruction
     x, next_poses, base_from_recon = (
@@ -84,7 +84,7 @@ def scene_section(result: RunResult) -> Section:
         "labels": labels,
         "data": data,
     }
-    return Section("view", content)
+    return content
 
 
 def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:

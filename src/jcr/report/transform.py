@@ -22,7 +22,7 @@ from jcr.export.ros import (
 )
 from jcr.geometry import apply, roll_pitch_yaw
 from jcr.records import COVARIANCE_ORDER, Intrinsics, Mount
-from jcr.report.render import Section
+from jcr.report.render import Content
 from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
@@ -34,7 +34,7 @@ FLANGE_M = 0.0315
 """Radius of the drawn flange: ISO 9409-1-50."""
 
 
-def transform_section(hand_eye: Calibration) -> Section:
+def transform_section(hand_eye: Calibration) -> Content:
     """Return the section of gripper_from_camera, or of base_from_camera for a fixed camera."""
     x, mount, std = hand_eye.parent_from_camera, hand_eye.mount, hand_eye.uncertainty.std
     parent = PARENT if mount == "gripper" else BASE
@@ -79,7 +79,7 @@ def transform_section(hand_eye: Calibration) -> Section:
         "order": order,
         "camera_info": None if hand_eye.intrinsics is None else camera_info(mounted),
     }
-    return Section("transform", content)
+    return content
 
 
 def sketch(

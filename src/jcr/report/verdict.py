@@ -6,28 +6,21 @@ from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.words import leave_one_out_text, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
 from jcr.findings.table import SHORT
-from jcr.report.render import Section
+from jcr.report.render import Content
 from jcr.rounding import significant
 
 Tile = tuple[str, str, str, bool]
 """Name, number, remark, and whether it is one of the main numbers."""
 
 
-def head(calibration: AnyCalibration) -> list[Section]:
+def head(calibration: AnyCalibration) -> dict[str, Content]:
     """Return the sections of verdict, main numbers and warnings."""
-    sections = [
-        Section("verdict", _verdict(calibration)),
-        Section("tiles", {"tiles": list(_tiles(calibration))}),
-    ]
-    return sections + [Section("warnings", {"remarks": calibration.remarks})] * bool(calibration.remarks)
+    sections: dict[str, Content] = {"verdict": _verdict(calibration)}
+    sections["tiles"] = {"tiles": list(_tiles(calibration))}
+    return sections | ({"warnings": {"remarks": calibration.remarks}} if calibration.remarks else {})
 
 
-def notes_section(calibration: AnyCalibration) -> list[Section]:
-    """Return the section of the notes; none where there are none."""
-    return [Section("notes", {"remarks": calibration.notes})] * bool(calibration.notes)
-
-
-def failure_section(calibration: AnyCalibration) -> Section:
+def failure_section(calibration: AnyCalibration) -> Content:
     """Return the fault, its remedies, and the reason why each back end failed."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
@@ -45,7 +38,7 @@ def failure_section(calibration: AnyCalibration) -> Section:
             for attempt in calibration.attempts
         ],
     }
-    return Section("failure", content)
+    return content
 
 
 def _verdict(calibration: AnyCalibration) -> dict[str, str]:

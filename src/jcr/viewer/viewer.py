@@ -131,7 +131,7 @@ class Viewer:
         self.base_from_camera = base_from_recon.rigid @ recon_from_camera
         self.tracks_in_base = base_from_recon(self.reconstruction.tracks.points_in_recon)
         server.scene.set_up_direction("+z")
-        headline = head(self.calibration)[0].content
+        headline = head(self.calibration)["verdict"]
         lines = [f"**{headline['verdict']}:** {headline['reason']}."]
         lines += [f"No map yet: make one with `jcr map {run.out}`."] * (self.scene is None)
         server.gui.add_markdown("\n\n".join(lines))
