@@ -44,20 +44,16 @@ class PointsOfATable:
             seen = np.flatnonzero(((x_px > 0) & (x_px < [639, 479])).all(1))
             self.ids.append(seen)
             self.x_px.append(x_px[seen] + rng.normal(scale=0.3, size=(len(seen), 2)))
-        self.asked: dict[bool, list[Key]] = {True: [], False: []}
 
         self.base_from_gripper: Transforms = self.base_from_camera @ inverse(GRIPPER_FROM_CAMERA)
 
-    def common(self, key: Key, coarse: bool = False) -> Int[ndarray, "m 2"]:
-        """Return rows of the points that two images see; coarse: of every third."""
+    def common(self, key: Key) -> Int[ndarray, "m 2"]:
+        """Return rows of the points that two images see."""
         first, second = (self.ids[k] for k in key)
-        both, i, j = np.intersect1d(first, second, return_indices=True)
-        some = both % 3 == 0 if coarse else np.full(len(both), True)
-        return np.stack([i, j], 1)[some]
+        return np.stack(np.intersect1d(first, second, return_indices=True)[1:], 1)
 
-    def matches(self, pairs: Sequence[Key], rolls: ndarray, coarse: bool = False) -> list[ndarray]:
-        self.asked[coarse] += pairs
-        return [self.common(key, coarse) for key in pairs]
+    def matches(self, pairs: Sequence[Key], rolls: ndarray) -> list[ndarray]:
+        return [self.common(key) for key in pairs]
 
 
 def matcher_of_points(features: PointsOfATable) -> Matcher:

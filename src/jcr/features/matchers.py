@@ -50,10 +50,8 @@ class Features(Protocol):
         """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
         ...
 
-    def matches(
-        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
-    ) -> list[Int[ndarray, "_ 2"]]:
-        """Return rows of matching keypoints of pairs, their images rotated (rad) before; `coarse`: of the best ones."""
+    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
+        """Return rows of matching keypoints of pairs, their images rotated (rad) before."""
         ...
 
 
@@ -98,19 +96,15 @@ class Matcher:
         return [(x + 0.5) * self._scale - 0.5 for x in self.features.x_px]
 
     def geometries(
-        self,
-        pairs: Sequence[Key],
-        rolls: Float[ndarray, "p 2"],
-        repeats: Bool[ndarray, "n n"],
-        coarse: bool = False,
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], repeats: Bool[ndarray, "n n"]
     ) -> Geometries:
-        """Return verified two-view geometries of pairs, their images rotated (rad) before; `coarse` as in Features.
+        """Return verified two-view geometries of pairs, their images rotated (rad) before.
 
         `repeats` are the pairs between whose images the gripper did not move.
         """
         new = [k for k, key in enumerate(pairs) if self.features.minds_roll or key not in self.raw]
         some = [pairs[k] for k in new]
-        self.raw |= dict(zip(some, self.features.matches(some, rolls[new], coarse), strict=True))
+        self.raw |= dict(zip(some, self.features.matches(some, rolls[new]), strict=True))
         x_px = self.x_px
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: self.verified(key, self.raw[key], x_px, not repeats[key]), pairs)

@@ -99,10 +99,8 @@ class SiftFeatures:
         """Remove an image; the rows of later ones are one less."""
         del self.x_px[row], self.descriptors[row]
 
-    def matches(
-        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
-    ) -> list[Int[ndarray, "_ 2"]]:
-        """Return rows of matching keypoints of each pair; SIFT uses neither the rotations (rad) nor `coarse`."""
+    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
+        """Return rows of matching keypoints of each pair; SIFT does not use the rotations (rad)."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

@@ -46,8 +46,6 @@ AS_TAKEN = math.radians(50)
 GUESSED_AT_ONCE = 6
 """Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
-ENOUGH = 150
-"""Matches of a pair by its best keypoints, with which it needs no others."""
 FOCALS = np.geomspace(0.35, 2.5, 40)
 """Focal lengths that are tried where no intrinsics are given, in long sides."""
 FOCAL_TOLERANCE = math.radians(1.5)
@@ -80,37 +78,32 @@ class _Search:
     repeats: Bool[ndarray, "n n"]
     """Pairs between whose images the gripper did not move."""
     pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
-    rotations: dict[Key, tuple[float, float]] = field(default_factory=dict)
-    """Angles (rad) by which the images of each pair were rotated."""
-    tried: set[tuple[int, int, int, int, bool]] = field(default_factory=set)
-    """Pairs, the angles (degrees) by which their images were rotated, and whether of the best keypoints alone."""
+    tried: set[tuple[int, int, int, int]] = field(default_factory=set)
+    """Pairs, and the angles (degrees) by which their images were rotated."""
 
     @property
     def systematic(self) -> float:
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
-    def match(self, rotations: Mapping[Key, tuple[float, float]], coarse: bool = True) -> None:
-        """Match pairs, the images of each rotated by two angles (rad), by their best keypoints if `coarse`.
-
-        Of two geometries of a pair the better one is kept.
-        """
+    def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
+        """Match pairs, the images of each rotated by two angles (rad); of two geometries of a pair keep the better."""
         todo = {}
         for key, both in rotations.items():
             if not self.matcher.features.minds_roll:
-                both, coarse = (0.0, 0.0), False
+                both = (0.0, 0.0)
             both = by_quarters(both[0]), by_quarters(both[1])
-            how = (*key, round(math.degrees(both[0])), round(math.degrees(both[1])), coarse)
+            how = (*key, round(math.degrees(both[0])), round(math.degrees(both[1])))
             if how not in self.tried:
                 self.tried.add(how)
                 todo[key] = both
         if not todo:
             return
-        found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats, coarse)
+        found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats)
         if self.matcher.features.minds_roll:  # an image that is rotated brings keypoints of its own
             self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             if self._is_better(pair := self.matcher.pair(self.view, key, geometry)):
-                self.pairs[key], self.rotations[key] = (pair, geometry), todo[key]
+                self.pairs[key] = pair, geometry
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs rotated by multiples of 90° until X's rotation is known, and return the gate."""
@@ -124,19 +117,9 @@ class _Search:
         return found
 
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
-        """Match pairs with images rotated upright, those with few matches by all keypoints; return the gate after it."""
-        rotations = {(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs}
-        self.match(rotations)
-        self.match({key: both for key, both in rotations.items() if self._has_few(key)}, coarse=False)
+        """Match pairs with images rotated upright, and return the gate after it."""
+        self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x)
-
-    def _has_few(self, key: Key) -> bool:
-        return key not in self.pairs or len(self.pairs[key][0].rows) < ENOUGH
-
-    def without_robot(self) -> Geometries:
-        """Return all pairs that match, those with few matches by all keypoints."""
-        self.match({key: self.rotations[key] for key in self.pairs if self._has_few(key)}, coarse=False)
-        return {key: geometry for key, (_, geometry) in self.pairs.items()}
 
     def hide_still_parts(self) -> None:
         """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
@@ -240,7 +223,7 @@ def match_with_robot(
         search.match(dict.fromkeys(everything, as_taken))
         found = search.gate()
     if found.of_x is None:
-        kept, notes, warnings = search.without_robot(), (), ()
+        kept, notes, warnings = {key: one for key, (_, one) in search.pairs.items()}, (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
         found = search.match_upright(seen_in_common(search.view, found, motion) or everything, upright, found)
