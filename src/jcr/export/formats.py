@@ -50,7 +50,7 @@ moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.m
 urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
 easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
 camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
-ply | cloud.ply | points, colours, labels | views.write_ply | cloud notes
+ply | cloud.ply | points, colours, labels | views.write_cloud | cloud notes
 glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene notes
 octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene notes options
 esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene notes options

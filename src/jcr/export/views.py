@@ -45,11 +45,6 @@ class PosedImages:
     """Points of the tracks (m)."""
 
 
-def write_ply(path: Path, cloud: PointCloud, notes: dict[str, str]) -> None:
-    """Write the cloud as PLY with its provenance in the header."""
-    write_cloud(path, cloud, notes)
-
-
 def write_nerfstudio(
     folder: Path, views: PosedImages, cloud: PointCloud, notes: dict[str, str], options: ExportOptions
 ) -> None:
