@@ -1,4 +1,4 @@
-"""Content of the live page: one record of a session's state, drawn by templates and figures of the report."""
+"""Content of the live page: one record of a session's state, which templates draw."""
 
 import json
 from functools import lru_cache

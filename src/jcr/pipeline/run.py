@@ -67,7 +67,11 @@ def run(
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
     check_board(options.reconstruct)
-    capture = _capture_of(capture, out)
+    if not isinstance(capture, Capture | str | Path):
+        raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
+    if not isinstance(capture, Capture):
+        with locked(out):
+            capture = read_capture(capture, into=out / CAPTURE)
     check_known_length(capture, options.calibrate.known_length)
     options, missing = _possible(options.for_capture(capture, backend), capture)
     with locked(out):
@@ -203,16 +207,6 @@ def measure(out: str | Path) -> "Measurement":
     from jcr.segments.measure import measure_objects
 
     return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
-
-
-def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
-    """Return a capture as it is, or read it from a path; images of a recording are put into the run folder."""
-    if isinstance(capture, Capture):
-        return capture
-    if not isinstance(capture, str | Path):
-        raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
-    with locked(out):
-        return read_capture(capture, into=out / CAPTURE)
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
