@@ -94,10 +94,11 @@ def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, .
     camera_explains = True
     while len(findings) < AT_ONCE:
         of_camera, log_chance = best_camera_effect(state, dismissed) if camera_explains else (None, 0.0)
-        test = _best_pose_effect(state, passed)
+        poses = _tested_poses(state)
+        test = None if state.arm is None else best_pose_effect(poses, passed)
         if test is not None and (of_camera is None or test.log_p < log_chance):
             passed.add(test.row.kind)
-            found = pose_finding(test, _tested_poses(state), state.names, state.std)
+            found = pose_finding(test, poses, state.names, state.std)
             if found is not None:
                 findings.append(found)
                 state = state.with_free(state.found, (*state.poses, test.row))
@@ -137,13 +138,6 @@ def _tested_poses(state: CameraAdjustment) -> ArmEquations:
         rows=rows_of_arm(adjusted.problem, arm),
         columns=columns_of_arm(arm),
     )
-
-
-def _best_pose_effect(state: CameraAdjustment, passed: Collection[FindingKind]) -> Test | None:
-    """Return the most significant effect on the gripper poses that its cause can produce."""
-    if state.arm is None:
-        return None
-    return best_pose_effect(_tested_poses(state), {*passed, *(row.kind for row in state.poses)})
 
 
 def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
