@@ -102,11 +102,6 @@ class Backend:
     sees_all_views: bool = False
     """Whether it is a network that processes all views at once."""
 
-    @property
-    def predicts_depth(self) -> bool:
-        """Whether its reconstructions have the pointmaps of a network."""
-        return bool(self.hub_id) or "predictions" in self.options
-
     def is_installed(self) -> bool:
         """Test whether the package it needs is there, without importing it."""
         return not self.package or is_installed(self.package)

@@ -23,7 +23,7 @@ from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
 from jcr.files import read_bytes
-from jcr.reconstruct import BACKENDS, ReconstructOptions, tries, with_cameras_of
+from jcr.reconstruct import ReconstructOptions, with_cameras_of
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
@@ -55,12 +55,6 @@ class RunOptions:
     """Options of the map; None: no cloud, no map, and no dense depth, which only these need."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
-
-    @property
-    def estimates_depth(self) -> bool:
-        """Whether dense depth is needed, and the back end that is tried first predicts none."""
-        is_needed = self.map is not None or self.calibrate.known_length is not None
-        return is_needed and not BACKENDS[tries(self.reconstruct)[0].backend].predicts_depth
 
     def for_capture(self, capture: Capture, backend: str | None = None) -> "RunOptions":
         """Return the options with another back end, or the one that takes the capture's own camera poses."""

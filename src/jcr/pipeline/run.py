@@ -83,7 +83,7 @@ def run(
             return before
         if options.map is not None:
             # Torch takes more than a second to import, loops of depth as long to load; COLMAP leaves a core idle.
-            threading.Thread(target=_load_map_code, args=[options.estimates_depth], daemon=True).start()
+            threading.Thread(target=_load_map_code, daemon=True).start()
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
         stages = stages_of(result)
@@ -227,11 +227,10 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
     return options, None
 
 
-def _load_map_code(estimates_depth: bool) -> None:
-    """Import what a map needs; an error shows again where the map is made."""
+def _load_map_code() -> None:
+    """Import what depth and a map need; an error shows again where these are made."""
     with suppress(Exception):
-        if estimates_depth:
-            from jcr.depth.densify import compile_loops
+        from jcr.depth.densify import compile_loops
 
-            compile_loops()
+        compile_loops()
         import jcr.scene.build  # noqa: F401
