@@ -1,7 +1,8 @@
 """Tests of additional effects on the camera and on the gripper poses, one after the other, until none is significant.
 
-Effects of both kinds compete (checks/camera.py, estimation/hypotheses.py), and the less probable one by chance is the
-cause. What was found is free while the next is tested, and the calibration adopts the effects that its model can carry.
+Effects of both kinds compete (checks/camera.py, estimation/hypotheses.py). Of two significant ones that one is the
+cause beside which the other is no longer significant. What was found is free while the next is tested, and the
+calibration adopts the effects that its model can carry.
 """
 
 from collections.abc import Collection, Sequence
@@ -15,6 +16,7 @@ from numpy import ndarray
 from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case, some_points
 from jcr.calibration.checks.camera import (
+    LOG_P,
     MATERIAL,
     MIN_IMAGES,
     MOST_BYTES,
@@ -96,7 +98,7 @@ def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, .
         of_camera, log_chance = best_camera_effect(state, dismissed) if camera_explains else (None, 0.0)
         poses = _tested_poses(state)
         test = None if state.arm is None else best_pose_effect(poses, passed)
-        if test is not None and (of_camera is None or test.log_p < log_chance):
+        if test is not None and (of_camera is None or _explains(state, test, of_camera, log_chance)):
             passed.add(test.row.kind)
             found = pose_finding(test, poses, state.names, state.std)
             if found is not None:
@@ -114,6 +116,17 @@ def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, .
         else:
             break
     return state, tuple(findings)
+
+
+def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
+    """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
+    with_camera = with_effect_free(state, of_camera)
+    if with_camera is None:
+        return True
+    left = best_pose_effect(_tested_poses(with_camera), {row.kind for row in state.poses})
+    poses_remain = left is not None and left.row.kind is test.row.kind
+    camera_remains = state.with_free(state.found, (*state.poses, test.row)).log_p(of_camera) <= LOG_P
+    return test.log_p < log_chance if poses_remain == camera_remains else poses_remain
 
 
 @dataclass(frozen=True, kw_only=True)
