@@ -54,10 +54,6 @@ class ImageGrid:
         """Map pixels (...,2) of the original image to the grid."""
         return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
 
-    def original_from_grid(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Map pixels (...,2) of the grid to the original image."""
-        return (x_px + np.array(self.crop_corner) + 0.5) / self.scale - 0.5
-
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
         """Return the pinhole of the grid from that of the original image; its distortion is dropped."""
         return cropped(
@@ -112,12 +108,12 @@ class PreparedImages:
         """Pinhole of the network's grid; None: unknown."""
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
-    def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Map pixels (...,2) of the grid to the capture's distorted images."""
-        undistorted_px, camera = self.grid.original_from_grid(x_px), self.intrinsics_of_capture
-        if self.pinhole is None or camera is None or not is_distorted(camera):
-            return undistorted_px
-        return project(camera, unproject(self.pinhole, undistorted_px))
+    def grid_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Map pixels (...,2) of the capture's distorted images to the grid."""
+        camera = self.intrinsics_of_capture
+        if self.pinhole is not None and camera is not None and is_distorted(camera):
+            x_px = project(self.pinhole, unproject(camera, x_px))
+        return self.grid.grid_from_original(x_px)
 
 
 def prepare_images(

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import project, unproject
 from jcr.extras import xfeat_is_installed
 from jcr.features.matchers import FeatureName
 from jcr.geometry import inverse
@@ -44,10 +43,7 @@ def refine(
         )
         if made is None or np.bincount(made.tracks.image).min() < LEAST_MATCHES:
             continue
-        undistorted_px = made.tracks.x_px
-        if given is not None:
-            undistorted_px = project(pinhole, unproject(given, undistorted_px))
-        change, unit = _depth_changes(made, maps, maps.grid.grid_from_original(undistorted_px))
+        change, unit = _depth_changes(made, maps, images.grid_px(made.tracks.x_px))
         poses, tracks = made.recon_from_camera.copy(), made.tracks
         poses[:, :3, 3] *= unit
         tracks = replace(tracks, points_in_recon=unit * tracks.points_in_recon)
