@@ -38,7 +38,7 @@ def a_hand_eye(met: bool, reached_mm: float = 1.0) -> Calibration:
         rotation_deg=REQUIRED[1],
         asked=True,
         distance_mm=500.0,
-        reached_mm=reached_mm if met else max(reached_mm, 1.1 * REQUIRED[0]),
+        reached_mm=min(reached_mm, REQUIRED[0]) if met else max(reached_mm, 1.1 * REQUIRED[0]),
         reached_deg=0.1,
     )
     return replace(found, requirement=required)
