@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.linalg import get_lapack_funcs
+from scipy.sparse import bsr_array
 
 Matrices = Float[ndarray, "*k n n"]
 Columns = Float[ndarray, "*#k n r"]
@@ -166,7 +167,9 @@ def without_points(
         root = np.linalg.inv(np.linalg.cholesky(_regular(block, damping)))
         by_point = root[of_point] @ np.swapaxes(by_point, 1, 2)
         half = np.zeros((len(points), 3, len(columns) + 1))
-        half[:, :, :s] = np.add.reduceat(by_point @ rows.shared[of_group], begins)
+        # A sparse product, where NumPy would make one for each observation.
+        blocks_of_points = bsr_array((by_point, np.arange(len(of_point)), np.append(begins, len(of_point))))
+        half[:, :, :s] = (blocks_of_points @ rows.shared[of_group].reshape(-1, s)).reshape(-1, 3, s)
         half[:, :, -1:] = np.add.reduceat(by_point @ rows.residual[of_group, :, None], begins)
         places = of_point[pairs, None, None], np.arange(3)[:, None], own_columns[of_image[pairs]][:, None]
         half[places] = np.add.reduceat(by_point @ rows.own[of_group], pairs)

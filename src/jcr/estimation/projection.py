@@ -150,7 +150,7 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
     directions, own_map = problem.directions, view.own_map
     out = np.zeros((len(view.in_camera), 2, directions.shape[1]))
     for camera, own, rows in zip(view.cameras, problem.parameters_of, problem.camera_rows, strict=True):
-        columns = np.flatnonzero(directions[own].any(0))
+        columns = _slice(directions[own])
         along = directions[own, columns]
         by_camera = by_parameters(camera, view.in_camera[rows]) @ along
         if own_map is not None:
@@ -159,14 +159,13 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
             by_camera[:, 0] += (own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx)[:, None] * along[
                 0
             ]
-        out[np.ix_(rows, np.arange(2), columns)] = by_camera
+        out[rows, :, columns] = by_camera
     if own_map is None:
         return out
     assert problem.observations is not None
     first, image = problem.parameters_of[-1].stop, problem.observations.image
     # Parameters of images are freed by themselves.
-    columns = np.flatnonzero(directions[first:].any(0))
-    columns = slice(columns[0], columns[-1] + 1)
+    columns = _slice(directions[first:])
     about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
     focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, -1, of_images.shape[1])
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
@@ -179,6 +178,12 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
     if of_images[-PRISM:].any():
         by_image += problem.prism @ of_images[-PRISM:]
     return out
+
+
+def _slice(directions: Float[ndarray, "r l"]) -> slice:
+    """Return the columns from the first to the last that is not 0."""
+    columns = np.flatnonzero(directions.any(0))
+    return slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)
 
 
 def _mapped(own_map: Float[ndarray, "k 2"], v: Float[ndarray, "k 2 p"]) -> Float[ndarray, "k 2 p"]:
