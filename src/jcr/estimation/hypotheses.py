@@ -23,6 +23,9 @@ from jcr.estimation.pose_equations import PoseEquations, pose_by_pose, pose_equa
 from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
+    ROTATION,
+    SCALE,
+    TRANSLATION,
     UNKNOWNS,
     Start,
     State,
@@ -41,7 +44,7 @@ from jcr.estimation.robot_noise import (
 )
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
-from jcr.geometry import Poses, Transform, skew
+from jcr.geometry import Poses, Transform, by_similarity, skew
 from jcr.records import Intrinsics, JointOffsets, RobotNoise
 
 CONFIRMED_AT_MOST = 3
@@ -514,15 +517,12 @@ def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, 
     They grow by 1 m of position per image, 1 rad, and 1 of log scale; `scale` is in metres per unit.
     """
     n, position = len(recon_from_camera), recon_from_camera[:, :3, 3]
-    later = np.tril(np.ones((n, n)))[:, 1:]
-    by_position = np.zeros((n, 6, n - 1, 3))
-    by_position[:, :3] = later[:, None, :, None] * np.eye(3)[None, :, None] / scale
-    by_rotation = np.zeros((n, 6, n - 1, 3))
-    lever = -skew(position[:, None] - position[None, 1:])
-    by_rotation[:, :3] = np.swapaxes(later[..., None, None] * lever, 1, 2)
-    by_rotation[:, 3:] = later[:, None, :, None] * np.eye(3)[None, :, None]
-    by_scale = np.zeros((n, 6, n - 1))
-    by_scale[:, :3] = (position[:, None] - position[None, :-1]).swapaxes(1, 2) * later[:, None]
-    return [
-        half @ half.T for half in (one.reshape(6 * n, -1) for one in (by_position, by_rotation, by_scale))
-    ]
+    moves = np.zeros((n, n - 1, 6, 7))
+    # A camera rotates about itself; the way to it from the one before has a wrong length.
+    moves[:, :, :3] = by_similarity(position[:, None] - position[1:])
+    moves[:, :, :3, 6] = position[:, None] - position[:-1]
+    moves[:, :, 3:, 3:6] = np.eye(3)
+    moves *= np.tril(np.ones((n, n)))[:, 1:, None, None]
+    moves[..., :3] /= scale
+    halves = (moves.swapaxes(1, 2)[..., one].reshape(6 * n, -1) for one in (TRANSLATION, ROTATION, SCALE))
+    return [half @ half.T for half in halves]

@@ -109,15 +109,12 @@ def assumed(
 
 def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
     """Return typical errors of a robot; `given` (m, rad) is a lower bound on the random ones."""
-    metres, radians, systematic = TYPICAL
+    sizes = np.array(TYPICAL)
     if given is not None:
-        metres, radians = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
+        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
+    metres, radians, systematic = sizes.tolist()
     return RobotNoise(
-        translation=float(metres),
-        rotation=float(radians),
-        estimated=False,
-        given=given,
-        systematic=float(systematic),
+        translation=metres, rotation=radians, estimated=False, given=given, systematic=systematic
     )
 
 
