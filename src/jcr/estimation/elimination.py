@@ -169,7 +169,8 @@ def without_points(
         half = np.zeros((len(points), 3, len(columns) + 1))
         # A sparse product, where NumPy would make one for each observation.
         blocks_of_points = bsr_array((by_point, np.arange(len(of_point)), np.append(begins, len(of_point))))
-        half[:, :, :s] = (blocks_of_points @ rows.shared[of_group].reshape(-1, s)).reshape(-1, 3, s)
+        shared = blocks_of_points @ rows.shared[of_group].reshape(2 * len(of_point), s)
+        half[:, :, :s] = shared.reshape(len(points), 3, s)
         half[:, :, -1:] = np.add.reduceat(by_point @ rows.residual[of_group, :, None], begins)
         places = of_point[pairs, None, None], np.arange(3)[:, None], own_columns[of_image[pairs]][:, None]
         half[places] = np.add.reduceat(by_point @ rows.own[of_group], pairs)
