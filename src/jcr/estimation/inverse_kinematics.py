@@ -59,7 +59,7 @@ class Posture:
 
     joints: Float[ndarray, "n dof"]
     flange_from_tool: Transform
-    """Given, the identity, or estimated."""
+    """Identity, or estimated."""
     misfit: Float[ndarray, "n 2"]
     """Distance (m) and angle (rad) from each pose."""
 
@@ -69,27 +69,20 @@ class Posture:
         return bool((self.misfit < FITS).all())
 
 
-def inverse_kinematics(
-    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
-) -> Posture:
+def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
 
-    `flange_from_tool` is the frame of the poses in the gripper frame of `arm`. None: the identity, or where the poses
-    are then out of reach, a constant tool that explains them, estimated together with the angles.
+    Where the poses are out of reach, they are those of a constant tool, which is estimated together with the angles.
     """
     rng = np.random.default_rng(0)
-    tool = np.eye(4) if flange_from_tool is None else flange_from_tool
-    posture = _posture(arm, base_from_gripper, tool, rng)
-    if posture.fits or flange_from_tool is not None:
-        return posture
-    tried = [posture]
+    tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
     for ahead, yaw in TOOLS:
+        if tried[-1].fits:
+            break
         start = transform(rotation_exp(np.array([0.0, 0.0, yaw])), np.array([0.0, 0.0, ahead]))
         first = _posture(arm, base_from_gripper, start, rng)
         found = _with_tool(arm, base_from_gripper, first.joints, start)
         tried.append(_posture(arm, base_from_gripper, found, rng))
-        if tried[-1].fits:
-            break
     return min(tried, key=lambda one: float(((one.misfit * (1.0, ARM)) ** 2).sum()))
 
 
