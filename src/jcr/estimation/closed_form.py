@@ -13,7 +13,6 @@ from numpy import ndarray
 from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transform
 
 Poses = Float[ndarray, "*#batch n 4 4"]
-Weights = Float[ndarray, "*#batch n"]
 ROUNDS = 5
 """Largest number of rounds that refine the rotations; a likelihood fit follows."""
 NEAR_HALF_ROTATION = -0.73
@@ -23,7 +22,7 @@ RELATIVE_CUT = 1e-10
 
 
 def closed_form(
-    base_from_gripper: Poses, recon_from_camera: Poses, weights: Weights | None = None, rounds: int = ROUNDS
+    base_from_gripper: Poses, recon_from_camera: Poses, rounds: int = ROUNDS
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
     """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
@@ -31,10 +30,9 @@ def closed_form(
     recovery problem, eq. 8 to 10, without its grid search over λ). Of motions that leave them open, the smallest
     translation is returned. The scale is 0 or less where the motions do not determine it.
     """
-    weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
-    rotation, base_rotation = rotations(of_gripper, of_camera, weights, rounds)
-    x, scale, z = _translations(base_from_gripper, recon_from_camera, base_rotation, weights)
+    rotation, base_rotation = rotations(of_gripper, of_camera, rounds)
+    x, scale, z = _translations(base_from_gripper, recon_from_camera, base_rotation)
     return transform(rotation, x), scale, transform(base_rotation, z)
 
 
@@ -66,29 +64,26 @@ def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
 def rotations(
     gripper: Float[ndarray, "*#batch n 3 3"],
     camera: Float[ndarray, "*#batch n 3 3"],
-    weights: Weights,
     rounds: int = ROUNDS,
 ) -> tuple[Rotations, Rotations]:
     """Return R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
 
     The solution is Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. Where a
     motion is nearly a rotation by 180°, whose sine is small, another solution competes: the equation is linear in R_X
-    and R_Z, and the leading singular pair of Σ w R_C ⊗ R_G solves it (Shah 2013). That one alone is ambiguous where
+    and R_Z, and the leading singular pair of Σ R_C ⊗ R_G solves it (Shah 2013). That one alone is ambiguous where
     all motions are rotations by 180°.
     """
-    batch, n = weights.shape[:-1], weights.shape[-1]
+    *batch, n = gripper.shape[:-2]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
-    weights = weights.reshape(-1, n)
     a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
-    pairs = (weights[:, :, None] * weights[:, None]).reshape(-1, 1, n * n)
     of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))
-    rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) * pairs @ of_b)
-    rotation, base, gap = _polished(rotation, gripper, camera, weights, rounds)
+    rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) @ of_b)
+    rotation, base, gap = _polished(rotation, gripper, camera, rounds)
 
     near = (np.trace(a, axis1=-2, axis2=-1) < NEAR_HALF_ROTATION).any((1, 2))
     if near.any():
-        some = gripper[near], camera[near], weights[near]
-        kron = np.einsum("hn,hnij,hnkl->hikjl", some[2], some[0], some[1]).reshape(-1, 9, 9)
+        some = gripper[near], camera[near]
+        kron = np.einsum("hnij,hnkl->hikjl", *some).reshape(-1, 9, 9)
         leading = np.linalg.svd(kron)[2][:, 0].reshape(-1, 3, 3)
         sign = np.where(np.linalg.det(leading) < 0, -1.0, 1.0)
         rival = _polished(nearest_rotation(sign[:, None, None] * leading), *some, rounds)
@@ -102,46 +97,41 @@ def _polished(
     rotation: Float[ndarray, "h 3 3"],
     gripper: Float[ndarray, "h n 3 3"],
     camera: Float[ndarray, "h n 3 3"],
-    weights: Float[ndarray, "h n"],
     rounds: int,
 ) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
     """Return R_X and R_Z, each optimal given the other in turn (monotone), and the squared residual."""
     from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
-    weighed = weights[:, :, None, None] * gripper
-    base = nearest_rotation((weighed @ rotation[:, None] @ from_camera).sum(1))
+    base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
     for _ in range(rounds):
         before = rotation
-        rotation = nearest_rotation(
-            (weights[:, :, None, None] * (from_gripper @ base[:, None] @ camera)).sum(1)
-        )
-        base = nearest_rotation((weighed @ rotation[:, None] @ from_camera).sum(1))
+        rotation = nearest_rotation((from_gripper @ base[:, None] @ camera).sum(1))
+        base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
         if np.abs(rotation - before).max() < 1e-13:
             break
     gap = gripper @ rotation[:, None] - base[:, None] @ camera
-    return rotation, base, (weights * (gap**2).sum((-1, -2))).sum(-1)
+    return rotation, base, (gap**2).sum((-1, -2, -3))
 
 
 def _translations(
-    base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations, weights: Weights
+    base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations
 ) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
     """Return t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
 
-    t_Z is eliminated: it makes the weighted means equal. The paper prints t_c^e for the camera's translation in its
+    t_Z is eliminated: it makes the means equal. The paper prints t_c^e for the camera's translation in its
     d_i(λ); t_C is meant.
     """
     center, rotation = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
     in_base = center @ np.swapaxes(base_rotation, -1, -2)
     position = base_from_gripper[..., :3, 3]
     rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
-    share = weights / weights.sum(-1, keepdims=True)
-    rows = rows - np.einsum("...n,...nij->...ij", share, rows)[..., None, :, :]
+    rows = rows - rows.mean(-3, keepdims=True)
     # The column has unit size, so that the cut of unobservable directions does not depend on the reconstruction's unit.
     # Centres that differ by rounding alone count as one.
     size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
     unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
     rows[..., 3] /= unit[..., None, None]
-    rows = (rows * np.sqrt(weights)[..., None, None]).reshape(*weights.shape[:-1], -1, 5)
+    rows = rows.reshape(*rows.shape[:-3], -1, 5)
     solution = np.linalg.pinv(rows[..., :4], rcond=RELATIVE_CUT) @ rows[..., 4:]
     translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
     gap = (rotation @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * in_base
-    return translation, scale, np.einsum("...n,...ni->...i", share, gap)
+    return translation, scale, gap.mean(-2)

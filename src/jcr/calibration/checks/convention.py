@@ -157,7 +157,7 @@ def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
     _, _, base_from_gripper, image = candidate
     camera = recon_from_camera[image]
     agree, error = least_trimmed(base_from_gripper, camera)
-    return error if closed_form(base_from_gripper, camera, agree.astype(float))[1] > 0 else np.inf
+    return error if closed_form(base_from_gripper[agree], camera[agree])[1] > 0 else np.inf
 
 
 def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
