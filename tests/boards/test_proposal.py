@@ -14,7 +14,7 @@ PX_PER_MM = 5
 
 def seen(spec: str, views: int = 3) -> list[ndarray]:
     """Photographs of the printed sheet, each from another direction."""
-    printed = board_sheet(spec).pixels
+    printed, _ = board_sheet(spec)
     width, height = (round(PX_PER_MM * side) for side in PAPERS_MM["a4"])
     paper = np.where(np.asarray(printed.convert("L").resize((width, height))) > 127, 245, 15).astype(np.uint8)
     rng = np.random.default_rng(0)

@@ -11,7 +11,7 @@ from numpy import ndarray
 import jcr
 from in_process import run_jcr
 from jcr.boards.detection import boards
-from jcr.boards.sheet import board_sheet
+from jcr.boards.sheet import as_pdf, board_sheet
 
 
 def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:
@@ -33,15 +33,15 @@ def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:
     ],
 )
 def test_a_printed_board_is_found_whole_and_at_its_size(spec: str):
-    sheet = board_sheet(spec)
-    paper, image = mm_of_page(sheet.as_pdf())
+    pixels, px_per_mm = board_sheet(spec)
+    paper, image = mm_of_page(as_pdf(pixels, px_per_mm))
     np.testing.assert_allclose(paper, (297, 210), atol=0.03)
-    np.testing.assert_allclose(image, np.array(sheet.pixels.size) / sheet.px_per_mm, atol=1e-3)
+    np.testing.assert_allclose(image, np.array(pixels.size) / px_per_mm, atol=1e-3)
     grey = cv2.resize(
-        255 * np.asarray(sheet.pixels, np.uint8), None, fx=1 / 3, fy=1 / 3, interpolation=cv2.INTER_AREA
+        255 * np.asarray(pixels, np.uint8), None, fx=1 / 3, fy=1 / 3, interpolation=cv2.INTER_AREA
     )
     (sighting,) = boards(spec)[0].detect(grey)
-    x_mm = 3 * (sighting.x_px + 0.5) / sheet.px_per_mm
+    x_mm = 3 * (sighting.x_px + 0.5) / px_per_mm
     expected = 1e3 * sighting.x_in_body[:, :2]
     across, down = (int(text) for text in spec.split(":")[1].split("x"))
     assert len(x_mm) == ((across - 1) * (down - 1) if spec.startswith("charuco") else across * down)

@@ -1,7 +1,6 @@
 """A calibration board to print at its exact size, as a PDF page, with rulers that show whether the printer kept it."""
 
 import io
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,22 +23,17 @@ LEAST_PX_PER_MM = 600 / 25.4
 MM_PER_INCH = 25.4
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A page in black and white."""
-
-    pixels: Image.Image
-    px_per_mm: float
-
-    def as_pdf(self) -> bytes:
-        """Return the page at its true size as PDF, without loss."""
-        file = io.BytesIO()
-        self.pixels.save(file, "PDF", resolution=MM_PER_INCH * self.px_per_mm)
-        return file.getvalue()
+def as_pdf(page: Image.Image, px_per_mm: float) -> bytes:
+    """Return a page at its true size as PDF, without loss."""
+    file = io.BytesIO()
+    page.save(file, "PDF", resolution=MM_PER_INCH * px_per_mm)
+    return file.getvalue()
 
 
-def board_sheet(spec: str, paper: str = "a4") -> Sheet:
-    """Return the sheet of a ChArUco board or chessboard as `--board` names it, a square a whole number of pixels wide.
+def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
+    """Return the page of a ChArUco board or chessboard as `--board` names it, in black and white, and its pixels per mm.
+
+    A square is a whole number of pixels wide.
 
     Raises InputError on a name that means none, and on a board that the paper has no room for.
     """
@@ -79,7 +73,7 @@ def board_sheet(spec: str, paper: str = "a4") -> Sheet:
         (MARGIN_MM, top + ruler + TEXT_MM + 1.0, f"{ruler:g} mm"),
     ):
         draw.text((x_mm * px_per_mm, y_mm * px_per_mm), text, 0, font, anchor="ls")
-    return Sheet(pixels, px_per_mm)
+    return pixels, px_per_mm
 
 
 def _charuco(

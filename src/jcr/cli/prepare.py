@@ -43,11 +43,11 @@ class BoardCommand:
 
     def main(self) -> int:
         """Write the sheet and print the option that it is used with."""
-        from jcr.boards.sheet import board_sheet
+        from jcr.boards.sheet import as_pdf, board_sheet
 
         if self.out.suffix.lower() != ".pdf":
             raise InputError(f"jcr board {self.out}: writes a PDF; name a file that ends in .pdf")
-        write_bytes(self.out, board_sheet(self.board, self.paper).as_pdf())
+        write_bytes(self.out, as_pdf(*board_sheet(self.board, self.paper)))
         use = f"print at 100 % on {self.paper}, measure the rulers, then calibrate with --board {self.board}"
         self.output.result(
             [f"{self.out}: {use}"], {"file": str(self.out), "board": self.board, "paper": self.paper}
