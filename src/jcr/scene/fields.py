@@ -120,7 +120,7 @@ class Field(nn.Module):
         box: Float[Tensor, "2 3"],
         lattices: Sequence[Lattice] = (),
         frequencies: int = 0,
-        grids: Sequence[tuple[int, int]] = (),
+        grids: Sequence[Sequence[int]] = (),
         generator: torch.Generator | None = None,
     ) -> None:
         """Initialise the layers from `generator`: `heads` are properties and their numbers of outputs.
