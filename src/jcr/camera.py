@@ -1,9 +1,8 @@
-"""The one camera model: projection and its derivatives, its inverse, resizing and cropping, undistorted images.
+"""Camera models of OpenCV: projection with derivatives, unprojection, resizing, cropping, undistortion of images.
 
-OpenCV's pinhole with five distortion coefficients, its rational model with eight and with a thin prism twelve ("Camera
-Calibration and 3D Reconstruction"), and its fisheye with four (Kannala and Brandt, TPAMI 2006).
-What a distortion does to rays stands in
-`_distorted`, `_slopes`, `_by_coefficients` and, for the fisheye, `_fisheye_rays` alone: no caller knows the model.
+Models: pinhole with five distortion coefficients, rational with eight, rational with thin prism with twelve ("Camera
+Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_distorted`,
+`_slopes`, `_by_coefficients` and, for the fisheye, `_fisheye_rays` depend on the model.
 Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
 precision: float32 points give float32 pixels.
 """
@@ -20,57 +19,57 @@ from numpy import ndarray
 from jcr.records import COEFFICIENTS, Intrinsics
 
 HALF_PIXEL = 0.5
-"""Pixels of COLMAP and nerfstudio are ours plus this: theirs are counted from the corner of the image."""
+"""Difference (px) of pixel coordinates in COLMAP and nerfstudio, counted from the image corner, to those here."""
 USUAL_FOCAL = 0.8
-"""Focal length of an unknown camera in long sides of its image, 64° wide; wrist cameras have 0.5 to 1.2."""
+"""Assumed focal length of an unknown camera over the long side of its image (64° wide); wrist cameras: 0.5 to 1.2."""
 WITHIN_FOLD = 0.9
-"""Share of the distance at which a distortion folds over, up to which its inverse is used."""
+"""Share of `fold_distance_px` up to which a distortion is inverted."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
-"""Its pixels are x/z, y/z."""
+"""Camera whose pixel coordinates are x/z, y/z."""
 Coordinate = Float[ndarray, "*batch"] | np.floating
 _WIDEST_TANGENT = 10.0
-"""Rays farther than 84° from the optical axis are beyond these models."""
+"""Tangent of the largest angle of a ray to the optical axis that the models describe, 84°."""
 _WIDEST_ANGLE = float(np.arctan(_WIDEST_TANGENT))
 _NEAR_AXIS = 1e-8
-"""x² + y² below which a fisheye's formulas are taken there, for they divide by it; they are flat to 1e-8."""
+"""Lower bound of x² + y² in the formulas of a fisheye, which divide by it; the error is below 1e-8."""
 _WIDEST_PINHOLE = 1.7
-"""x/z and y/z at 60°, beyond which a pinhole grid would stretch a fisheye's border without end."""
+"""Largest x/z and y/z of an undistorted grid, 60°: beyond, a fisheye's border would be stretched too much."""
 
 
 def parameter_names(camera: Intrinsics) -> tuple[str, ...]:
-    """Return the names of `parameters`, in their order."""
+    """Return the names of the numbers of `parameters(camera)`: fx, fy, cx, cy and the distortion coefficients."""
     return ("fx", "fy", "cx", "cy", *COEFFICIENTS[camera.model])
 
 
 def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
-    """Return the camera as a vector: focal lengths, principal point, and the coefficients of its model."""
+    """Return the vector fx, fy, cx, cy, distortion coefficients of the camera."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
-    """Return a camera of the same model and image size with the values of a vector of `parameters`."""
+    """Return a camera of the same model and image size with the values of a vector in the order of `parameters`."""
     fx, fy, cx, cy, *distortion = values.tolist()
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
 def is_distorted(camera: Intrinsics) -> bool:
-    """Whether straight lines are not straight in its images."""
+    """Return whether the camera has a distortion; a fisheye always has."""
     return camera.model == "fisheye" or any(camera.distortion)
 
 
 def with_thin_prism(camera: Intrinsics) -> Intrinsics:
-    """Return a pinhole or rational camera as one of the thin prism model that projects alike."""
+    """Return a pinhole or rational camera as one of the thin prism model with the same projection."""
     padded = [*camera.distortion, *[0.0] * (len(COEFFICIENTS["thin_prism"]) - len(camera.distortion))]
     return replace(camera, distortion=tuple(padded), model="thin_prism")
 
 
 def without_distortion(camera: Intrinsics) -> Intrinsics:
-    """Return the pinhole with the same focal lengths and principal point."""
+    """Return the pinhole camera without distortion that has the same focal lengths and principal point."""
     return replace(camera, distortion=(0.0,) * 5, model="pinhole")
 
 
 def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
-    """Pixels (...,2) of points (...,3) in front of the camera; of others nothing that means anything."""
+    """Return the pixels (...,2) of points (...,3) in front of the camera; other points give meaningless pixels."""
     x, y, z = x_in_camera[..., 0], x_in_camera[..., 1], x_in_camera[..., 2]
     if is_distorted(camera):
         x, y = _distorted(camera, x / z, y / z)
@@ -79,7 +78,7 @@ def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Floa
 
 
 def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Directions (...,3) with z = 1 of pixels (...,2): by Newton's method, exact where no distortion folds over."""
+    """Return the rays (...,3) with z = 1 of pixels (...,2), by Newton's method; exact within `fold_distance_px`."""
     target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if camera.model == "fisheye":
         return _fisheye_rays(camera, target)
@@ -95,7 +94,7 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
 
 
 def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2 3"]:
-    """Return the derivatives of `project` by the point."""
+    """Return the derivatives (...,2,3) of the pixel of `project` by the point in the camera frame."""
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
     x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
@@ -109,7 +108,7 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
 def by_parameters(
     camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]
 ) -> Float[ndarray, "*batch 2 p"]:
-    """Return the derivatives of `project` by the camera's `parameters`."""
+    """Return the derivatives (...,2,p) of the pixel of `project` by the p numbers of `parameters(camera)`."""
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
     out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
     out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
@@ -137,7 +136,7 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 def _slopes(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return the derivatives of `_distorted`: of its x by x and by y, then of its y by x and by y."""
+    """Return the derivatives of the x of `_distorted` by x and by y, then those of its y by x and by y."""
     r2 = x * x + y * y
     radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
@@ -154,7 +153,7 @@ def _slopes(
 
 
 def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Return the factor by which rays at x² + y² = r2 move outwards, and its derivative by r2."""
+    """Return the radial factor on x and y of rays with x² + y² = r2, and its derivative by r2."""
     if camera.model == "fisheye":
         k = camera.distortion
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -176,7 +175,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 def _by_coefficients(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Float[ndarray, "*batch c"], Float[ndarray, "*batch c"]]:
-    """Return the derivatives (...,c) of `_distorted`'s x and y by the coefficients of the distortion."""
+    """Return the derivatives (...,c) of the x, and of the y, of `_distorted` by the c distortion coefficients."""
     r2, xy = x * x + y * y, 2 * x * y
     if camera.model == "fisheye":
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -199,7 +198,7 @@ def _by_coefficients(
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Directions with z = 1 of distorted coordinates: by Newton's method in the angle, in which the model is smooth."""
+    """Return the rays with z = 1 of distorted coordinates of a fisheye, by Newton's method in the angle to the axis."""
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
     angle = np.minimum(bent, _WIDEST_ANGLE)
@@ -209,18 +208,18 @@ def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Flo
         if np.abs(error).max(initial=0.0) < 1e-14:
             break
         slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])))
-        # Beyond the widest angle there is no ray in front of the camera; the nearest one stands for it.
+        # Pixels beyond the widest angle have no ray in front of the camera; they get the nearest one.
         angle = np.clip(angle - error / np.maximum(slope, 0.1), 0.0, _WIDEST_ANGLE)
     stretch = np.where(bent < 1e-12, 1.0, np.tan(angle) / np.maximum(bent, 1e-12))
     return np.concatenate([target * stretch[..., None], np.ones_like(target[..., :1])], axis=-1)
 
 
-@lru_cache(maxsize=64)  # every stage asks for the same camera
+@lru_cache(maxsize=64)  # called many times for the same camera
 def fold_distance_px(camera: Intrinsics) -> float | None:
     """Return the distance (px) from the principal point at which the distortion folds over; None if it never does.
 
-    Rays are followed outwards until they leave the frame. Where the Jacobian's determinant reaches zero
-    before, two rays share one pixel and the pixels beyond have no ray at all.
+    At a fold the determinant of the distortion's Jacobian reaches zero inside the image: two rays share one pixel, and
+    pixels beyond have no ray.
     """
     edges = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     (left, top), (right, bottom) = unproject(without_distortion(camera), edges)[:, :2]
@@ -244,11 +243,11 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
 
 
 def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
-    """Given intrinsics, without a distortion that has no inverse, and a warning that says so.
+    """Return given intrinsics and warnings; a distortion that folds over inside the image is set to zero.
 
-    With such a distortion images do not register.
+    Images with such a distortion do not register.
     """
-    # Of a fisheye's border, beyond the widest angle, there are pixels without rays; the rest is as good as any.
+    # A fisheye's border, beyond the widest angle, may have pixels without rays; the rest of the image is usable.
     if camera is None or camera.model == "fisheye" or (fold := fold_distance_px(camera)) is None:
         return camera, ()
     warning = (
@@ -259,7 +258,7 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
 
 
 def guessed_intrinsics(size: tuple[int, int], focal: float = USUAL_FOCAL) -> Intrinsics:
-    """Return a pinhole of square pixels for images of `size` (width, height); `focal` is in long sides."""
+    """Return a pinhole with square pixels for images of `size` (width, height); `focal` is relative to the long side."""
     (width, height), focal_px = size, focal * max(size)
     return Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
 
@@ -284,14 +283,14 @@ def cropped(camera: Intrinsics, left: int, top: int, width: int, height: int) ->
 
 
 def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
-    """Return the camera with both focal lengths multiplied."""
+    """Return the camera with both focal lengths multiplied by a factor."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
-    """Return the largest undistorted pinhole grid inside the frame, with the long side that is given.
+    """Return the undistorted pinhole camera with the largest view inside the image, and a long side of this length.
 
-    Of a distortion that folds over, what lies within the fold: a rectangle of the frame's shape.
+    Where the distortion folds over, the view is a rectangle of the image's shape within the fold.
     """
     corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     if (fold_px := fold_distance_px(camera)) is not None:
@@ -311,7 +310,7 @@ def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
 
 
 def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
-    """Directions with z = 1 of every pixel of an undistorted grid, in the camera frame."""
+    """Return the ray with z = 1 of every pixel of an undistorted camera, in the camera frame."""
     u, v = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
     return unproject(pinhole, np.stack([u, v], axis=-1).astype(np.float64))
 
@@ -319,9 +318,9 @@ def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
 def undistortion(
     camera: Intrinsics, pinhole: Intrinsics
 ) -> Callable[[UInt8[ndarray, "h w 3"]], UInt8[ndarray, "h2 w2 3"]]:
-    """Return the resampling of a camera's images to an undistorted grid; averaged over areas where the grid is coarser.
+    """Return a function that resamples images of a camera to those of an undistorted pinhole camera.
 
-    Where the pixels come from is computed once for all images.
+    Its lookup table is computed once. Pixels are averaged over areas if the pinhole camera has fewer of them.
     """
     factor = max(1, round(camera.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
@@ -331,7 +330,7 @@ def undistortion(
     )
 
     def undistorted(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h2 w2 3"]:
-        # In whole grey levels, averages of two by two would all be rounded up from a half.
+        # Integer grey levels would bias the averages of 2 x 2 pixels, whose halves are rounded up.
         resampled = cv2.remap(
             image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )

@@ -1,6 +1,6 @@
-"""Tails and quantiles of chi-squared and F, of scipy.special: scipy.stats takes as long to import as all else.
+"""Tail probabilities and quantiles of the chi-squared and F distributions, computed with scipy.special.
 
-Names and results are those of scipy.stats.
+Names and results are those of scipy.stats, whose import takes as long as all other imports together.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ Number = float | int | np.number | ndarray
 
 
 class chi2:  # noqa: N801
-    """Sum of `freedom` squares of standard normal numbers: probabilities of x and quantiles, by x or share, freedom."""
+    """Chi-squared distribution; arguments are x, or a probability, then the degrees of freedom."""
 
     cdf = staticmethod(lambda x, freedom: chdtr(freedom, x))
     sf = staticmethod(lambda x, freedom: chdtrc(freedom, x))
@@ -22,13 +22,13 @@ class chi2:  # noqa: N801
 
 
 class f:  # noqa: N801
-    """Ratio of two mean squares."""
+    """F distribution: ratio of two mean squares of independent normal numbers."""
 
     @staticmethod
     def logsf(x: Number, over: Number, under: Number) -> Any:
-        """Return the logarithm of the probability of more than x, finite where the probability itself underflows.
+        """Return log P(F > x); `over` and `under` are the degrees of freedom of numerator and denominator.
 
-        There it is the leading term of the incomplete beta function at a small argument (DLMF 8.17.7).
+        Where P underflows, the result is the leading term of the incomplete beta function (DLMF 8.17.7).
         """
         tail, half = np.asarray(fdtrc(over, under, x)), np.asarray(under) / 2
         share = np.maximum(under / (under + np.asarray(over) * np.asarray(x, float)), 1e-300)

@@ -1,10 +1,10 @@
 """Rigid transforms and similarities as plain arrays.
 
 `a_from_b` is a (...,4,4) float64 matrix that maps b coordinates to a: `x_in_a = a_from_b · x_in_b`.
-Scale never hides in a 4x4: a similarity is a rigid `a_from_b` and a scale that is applied first.
+A 4x4 matrix contains no scale: a similarity is a rigid `a_from_b` and a scale that is applied to x_in_b first.
 
-Steps, errors and covariances of an `a_from_b` are those of `retract`, everywhere: (v, w), both in the axes of a, with
-t ← t + v and R ← exp(w) R. v moves the origin of b whatever w is, which keeps the two parts of different units apart.
+A step (v, w) of a transform `a_from_b` changes it to t + v, exp(w) R; v (m) and w (rad) are in the axes of frame a.
+All steps, errors and covariances of transforms are in this form (`retract`), translation before rotation.
 """
 
 import warnings
@@ -25,19 +25,19 @@ Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
 
 HUGE = 1e15
-"""No length or reconstruction has larger numbers, and sums of their squares stay far from overflow."""
+"""Largest accepted number; sums of squares of smaller ones cannot overflow."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of RᵀR − I accepted as rounding; transforms printed with four digits pass."""
 TINY = 1e-300
-"""Keeps 0 / 0 from being asked; no sum of squares of lengths is as small."""
+"""Lower bound of denominators, against 0 / 0."""
 ARM = 0.3
-"""m. Where a length and an angle (rad) are counted together, the angle counts at this arm: 0.1 mm weighs as 0.02°."""
+"""Lever (m) by which an angle (rad) is multiplied to compare it with a length: 0.1 mm counts like 0.02°."""
 PARALLEL = 1e-6
-"""Keeps the point nearest to lines finite where they are parallel, and meet anywhere along them."""
+"""Weight that keeps the point nearest to parallel lines finite."""
 
 
 def rotation_exp(rotation_vector: Vectors) -> Rotations:
-    """SO(3) exponential: rotation vectors (...,3) rad to matrices (...,3,3)."""
+    """Return the rotation matrices (...,3,3) of rotation vectors (...,3) in rad: the exponential map of SO(3)."""
     if rotation_vector.size == 0:  # refused by SciPy before 1.14
         return np.zeros((*rotation_vector.shape[:-1], 3, 3))
     flat = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
@@ -45,7 +45,7 @@ def rotation_exp(rotation_vector: Vectors) -> Rotations:
 
 
 def rotation_log(rotation: Rotations) -> Vectors:
-    """SO(3) logarithm: matrices (...,3,3) to rotation vectors (...,3) rad, length ≤ π; safe at 0 and π."""
+    """Return the rotation vectors (...,3), in rad with length ≤ π, of rotation matrices; accurate near 0 and π too."""
     if rotation.size == 0:  # refused by SciPy before 1.14
         return np.zeros(rotation.shape[:-1])
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
@@ -53,19 +53,19 @@ def rotation_log(rotation: Rotations) -> Vectors:
 
 
 def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"] | np.floating:
-    """Angle of rotation in [0, π] rad, accurate near both ends (unlike arccos of the trace)."""
+    """Return the angle of rotation in [0, π] rad, accurate near 0 and π too (unlike arccos of the trace)."""
     return np.linalg.norm(rotation_log(rotation), axis=-1)
 
 
 def skew(v: Vectors) -> Rotations:
-    """Cross-product matrices (...,3,3): `skew(v) @ w == cross(v, w)`."""
+    """Return the cross-product matrices (...,3,3): `skew(v) @ w == cross(v, w)`."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return out - np.swapaxes(out, -1, -2)
 
 
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
-    """Return the derivatives of points v from an origin by a step (v, w) of it and the logarithm of a scale about it."""
+    """Return [I, -skew(v), v], the derivatives of points v by a translation, a rotation about 0, and a log scale."""
     identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
     return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
 
@@ -73,7 +73,7 @@ def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
 def transform(
     rotation: Float[ndarray, "*#batch 3 3"], translation: Float[ndarray, "*#batch 3"]
 ) -> Float[ndarray, "... 4 4"]:
-    """Assemble (...,4,4) from rotation (...,3,3) and translation (...,3), which broadcast."""
+    """Return transforms (...,4,4) from rotations (...,3,3) and translations (...,3), which broadcast."""
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     out = np.zeros((*batch, 4, 4))
     out[..., :3, :3] = rotation
@@ -83,7 +83,7 @@ def transform(
 
 
 def inverse(a_from_b: Transforms) -> Transforms:
-    """Rigid inverse, (...,4,4), without a general matrix inversion."""
+    """Return b_from_a (...,4,4), the inverses of rigid transforms."""
     rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     return transform(rotation_t, -(rotation_t @ a_from_b[..., :3, 3:])[..., 0])
 
@@ -91,7 +91,7 @@ def inverse(a_from_b: Transforms) -> Transforms:
 def retract(
     a_from_b: Float[ndarray, "*#batch 4 4"], step: Float[ndarray, "*#batch 6"]
 ) -> Float[ndarray, "... 4 4"]:
-    """Return transforms (...,4,4) after steps (...,6) as this module defines them: t + v, exp(w) R."""
+    """Return transforms (...,4,4) after steps (v, w) of shape (...,6): translation t + v, rotation exp(w) R."""
     return transform(
         rotation_exp(step[..., 3:]) @ a_from_b[..., :3, :3], a_from_b[..., :3, 3] + step[..., :3]
     )
@@ -100,7 +100,7 @@ def retract(
 def step_between(
     a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
 ) -> Float[ndarray, "... 6"]:
-    """Return the steps (...,6) from `a_from_b` to `target`: the inverse of `retract`, up to a rotation by 180°."""
+    """Return the steps (...,6) for which `retract(a_from_b, step)` is `target`; translation, then rotation vector."""
     rotation = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(rotation)], axis=-1)
 
@@ -110,7 +110,7 @@ def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
 
     `rotation` (…,3,3) holds the rotations a_from_b.
 
-    A motion on the right, T ← T·exp(ξ), is the step `step_axes(R) @ ξ` to first order.
+    To first order `step_axes(R) @ ξ` is the step from T to T·exp(ξ).
     """
     out = np.zeros((*rotation.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = rotation
@@ -118,10 +118,9 @@ def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
 
 
 def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
-    """Matrices (...,6,6) that take steps to twists (v', w) about the origin of a, which move every point x by v' + w×x.
+    """Return the matrices (...,6,6) that turn steps (v, w) of a_from_b into twists (v + t × w, w) about the origin of a.
 
-    In twists bodies that move together move alike, so that only differences of twists show in what they see of each
-    other; v' = v + t×w.
+    A twist (u, w) moves every point x by u + w × x. Bodies that move together have equal twists, unlike steps.
     """
     out = np.zeros((*a_from_b.shape[:-2], 6, 6))
     out[..., range(6), range(6)] = 1.0
@@ -130,7 +129,7 @@ def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
 
 def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
-    """Matrices (...,6,6) that take steps of transforms to those of their inverses."""
+    """Return the matrices (...,6,6) that turn small steps of a_from_b into the steps of b_from_a."""
     rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     out = -step_axes(rotation_t)
     out[..., :3, 3:] = -rotation_t @ skew(a_from_b[..., :3, 3])
@@ -138,19 +137,19 @@ def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
 
 def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
-    """Matrices that take twists (v, ω) in b axes to a axes."""
+    """Return the adjoint matrices (n,6,6) that turn twists (v, ω) in frame b into twists in frame a."""
     return twist_from_step(a_from_b) @ step_axes(a_from_b[:, :3, :3])
 
 
 def apply(a_from_b: Transform, x_in_b: Vectors) -> Vectors:
-    """x_in_a for points (...,3) under one rigid transform (4,4)."""
+    """Return x_in_a (...,3), the points transformed by one rigid transform (4,4)."""
     return x_in_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def scale_translation(
     a_from_b: Float[ndarray, "*#batch 4 4"], scale: Float[ndarray, "*#batch"] | np.floating | float
 ) -> Float[ndarray, "... 4 4"]:
-    """S_λ: the transforms with their translations multiplied by scales (...), their rotations untouched."""
+    """Return the transforms with their translations multiplied by the scales (...); rotations do not change (S_λ)."""
     return transform(a_from_b[..., :3, :3], np.asarray(scale)[..., None] * a_from_b[..., :3, 3])
 
 
@@ -181,9 +180,9 @@ def fit_similarity(
     x_in_b: Float[ndarray, "*#batch n 3"],
     weights: Float[ndarray, "*#batch n"] | None = None,
 ) -> tuple[Float[ndarray, "... 4 4"], Any]:
-    """Least-squares `a_from_b` (...,4,4) and scales (...) with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991).
+    """Return least-squares `a_from_b` (...,4,4) and scales (...) with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991).
 
-    Without a batch the scale is a float. Points of no weight or of no extent give scale 1.
+    One set of points (n,3) gives one scale. Points without weight or extent give scale 1.
     """
     w = np.ones(x_in_a.shape[:-1]) if weights is None else weights
     w = w / np.maximum(w.sum(-1, keepdims=True), TINY)
@@ -198,9 +197,9 @@ def fit_similarity(
 
 
 def across_lines(direction: Vectors) -> Rotations:
-    """Projectors (...,3,3) onto the plane at right angles to unit directions (...,3): I − d dᵀ.
+    """Return the projectors I − d dᵀ (...,3,3) onto the plane perpendicular to unit directions d (...,3).
 
-    They are what lines show of the point nearest to them: Σ (I − d dᵀ) x = Σ (I − d dᵀ) o, with o on each line.
+    The point x nearest to lines through points o solves Σ (I − d dᵀ) x = Σ (I − d dᵀ) o.
     """
     return np.eye(3) - direction[..., :, None] * direction[..., None, :]
 
@@ -208,14 +207,14 @@ def across_lines(direction: Vectors) -> Rotations:
 def nearest_to_lines(
     origin: Float[ndarray, "*#batch n 3"], direction: Float[ndarray, "*#batch n 3"]
 ) -> Float[ndarray, "... 3"]:
-    """Return the points (...,3) nearest to n lines each, given by a point and a unit direction (...,n,3)."""
+    """Return the point (...,3) nearest to n lines, each given by one of its points and a unit direction (...,n,3)."""
     across = across_lines(direction)
     normal = across.sum(-3) + PARALLEL * np.eye(3)
     return np.linalg.solve(normal, (across @ origin[..., None]).sum(-3))[..., 0]
 
 
 def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
-    """Return the length of motions (...,4,4) (m): the way of the origin, and the angle times ARM."""
+    """Return the length (m) of motions (...,4,4): length of the translation plus ARM times the angle."""
     return np.linalg.norm(motion[..., :3, 3], axis=-1) + ARM * rotation_angle(motion[..., :3, :3])
 
 
@@ -230,19 +229,19 @@ def largest_motion(a_from_b: Float[ndarray, "n 4 4"]) -> tuple[float, float]:
 def rotation_between_deg(
     a: Float[ndarray, "*#batch 3 3"], b: Float[ndarray, "*#batch 3 3"]
 ) -> Float[ndarray, "..."] | np.floating:
-    """Angle in degrees between two (stacks of) rotations."""
+    """Return the angle in degrees between rotations a and b (...,3,3), which broadcast."""
     return np.degrees(rotation_angle(np.swapaxes(a, -1, -2) @ b))
 
 
 def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
-    """Roll, pitch, yaw (rad) about the fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll); at gimbal lock yaw is 0."""
+    """Return roll, pitch, yaw (rad) with R = Rz(yaw)·Ry(pitch)·Rx(roll); at gimbal lock yaw is 0."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of gimbal lock, where any of the equal answers will do
+        warnings.simplefilter("ignore")  # about gimbal lock, where roll and yaw are not unique
         return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
 def require_rigid(matrix: Transform, where: str) -> Transform:
-    """Return the matrix with its rotation made exact; raise InputError where it is too far from rigid.
+    """Return the matrix with its rotation made exact; raise InputError if it is too far from rigid.
 
     `where` begins the message: the file and frame, or the argument, that the matrix came from.
     """

@@ -1,7 +1,7 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) on any manifold, dense or with unknowns that a caller eliminates.
 
-Unknowns are any object (a pose, a tuple); they move by steps in a tangent space, as geometry.retract moves poses. Where
-the cost is an array, its elements are those of independent problems, and the unknowns have them along the first axis.
+Unknowns are any object (a pose, a tuple); a step in a tangent space moves them, as geometry.retract moves a pose. Many
+independent problems are solved together if the cost is an array: one element per problem, and one row of the unknowns.
 """
 
 from collections.abc import Callable
@@ -14,31 +14,32 @@ from numpy import ndarray
 from threadpoolctl import threadpool_limits
 
 one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""Decorates what solves many small systems. BLAS threads gain nothing on these, and wait for each other as soon as the
-machine has other work: of 15 images with the other core taken, `solve_hand_eye` took 60 times as long."""
+"""Decorator of functions that solve many small linear systems: it limits BLAS to one thread. Several threads gain
+nothing there; with the other core busy, `solve_hand_eye` of 15 images took 60 times as long."""
 
 Unknowns = TypeVar("Unknowns")
 Loss = Literal["linear", "soft_l1", "cauchy"]
 """Loss of a squared length s: s, 2(√(1 + s) − 1) or log(1 + s), as in scipy.optimize.least_squares."""
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
+"""Initial, smallest and largest damping, as a share of each diagonal element of the normal equations."""
 TINY = 1e-300
-"""Cost of exact data, below which nothing can be gained."""
+"""Absolute cost that counts as 0."""
 EXACT = 1e-24
-"""Share of the initial cost below which a cost is rounding."""
+"""Share of the initial cost below which a change of the cost is rounding."""
 UNSEEN = 1e-12
-"""Share of the largest diagonal element that keeps an unobservable direction fixed."""
+"""Share of the largest diagonal element that is added to all, so that unobservable unknowns stay where they are."""
 System = TypeVar("System")
 
 
 @dataclass(frozen=True)
 class Minimum(Generic[Unknowns]):
-    """The minimum of a sum of losses."""
+    """Result of `minimise`: unknowns at the minimum, their cost and their normal equations."""
 
     unknowns: Unknowns
     cost: Any
     """Half the sum of the losses."""
     normal: Float[ndarray, "*b p p"]
-    """Jᵀ W J there, W the weights of the loss: the inverse covariance where residuals are whitened."""
+    """Matrix JᵀWJ at the minimum, W being the weights of the loss: the inverse covariance if residuals are whitened."""
     settled: bool
     """Whether the last step gained less than the tolerance."""
 
@@ -53,10 +54,10 @@ def damped_gauss_newton(
     damping: Any = START_DAMPING,
     iterations: int = 100,
 ) -> tuple[Unknowns, Any, bool]:
-    """Minimise a cost from `start`; return the unknowns, their cost, and whether the steps settled.
+    """Minimise a cost from `start`; return the unknowns, their cost, and whether the iteration converged.
 
-    `step` takes the unknowns, their linearisation and the relative damping of its diagonal. The iteration ends where a
-    step changes the cost by less than `enough` of it. Of independent problems each has its own damping.
+    `step` returns the unknowns after a step, from the present ones, their linearisation and the damping. The iteration
+    ends when a step changes the cost by less than `enough(cost)`. Independent problems have a damping each.
     """
     unknowns, least, settled = start, cost(start), False
     system: System | None = None
@@ -76,7 +77,7 @@ def damped_gauss_newton(
 
 
 def _where(better: Any, tried: Any, before: Any) -> Any:
-    """Return the unknowns after the step where that is better; of independent problems, arrays or tuples of these."""
+    """Return `tried` for the problems that are `better`, `before` for the others; arrays, or tuples of arrays."""
     if np.all(better):
         return tried
     if isinstance(tried, tuple):
@@ -94,8 +95,8 @@ def minimise(
 ) -> Minimum[Unknowns]:
     """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each, ρ being the loss.
 
-    `linearised` returns the residuals and their derivatives by a step (p,), `moved` takes the step. The iteration ends
-    where a step lowers the cost by less than `tolerance` of it.
+    `linearised` returns residuals and their derivatives by a step of p numbers; `moved` returns the unknowns after a
+    step. The iteration ends when a step changes the cost by less than the share `tolerance`.
     """
 
     def step(
@@ -125,13 +126,14 @@ def minimise(
 
 
 def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray, "*batch"]:
-    """Return ρ'(s), the weight of residuals of squared length s in the equations."""
+    """Return ρ'(s), the derivative of the loss: the weight of residuals of squared length s in the normal equations."""
     if loss == "linear":
         return np.ones_like(squared)
     return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)
 
 
 def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
+    """Return ½ Σ ρ(|r|²) over the residuals of each problem."""
     squared = (residual**2).sum(-1)
     if loss == "soft_l1":
         squared = 2 * (np.sqrt(1 + squared) - 1)
@@ -143,6 +145,7 @@ def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
 def _equations(
     loss: Loss, residual: Float[ndarray, "*b k m"], jacobian: Float[ndarray, "*b k m p"]
 ) -> tuple[Float[ndarray, "*b p p"], Float[ndarray, "*b p"]]:
+    """Return the normal equations JᵀWJ and JᵀWr, W being the weights of the loss."""
     root = np.sqrt(loss_weight(loss, (residual**2).sum(-1)))[..., None]
     flat = (root[..., None] * jacobian).reshape(*residual.shape[:-2], -1, jacobian.shape[-1])
     transposed = np.swapaxes(flat, -1, -2)
