@@ -498,7 +498,8 @@ def validated(content: dict[str, object], file: Path) -> AnyCalibration:
         raise InputError(
             f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; run the calibration again"
         )
-    record = FailedCalibration if content.get("scale") is None else Calibration
+    is_empty = content.get("scale") is None and content.get("uncertainty") is None
+    record = FailedCalibration if is_empty else Calibration
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
         found = adapter(record).validate_json(json.dumps(content), strict=True)

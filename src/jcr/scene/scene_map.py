@@ -166,6 +166,17 @@ class SceneMap:
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
 
+    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
+        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
+
+        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
+        """
+        x = self._points(x_in_base, "points")
+        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
+        if not isinstance(x_in_base, Tensor):
+            answers = tuple(answer.cpu().numpy() for answer in answers)
+        return dict(zip(self.properties, answers, strict=True))
+
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m; tensors are answered with (differentiable) tensors.
 
