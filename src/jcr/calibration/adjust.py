@@ -1,6 +1,6 @@
-"""Bundle adjustment of a case: images, points, intrinsics and robot poses together (estimation/).
+"""Joint bundle adjustment of a case's camera poses, points, intrinsics and gripper poses (estimation/).
 
-Where images are not adjusted, the covariance of the fit to poses includes the errors of given intrinsics.
+A case without adjusted images keeps the fit to camera poses; errors of the intrinsics are added to its covariance.
 """
 
 from dataclasses import replace
@@ -38,19 +38,18 @@ from jcr.geometry import (
 from jcr.records import LeaveOneOut, PaperResiduals, Tracks
 
 FEWEST = 6
-"""Fewest observations of an image from which the motion of its camera with the intrinsics is computed."""
+"""Fewest observations of an image; with fewer, the camera's motion due to wrong intrinsics is not computed."""
 SETTLED_ENOUGH = 0.5
-"""Standard deviations of the last step below which an adjustment that did not settle is only noted: smaller effects
-are not reported either (checks/effects.py)."""
+"""Largest last step, in standard deviations, for which an adjustment that did not converge is a note and no warning:
+effects of that size are not reported either (checks/effects.py)."""
 
 
 def with_adjusted_images(case: Case) -> Case:
-    """Adjust the images of a case and replace its fit from poses by the calibration that results.
+    """Adjust the images of a case and replace its fit to camera poses by the resulting calibration.
 
-    A rejected fit is replaced too: without intrinsics the fit from poses alone is poor, and the adjustment is not. On
-    correspondences between pointmaps, whose errors neighbours share, it is replaced only where the leave-one-out error
-    becomes smaller. The fit stays where the motions leave a direction unobservable, which images do not change, and
-    where the adjustment fails because points lie behind the cameras.
+    A rejected fit is replaced too: without given intrinsics the camera poses are poor before the adjustment. For
+    correspondences between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
+    decreases. The fit is kept if the motions are degenerate, or if the adjustment fails (points behind the cameras).
     """
     if not case.is_adjustable:
         return _considered(case)
@@ -63,7 +62,7 @@ def with_adjusted_images(case: Case) -> Case:
         return case
     refined = judged(refined_by(case, found))
     if not found.settled:
-        # The rounds ended before sizes and steps settled.
+        # The iterations ended before the steps and the estimated sizes of the errors converged.
         severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
         size = {"value": found.last_step, "rounds": float(found.iterations)}
         unsettled = Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size)
@@ -81,11 +80,12 @@ def adjust_case(
     combinations: Float[ndarray, "e p"] | None = None,
     confirmed_errors: Float[ndarray, "s b"] | None = None,
 ) -> Solution:
-    """Adjust the used images and gripper poses of a case, from its fit to poses or from its adjustment.
+    """Adjust the used images and gripper poses of a case, starting from its last adjustment or its fit to camera poses.
 
-    `prior` takes the place of the case's camera; the rest is that of ReportedPoses and adjust_wrist. The first errors of
-    the gripper poses are those that the fit leaves: images that are first adjusted to poses that contradict them take
-    ten times the steps.
+    `prior` replaces the case's prior of the intrinsics. Each column of `combinations` (e,p) is one effect to estimate,
+    a combination of the e columns of hypotheses.Alternatives. `confirmed_errors` (s,b) are b error patterns of the
+    gripper poses, s = 6 per used image, one standard deviation each. The robot pose noise starts at the residuals of
+    the fit, because a smaller initial noise takes ten times the steps where poses contradict the images.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
@@ -104,10 +104,10 @@ def adjust_case(
 
 
 def _considered(case: Case) -> Case:
-    """Return the case with the errors of its intrinsics, which a fit to poses cannot estimate, as uncertainty.
+    """Add the uncertainty of the intrinsics, which a fit to camera poses cannot estimate, to the case's covariance.
 
-    The focal length does not move a network's cameras. A wrong principal point rotates all of them, so that the
-    transform and the principal point together place points where they are.
+    The camera poses of a network do not depend on the focal length. An error of the principal point rotates the
+    hand-eye transform; this correlation is kept in the joint covariance.
     """
     hand_eye, camera, x = case.hand_eye, case.camera, case.hand_eye.gripper_from_camera
     if case.reconstruction.predicted_focal is not None:
@@ -138,12 +138,12 @@ def with_intrinsics_considered(
     priors: tuple[LinearPrior, ...],
     systematic: Float[ndarray, "s s"],
 ) -> Calibration:
-    """Return the calibration with the errors of its intrinsics in its covariance C and budget: C + S Φ Sᵀ.
+    """Add the errors of the intrinsics to the covariance C of a calibration from camera poses alone: C + S Φ Sᵀ.
 
-    This is the consider covariance of Schmidt, Φ that of the intrinsics (Tapley, Schutz and Born, "Statistical Orbit
-    Determination", 2004, chapter 6), for a calibration from camera poses alone, which cannot estimate them.
-    All arguments are of the used images. The sensitivity S is that of the fit to the cameras that one standard
-    deviation of each parameter would give: cameras that keep the pixels of `tracks` in place.
+    This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
+    Φ is the covariance of the intrinsics. S is the derivative of the fit by the intrinsics: each parameter changes by
+    one standard deviation, and the camera poses change so that the pixels of `tracks` stay in place. All poses and
+    `systematic`, the covariance of the systematic robot errors (s = 6m) at 1 rad, are those of the used images.
     """
     moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
     for row, pose in enumerate(recon_from_camera):
@@ -172,17 +172,17 @@ def with_intrinsics_considered(
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
-    """Return the calibration of a case from an adjustment, without the findings that its numbers decide."""
+    """Return the calibration that an adjustment of a case gives, without the findings that `judged` makes."""
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
     if case.capture.intrinsics is None and intrinsics.model == "pinhole":
-        # A thin prism that nobody measured and no image shows moves transform and intrinsics together, and places no
-        # point elsewhere. Cameras of other models have their own coefficients.
+        # An unmodelled thin prism changes transform and intrinsics together and moves no point. Camera models other
+        # than pinhole have coefficients of their own for it.
         steps = decentring(intrinsics, x)
         uncertainty = uncertainty.with_error(steps @ steps.T, "intrinsics")
     gripper, camera = case.base_from_gripper, case.recon_from_camera
-    # Rejected poses are measured against where their cameras show them.
+    # The residuals of rejected gripper poses refer to the poses that their camera poses predict.
     predicted = base_from_recon @ scale_translation(camera, scale) @ inverse(x)
     state, rigs = found.state, found.problem.arms[0].rigs
     predicted[used] = predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig[rigs])
@@ -206,9 +206,9 @@ def refined_by(case: Case, found: Solution) -> Calibration:
 
 
 def _leave_one_out(found: Solution) -> LeaveOneOut | None:
-    """Return the mean error of gripper poses that are predicted by an adjustment without their image."""
+    """Return the mean leave-one-out error: each gripper pose is predicted by an adjustment without its image."""
     left_out, likely = found.leave_one_out[0], found.most_likely
-    # The images as they would be with every gripper, and the rig on it, displaced by its own leave-one-out residual.
+    # The reprojection error refers to cameras that are displaced by the leave-one-out residuals of their gripper poses.
     x, z, own, rigs = likely.x[0], likely.z[0], found.problem.arms[0].rigs, likely.world_from_rig.copy()
     gripper = predicted_gripper_poses(x, likely.scale, z, rigs[own])
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x

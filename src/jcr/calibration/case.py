@@ -28,19 +28,19 @@ from jcr.findings import Finding, is_explained, verdict_of
 from jcr.records import Capture, Reconstruction, SceneUncertainty, Tracks
 
 MIN_OBSERVATIONS = 200
-"""Fewest observations with which images are adjusted; fewer do not refine what the poses show."""
+"""Fewest observations with which images are adjusted; fewer do not improve the fit to camera poses."""
 MIN_IMAGES = 3
 """Fewest images that are adjusted."""
 MOST_OBSERVATIONS = 60_000
-"""Most observations that are adjusted: the robot limits what more could add, and 25 images of 640x480 have as many."""
+"""Most observations that are adjusted, as many as 25 images of 640x480 have; more add little to the robot's errors."""
 
 WELL_SEEN = 3
-"""Images that show a point well."""
+"""Number of images from which a point is preferred, where only some of the points are adjusted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A capture, its reconstruction, and their calibration so far; poses are in the reconstruction's order."""
+    """Capture, reconstruction, and the state of their calibration; pose arrays are in the reconstruction's order."""
 
     capture: Capture
     reconstruction: Reconstruction
@@ -48,17 +48,17 @@ class Case:
     robot: RobotErrorPrior
     """Systematic errors of the registered images' poses."""
     priors: tuple[LinearPrior, ...]
-    """Measurements of scale and height beside the robot's poses."""
+    """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
     hand_eye: Calibration
-    """The calibration as it stands; its images are the registered ones."""
+    """Current calibration; its images are the registered ones."""
     fit: Calibration | None = None
-    """The fit to camera poses of which `hand_eye` was made by the images; None where `hand_eye` is that fit."""
+    """Fit to camera poses that the adjustment started from; None while `hand_eye` is itself that fit."""
     carries: Literal["camera", "scene"] = "camera"
     """Load of the gripper; the camera is fixed where the gripper carries the scene."""
     chosen_tracks: Tracks | None = None
-    """Observations in the used images that take part, where not all do."""
+    """Observations to adjust, a subset of those in the used images; None: the default subset (`tracks`)."""
     adjusted: Solution | None = None
-    """Images and robot together, whether or not `hand_eye` is made of it; None where images could not be adjusted."""
+    """Last bundle adjustment, even if `hand_eye` is still the fit to poses; None if the images were not adjusted."""
 
     @property
     def base_from_gripper(self) -> Float[ndarray, "m 4 4"]:
@@ -67,18 +67,18 @@ class Case:
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
-        """Camera poses by the images alone where these are known, else those of the reconstruction."""
+        """Camera poses from the images alone (`evidence`) if the reconstruction has them, else its camera poses."""
         evidence = self.reconstruction.evidence
         return self.reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
 
     @property
     def used(self) -> Int[ndarray, " u"]:
-        """Rows of the registered images that are used."""
+        """Indices, among the registered images, of the images that the calibration uses."""
         return np.flatnonzero(self.hand_eye.inliers)
 
     @property
     def pose_fit(self) -> Calibration:
-        """The fit to camera poses, with which the adjustment of the images starts."""
+        """Fit to camera poses, the initial estimate of the bundle adjustment."""
         return self.fit or self.hand_eye
 
     @property
@@ -88,12 +88,12 @@ class Case:
 
     @property
     def systematic(self) -> Float[ndarray, "s s"]:
-        """Covariance of the systematic errors of the used poses at 1 rad."""
+        """Covariance of the systematic errors of the used gripper poses for a size of 1 rad; 6 rows per pose."""
         return of_poses(self.robot.systematic, self.used)
 
     @property
     def camera(self) -> CameraPrior:
-        """Camera with the prior of its intrinsics before the calibration."""
+        """Intrinsics before the calibration, and their prior covariance."""
         given, found = self.capture.intrinsics, self.reconstruction.intrinsics
         if given is None and self.reconstruction.predicted_focal is not None:
             of_center = {name: ESTIMATED[name] for name in ("aspect", "cx", "cy")}
@@ -112,31 +112,34 @@ class Case:
 
     @property
     def free_focus(self) -> Float[ndarray, "e p"] | None:
-        """Combinations that give every used image a focal length of its own; None where the user asked for none."""
+        """Combinations (e,p) of the columns of hypotheses.Alternatives that give each used image its own focal length.
+
+        None where the option `focus` is "fixed".
+        """
         if self.options.focus == "fixed":
             return None
         return focal_lengths(self.reconstruction.intrinsics, len(self.used))
 
     @property
     def scene_distance_m(self) -> float | None:
-        """Median distance from the camera to the scene; None where the images were not adjusted."""
+        """Median depth of the scene points in the images (m); None where the images were not adjusted."""
         if self.adjusted is None or self.hand_eye.source == "poses":
             return None
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
 
     @property
     def scene_uncertainty(self) -> SceneUncertainty | None:
-        """Uncertainty of the scene in the base frame; None where the calibration is not made of images."""
+        """Uncertainty of the reconstructed scene in the base frame; None for a calibration from camera poses alone."""
         if self.adjusted is None or self.scene_distance_m is None:
             return None
         return scene_uncertainty(scene_points(self.adjusted))
 
     @property
     def is_adjustable(self) -> bool:
-        """Whether bundle adjustment can refine the fit to poses.
+        """Whether bundle adjustment can refine the fit to camera poses.
 
-        Cameras that are not found by matches come with their covariance and have no tracks. Bundle adjustment takes
-        scale and height from the robot alone.
+        It needs enough observations and images. Camera poses with a covariance (`evidence`) are not adjusted, nor are
+        cases with a known scale or height (`priors`), which the bundle adjustment does not model.
         """
         return (
             self.reconstruction.evidence is None
@@ -147,9 +150,9 @@ class Case:
 
     @property
     def shows_camera(self) -> bool:
-        """Whether effects on the camera can be tested.
+        """Whether effects on the camera can be tested: the case is adjustable, and its motions are observable.
 
-        Pointmaps were made with intrinsics of their own, and degenerate motions are reported first.
+        Tracks from pointmaps are excluded, because the network used intrinsics of its own.
         """
         return (
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
@@ -166,16 +169,17 @@ class Case:
         hand_eye: Calibration | None = None,
         adjusted: Solution | None = None,
     ) -> "Case":
-        """Return the case after a check: findings, and the calibration and adjustment that replace its own."""
+        """Return the case with the findings of a check added, and with a new calibration or adjustment if given."""
         found = with_findings(hand_eye or self.hand_eye, findings)
         fit = self.pose_fit if found.source == "images" else self.fit
         return replace(self, hand_eye=found, fit=fit, adjusted=adjusted or self.adjusted)
 
 
 def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
-    """Return a calibration with findings, and with their shifts in its covariance.
+    """Add findings to a calibration, and the outer products of their shifts to its covariance.
 
-    A finding rejects the calibration where its shift makes it too uncertain, or where it explains a rejection.
+    A finding with a shift is given the severity "rejects" if the calibration is rejected already, or if its shift makes
+    the calibration too uncertain.
     """
     named: list[Finding] = []
     for finding in findings:
@@ -184,7 +188,7 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
             continue
         accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
         hand_eye = hand_eye.with_finding(finding)
-        # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
+        # The finding "too uncertain" is not added, because its remedy, more images, does not help against a fault.
         if not accepted or not judged(hand_eye).converged:
             finding = replace(finding, severity="rejects")
         named.append(finding)
@@ -192,16 +196,16 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """Return the observations of the used images, whose rows are counted again."""
+    """Return the observations in the used images, with image numbers that count the used images only."""
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])
 
 
 def some_points(tracks: Tracks, most: int, most_points: int | None = None) -> Tracks:
-    """Return the observations of all board corners and of randomly chosen points, at most `most`.
+    """Return the observations of all board corners, and of randomly chosen points up to `most` observations.
 
-    Of at most `most_points` those that WELL_SEEN or more images show are chosen first.
+    `most_points` limits the number of the chosen points; points in WELL_SEEN or more images are then preferred.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))

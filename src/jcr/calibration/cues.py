@@ -1,4 +1,4 @@
-"""Lengths measured with a ruler that replace what the motions do not show: a height, a distance in an image."""
+"""Lengths given by the user for unobservable motions: the camera's height, or the distance of two pixels' points."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,19 +11,20 @@ from jcr.geometry import Poses, rotation_angle
 from jcr.records import Capture, Reconstruction
 
 LENGTH_STD = 0.01
-"""Relative standard deviation of a length: one pixel at either end of a hundred pixels."""
+"""Relative standard deviation of a known length: one pixel of a length of 100 px."""
 HEIGHT_STD = 1e-3
 """Standard deviation (m) of a height measured with a ruler."""
 CONTRADICTED = (4.0, 0.02)
-"""Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
+"""Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
+fraction of the scale; both limits are exceeded."""
 ONE_AXIS = np.radians(6)
 """Largest mean deviation (rad) of the rotation axis of a planar motion."""
 
 
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the axis that all rotations share, the camera's height (m) along it, and its standard deviation.
+    """Return the rotation axis (gripper frame) of a planar motion, the camera's height along it, and its std (m, m).
 
-    Raises InputError where the rotations share no axis.
+    Raises InputError if the gripper does not rotate about one common axis.
     """
     u, _, vt = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     up = np.sign(u[2, 0]) or 1.0
@@ -39,7 +40,7 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
 
 
 def check_known_length(capture: Capture, known_length: LengthInImage | None) -> None:
-    """Raise InputError, before any work, if the image of a known length, or a pixel of it, is not in the capture."""
+    """Raise InputError if the image of `known_length` is not in the capture, or if a pixel lies outside the image."""
     if known_length is None:
         return
     image, *ends, _ = known_length
@@ -58,9 +59,9 @@ def check_known_length(capture: Capture, known_length: LengthInImage | None) -> 
 def length_cue(
     capture: Capture, reconstruction: Reconstruction, known_length: LengthInImage
 ) -> tuple[float, float]:
-    """Return the metres per recon unit from the length between two pixels of one image, and its relative error.
+    """Return the scale (metres per recon unit) from a known length between two pixels, and its relative std.
 
-    Raises InputError when the image or a surface at either pixel is not there.
+    Raises InputError if the image is not registered or a pixel has no depth.
     """
     image, *ends, length_mm = known_length
     first, second = (
@@ -73,9 +74,10 @@ def length_cue(
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
 ) -> Float[ndarray, "3"]:
-    """Return the surface point (recon frame) of a pixel of an image.
+    """Return the surface point (recon frame) at a pixel of an image, from the pointmaps.
 
-    Raises InputError, which names the option `asked_by`, where there is no such image or surface.
+    Raises InputError if the image is not registered or the pixel has no depth; the message names the command-line
+    option `asked_by`.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:

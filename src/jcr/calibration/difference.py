@@ -1,4 +1,4 @@
-"""Difference of two calibrations, tested against the covariances of both, with the causes that would explain it."""
+"""Difference of two hand-eye calibrations: χ² test with both covariances, and the share of χ² by cause of error."""
 
 import json
 from dataclasses import dataclass, field
@@ -31,42 +31,42 @@ else:
     Comparable = object
 
 OTHER = "reference"
-"""Name of the covariance of a calibration whose file has no budget."""
+"""Cause of error that stands for the covariance of a calibration without an uncertainty budget."""
 NOTHING = 1e-6
-"""Share of a difference that is rounding."""
+"""Largest share of χ² that is attributed to rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Difference of one gripper_from_camera from another, in gripper axes."""
+    """Step from one gripper_from_camera to another, along the axes of the gripper, and its test."""
 
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
-    """rad: R_other = exp(r)·R."""
+    """Rotation vector r (rad): R_other = exp(r)·R."""
     sigmas: Float[ndarray, "6"] | None = None
-    """Size on each axis in standard deviations of the difference; None where neither states any."""
+    """Absolute translation and rotation per axis, divided by their standard deviations; None without covariances."""
     chi2: float | None = None
-    """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
+    """Squared Mahalanobis distance; χ² with 6 degrees of freedom if the errors of both are independent."""
     p_value: float | None = None
     explained_by: dict[str, float] = field(default_factory=dict)
-    """Share of χ² by cause, largest first; the sum is 1. Empty where there is no difference."""
+    """Share of χ² by cause of error, largest first; the sum is 1. Empty if both transforms are equal."""
 
 
 @dataclass(frozen=True)
 class StatedTransform:
-    """Transform and covariance of a calibration, or of a reference."""
+    """gripper_from_camera of a calibration or of a reference, with its covariance if that is known."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "6 6"] | None = None
-    """Covariance of the first six of COVARIANCE_ORDER; None where none is stated."""
+    """Covariance of translation (m) and rotation vector (rad), as in COVARIANCE_ORDER; None: unknown."""
     parts: dict[str, Float[ndarray, "6 6"]] = field(default_factory=dict)
-    """Parts of the covariance, by cause; empty where none are stated."""
+    """Parts of the covariance by cause of error; empty without an uncertainty budget."""
     doubt: str | None = None
-    """Reason of the rejection; None where it is accepted, or has no verdict."""
+    """Reason why the calibration is rejected; None if it is accepted, or if it is a reference without a verdict."""
 
 
 class _Reference(BaseModel):
-    """Fields of a file that somebody else wrote, such as reference.json."""
+    """Fields that are read from a JSON file which is no calibration.json, such as reference.json."""
 
     model_config = ConfigDict(allow_inf_nan=False)
     gripper_from_camera: Matrix | None = None
@@ -75,18 +75,17 @@ class _Reference(BaseModel):
 
 
 def compare(calibration: Comparable, other: Comparable) -> Difference:
-    """Return the difference of two calibrations and whether their errors explain it.
+    """Return the step from `calibration` to `other`, and the χ² test that their stated errors explain it.
 
     Each is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or
-    a 4×4 gripper_from_camera. Raises InputError where one of them has no transform of a camera on the gripper,
-    RejectedError where nothing was found.
+    a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
     """
     ours, others = (_stated(one, "the calibration") for one in (calibration, other))
     return difference(ours, others)
 
 
 def _stated(one: Comparable, name: str) -> StatedTransform:
-    """Return the transform of what `compare` takes with its covariance; raise InputError without a transform."""
+    """Return gripper_from_camera and covariance of an argument of `compare`; raise InputError without a transform."""
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)
@@ -103,9 +102,10 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
 
 
 def read_hand_eye(path: Path) -> StatedTransform:
-    """Read gripper_from_camera, and its covariance where the file has one; raise InputError without a transform.
+    """Read gripper_from_camera and its covariance from a run folder, calibration.json or reference.json.
 
-    A reference.json may state `std_mm` and `std_deg`, along the axes of the gripper.
+    A reference.json may state standard deviations `std_mm` and `std_deg` along the axes of the gripper. Raises
+    InputError for a file without gripper_from_camera.
     """
     file = path
     if path.is_dir():
@@ -129,9 +129,9 @@ def read_hand_eye(path: Path) -> StatedTransform:
 
 
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
-    """Return the difference of one calibration from another, compared with the covariances that they state.
+    """Return the step Δ from `ours` to `other` and its χ² = ΔᵀV⁻¹Δ, where V is the sum of both covariances.
 
-    A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
+    Causes of error with covariances Pₖ make up V = ΣPₖ; the share of cause k is ΔᵀV⁻¹PₖV⁻¹Δ / χ².
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
     parts, together = dict[str, Float[ndarray, "6 6"]](), np.zeros((6, 6))
@@ -141,7 +141,7 @@ def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
             rest = known.covariance - sum(known.parts.values(), np.zeros((6, 6)))
             for name, part in (known.parts | {OTHER: rest}).items():
                 parts[name] = parts.get(name, np.zeros((6, 6))) + part
-    if not np.diag(together).all():  # neither states any, or both are said to be exact
+    if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
         return Difference(translation_m=step[:3], rotation_vector=step[3:])
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std

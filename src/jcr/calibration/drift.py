@@ -1,7 +1,7 @@
-"""Test of a motion since an earlier calibration, from new images that are located in the old reconstruction.
+"""Test whether camera or scene moved since a calibration, from new images registered in the old reconstruction.
 
-Old and new gripper poses are one problem, and a motion that only the new images have is one row of the common test
-(estimation/hypotheses.py): of the camera on the gripper, or of the scene in the base frame.
+The equations of old and new gripper poses are combined. A motion of all new images, of the camera on the gripper or of
+the scene in the base frame, is tested as an additional effect (estimation/hypotheses.py).
 """
 
 from dataclasses import dataclass, replace
@@ -22,13 +22,13 @@ from jcr.findings import FindingKind
 from jcr.geometry import Poses, inverse, retract
 
 CLEAR = 5.0
-"""Difference of log probabilities by which one explanation is preferred to the other (odds of 150 to 1)."""
+"""Difference of log p-values from which a motion of the camera is distinguished from one of the scene (150 to 1)."""
 KNOWN = 1e9
-"""Freedom of known sizes of the errors: the test averages over them, and its rate of false alarms is the stated one."""
+"""Degrees of freedom for robot errors of known size, with which the F test becomes a χ² test."""
 POWER = 0.9
-"""Probability with which a motion of the size `detectable` is found."""
+"""Probability of detecting a motion of the size `Drift.detectable`."""
 NOISIER = 1.5
-"""Factor of the errors of the gripper poses from which new images contradict one another."""
+"""Ratio of the robot errors of old and new images to those of the old images from which `is_noisier` is set."""
 SETTLED, ITERATIONS = 1e-5, 10
 """Step (m, rad) that ends the iterations, and their largest number."""
 
@@ -38,19 +38,21 @@ Cause = Literal["camera", "scene", "either"]
 
 @dataclass(frozen=True, kw_only=True)
 class Drift:
-    """Motion of the camera on the gripper since the calibration, and what explains the images better."""
+    """Motion of the camera on the gripper since the calibration, its test, and the more likely cause."""
 
     offset: Float[ndarray, "6"]
-    """Step from the calibrated transform to the one now (m, rad; gripper axes)."""
+    """Step from the calibrated to the present gripper_from_camera: translation (m), rotation vector (rad), gripper
+    axes."""
     covariance: Float[ndarray, "6 6"]
+    """Covariance of `offset`."""
     p_value: float
-    """Probability of a motion like this or larger where nothing has moved."""
+    """Probability of an offset this large or larger if nothing has moved."""
     cause: Cause
-    """Motion that explains the images better: of the camera on the gripper, or of the scene in the base."""
+    """Motion that explains the new images better: of the camera on the gripper, or of the scene in the base frame."""
     detectable: tuple[float, float]
-    """m, rad: motions in the worst direction that the test at this `alpha` would find nine times in ten."""
+    """Translation (m) and rotation (rad), in the worst direction, that the test detects with probability 0.9."""
     is_noisier: bool
-    """Whether old and new gripper poses have much larger errors together than the old ones alone."""
+    """Whether the estimated robot errors of old and new poses together are much larger than those of the old poses."""
 
 
 def drift(
@@ -60,11 +62,12 @@ def drift(
     systematic: Float[ndarray, "s s"],
     alpha: float,
 ) -> Drift:
-    """Return the motion of the camera that new images show.
+    """Estimate and test the motion of the camera on the gripper between a calibration and new images.
 
-    `old` holds the gripper poses and cameras of the calibration, `new` those of the new images and the covariance of
-    steps of these cameras (geometry.retract, recon axes); `systematic` is the covariance of the systematic errors of old
-    and new gripper poses at 1 rad.
+    `old` holds base_from_gripper and recon_from_camera of the calibration. `new` holds both for the new images, and
+    the covariances of their camera poses (steps of geometry.retract, recon axes). `systematic` is the covariance of
+    the systematic errors of old, then new gripper poses for a size of 1 rad. `alpha` is the probability of a false
+    alarm.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
     first, state = len(old[0]), calibrated.state
@@ -81,7 +84,7 @@ def drift(
         _motion(problem, state, first, kind) for kind in (FindingKind.SLIP, FindingKind.BASE_MOVED)
     )
     difference = of_camera.log_p - of_scene.log_p
-    # Either motion fits one image exactly.
+    # A motion of the camera and a motion of the scene both fit a single new image exactly.
     unclear = len(new[0]) == 1 or abs(difference) < CLEAR
     now, then = np.array(of_camera.noise.together), np.array(calibrated.noise.together)
     return Drift(
@@ -95,12 +98,15 @@ def drift(
 
 
 def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Test:
-    """Return the test of a motion of X or Z from image `first` on, linear about the motion that it estimates."""
+    """Test a motion from image `first` on: of gripper_from_camera X (SLIP), or of base_from_recon Z (BASE_MOVED).
+
+    The equations are linearized again at each estimate of the motion until the estimate converges.
+    """
     (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
     columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)
     left = ITERATIONS
     while True:
-        # Reported without the motion, the new gripper poses fit the transforms of the calibration.
+        # The estimated motion is removed from the new gripper poses, so that they fit the calibrated transforms.
         moved, gripper = retract(x if of_x else z, motion), arm.base_from_gripper.copy()
         gripper[first:] = (
             gripper[first:] @ moved @ inverse(x) if of_x else z @ inverse(moved) @ gripper[first:]
@@ -117,7 +123,10 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
 
 
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
-    """Return motions (m) and rotations (rad) in the worst direction that a test at `alpha` finds nine times in ten."""
+    """Return translation (m) and rotation (rad) that a χ² test at level `alpha` detects with probability 0.9.
+
+    `covariance` is that of the estimated motion; both sizes are those in its least certain direction.
+    """
     length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]
     return float(length * worst[0]), float(length * worst[1])
