@@ -1,1 +1,1 @@
-"""Dense depth on known cameras."""
+"""Dense depth of images whose camera poses and intrinsics are known."""

@@ -1,4 +1,4 @@
-"""`python -m jcr.depth` compiles the loops of dense depth ahead of their first use, and keeps them on disk."""
+"""`python -m jcr.depth` compiles the numba loops of dense depth before their first use and caches them on disk."""
 
 from jcr.depth.densify import compile_loops
 

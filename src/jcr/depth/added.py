@@ -15,13 +15,14 @@ from jcr.progress import Progress
 from jcr.records import MATCHED, NO_DEPTH, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 NEIGHBOURS = 6
-"""Images that each is compared with; at most half of them are new ones."""
+"""Largest number of images that a new image is compared with; at most half of these are new as well."""
 REACH = 1.5
-"""The planes that span the search reach so much farther than known points: a new thing may be taller than all others."""
+"""Factor by which the searched range of inverse depth is widened: a new object may be taller than all others."""
 CONTRADICTION = 0.015
-"""Relative difference of depths by which one surface lies before another, beyond noise of depth and poses."""
+"""Relative difference of depth from which one surface counts as nearer than another; noise of depth and poses is
+smaller."""
 LEAST_SHARE = 0.005
-"""Least share of a new image's pixels with depth; with less it shows nothing of the scene."""
+"""Least share of a new image's pixels that must get a depth; with less, the image is taken to show another scene."""
 
 
 def extend(
@@ -32,11 +33,11 @@ def extend(
     added: Capture,
     report: Progress,
 ) -> Reconstruction:
-    """Return the reconstruction with further images, oldest first, whose gripper poses are known.
+    """Return the reconstruction with the images of `added`, oldest first, posed by their gripper poses.
 
-    Their rows come last, numbered from `capture_size`, the images of the capture; where a later image contradicts
-    an earlier one, the earlier's confidence is 0. Raises InputError for an image that shares no view with the
-    others.
+    The added images are the last rows; their `image_index` counts from `capture_size`, the number of images of the
+    capture. Pixels of an earlier image that a later image contradicts get confidence 0. Raises InputError for an added
+    image that gets too little depth.
     """
     dense, old, new = reconstruction.dense, len(reconstruction.recon_from_camera), len(added)
     pinhole = dense.intrinsics
@@ -80,7 +81,10 @@ def extend(
 
 
 def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"]) -> Pointmaps:
-    """Return pointmaps with those of later images, whose confidence is brought to the unit of the earlier ones'."""
+    """Return the pointmaps `dense` followed by the pointmaps `found` of later images; `colors` are those of all images.
+
+    The confidences of `found` are scaled to the median confidence of `dense`.
+    """
     assert found.reason is not None and found.depth_std is not None
     known, unit = dense.confidence > 0, 1.0
     if known.any():
@@ -105,10 +109,13 @@ def _contradicted(
     later: int,
     pinhole: Intrinsics,
 ) -> Bool[ndarray, "h w"]:
-    """Return the pixels of an earlier view that the later one sees through, or whose ray meets the later's surface."""
+    """Return which pixels of the view `earlier` have a depth that the view `later` contradicts.
+
+    The later view sees a surface behind the earlier view's point, or has points in front of the earlier view's surface.
+    """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
-        """Return the pixels (v, u) of a view's known points in the other, and which lie before its surface there."""
+        """Return pixels v, u in view `other` of the points of view `row`, and whether each hides the surface there."""
         other_from_recon = inverse(recon_from_camera[other])
         depth = apply(other_from_recon, points_in_recon[other])[..., 2]
         nearest = np.where(known[other], depth, np.inf).astype(np.float32)
@@ -130,7 +137,7 @@ def _contradicted(
 def _pixels(
     x_in_camera: Float[ndarray, "n 3"], pinhole: Intrinsics
 ) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
-    """Return the nearest pixel u, v (n,), depth (n,), and whether it lies in the image (else the pixel is 0, 0)."""
+    """Return the nearest pixel u, v of each point, its depth, and whether it lies in the image; else u = v = 0."""
     z = x_in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = np.round(project(pinhole, x_in_camera)).T
@@ -141,7 +148,7 @@ def _pixels(
 def _with_projections(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], first: int, pinhole: Intrinsics
 ) -> Tracks:
-    """Return the tracks with the projections of their points in the images from `first` on, for the choice of views."""
+    """Return the tracks with further observations: projections of all points into the images from row `first` on."""
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row in range(first, len(recon_from_camera)):
         u, v, _, inside = _pixels(apply(inverse(recon_from_camera[row]), tracks.points_in_recon), pinhole)

@@ -1,4 +1,4 @@
-"""Consistency of depths and colours across views; depths of 16 pixels of a row at once in vector registers."""
+"""Compiled comparison of depths and colours between views, 16 pixels of a row at once in vector registers."""
 
 from typing import Any, no_type_check
 
@@ -15,16 +15,17 @@ from jcr.depth.lanes import INT, LONG, Lanes
 
 LANES = 16
 SEEN_THROUGH = 0.01
-"""A neighbour whose depth is farther by this share sees through the point. Beside an object's outline the plain
-table often gets the object's depth; the neighbours that look past the object there show the table's."""
+"""Relative difference of depth: a neighbour whose depth at a point is farther by more sees through this point. Beside
+an object's outline, the plain table often gets the object's depth; neighbours that see the table there show the
+error."""
 
 
 def inverse_depth_evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
-    """Return the maps for `agreement`: inverse depths, 0 where not `known`, negative where not `sees`.
+    """Return the maps that `agreement` compares: inverse depth, 0 where not `known`, negated where not `sees`.
 
-    Their rows are continued by zeros to a multiple of the lanes.
+    A pixel of `sees` may contradict depths of other images. The rows are padded with zeros to a multiple of LANES.
     """
     maps = np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0).astype(np.float32, copy=False)
     return np.pad(maps, [(0, 0), (0, 0), (0, -maps.shape[2] % LANES)])
@@ -33,11 +34,13 @@ def inverse_depth_evidence(
 @compiled
 @no_type_check
 def agreement(i, compared, others, a, b, centre, k, width, tolerance):
-    """Return maps (4,h,w) of image i: mean inverse depth of images that agree, their number, number that see through.
+    """Compare the depths of image i with those of the images `others`; return four maps (4,h,w).
 
-    The fourth is the information of those that agree: the sum of squares of how far (px) the point moves in them per
-    inverse depth. `compared` is the `evidence` of images of this `width`; `a` (n,3,3) is K R and `b` (n,3) K t to
-    each other image, `centre` (n) its camera's z in image i; `tolerance` is relative.
+    The maps are the mean inverse depth over image i and the images that agree, the number of images that agree, the
+    number of images that see through the point, and Σ |∂x/∂(inverse depth)|² (px²) over the pixels x in the images that
+    agree. `compared` comes from `inverse_depth_evidence`, and `width` is the images' width before padding. `a` (n,3,3)
+    is K R and `b` (n,3) is K t of each other image from image i; `centre` (n) is the z coordinate of its camera in
+    image i; `k` is fx, fy, cx, cy; `tolerance` is the largest relative difference of depths that agree.
     """
     _, h, w = compared.shape
     one, tolerance = np.float32(1), np.float32(tolerance)
@@ -55,11 +58,12 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 @compiled
 @no_type_check
 def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tolerance):
-    """Return numbers (3,h,w) of images that show the points of image i in their colour, in another, and see through.
+    """Count for each point of image i the other images with its colour, with another colour, and with sight through it.
 
-    `asked` (h,w) is the points' inverse depth, 0 where none is asked for; `inverse_depth` (m,h,w) holds every image's
-    matched one, or 0, and `colors` (m,h,w,3) its colours. A point is hidden from an image whose matched depth there is
-    nearer, and not counted.
+    The three counts are (3,h,w). `asked` (h,w) is the inverse depth of the points, 0 for no point. `inverse_depth`
+    (m,h,w) is the matched inverse depth of all images, 0 for none, and `colors` (m,h,w,3) are their colours. An image
+    with a nearer matched depth at a point does not see the point and is not counted. `others`, `a`, `b`, `centre` and
+    `k` are as in `agreement`.
     """
     h, w = asked.shape
     half, most = np.float32(0.5), np.float32(tolerance * tolerance)
@@ -92,9 +96,10 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
 @inlined
 @no_type_check
 def _row(v, n, a, b, k, width, height):
-    """Return the factors of a ray's x, of 1 and of inverse depth in x, y and z of the n-th other image, in row v.
+    """Return the projection of row v of an image into the n-th other image, as factors of x, y and z.
 
-    Then the largest x and y there, and cx and 1/fx.
+    x, y and z each have a factor of the ray's x, a constant, and a factor of inverse depth. The last element is the
+    largest x and y in the image, cx and 1/fx.
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]
@@ -104,14 +109,15 @@ def _row(v, n, a, b, k, width, height):
 
 
 def _numbers(builder: Any, row: Any) -> list[Any]:
-    """Return the numbers of a tuple, each in all lanes."""
+    """Return each number of a tuple, repeated in all lanes."""
     return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
 
 
 def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
-    """Return pixel x, y, relative depth z of 16 pixels from u on in another image, and whether they lie in it.
+    """Project 16 pixels of a row, from column u on, into another image; return x, y, z and whether they lie in it.
 
-    `here` are their inverse depths, `rows` is what `_row` returns. Outside, x and y are 0.
+    `here` is the inverse depth of the pixels, and z is their depth in the other image over their own depth. `rows`
+    comes from `_row`. Outside of the image, x and y are 0.
     """
     (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = rows
     columns: Any = Lanes.repeated(here.builder, here.builder.trunc(u, INT), LANES).as_floats()
@@ -125,7 +131,10 @@ def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
 
 
 def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return the inverse depth between pixels, or the nearest's where one is unknown, and whether that one sees."""
+    """Interpolate a map of `inverse_depth_evidence` at x, y; return inverse depth and whether the nearest pixel `sees`.
+
+    Where one of the four pixels around is unknown, the inverse depth is that of the nearest pixel.
+    """
     left, top = x.as_ints(), y.as_ints()
     first = top * width + left
     (p, q), (r, s) = (at.gathered(image, LANES).as_pairs() for at in (first, first + width))
@@ -141,7 +150,7 @@ def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
 @intrinsic
 @no_type_check
 def _compare_depths(typing, sums, compared, place, rays, rest):
-    """Add to the maps of `agreement` what image j shows at the depths of 16 pixels; `place` is (i, j, v, u)."""
+    """Add to the maps of `agreement` the comparison of 16 pixels of image i with image j; `place` is (i, j, v, u)."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         out, maps = (context.make_array(signature.args[n])(context, builder, given[n]) for n in range(2))

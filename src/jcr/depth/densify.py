@@ -1,4 +1,4 @@
-"""The stage densify: a reconstruction's cameras and tracks to dense pointmaps, whichever back end found them."""
+"""Stage that estimates dense pointmaps from the cameras and tracks of a reconstruction of any back end."""
 
 import os
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 RISE = 0.4
-"""Share of a camera's distance to a board that things beside it may rise towards the camera."""
+"""Greatest height of objects beside a board, as a share of the distance from the board to the cameras."""
 MOST_THREADS = 16
-"""Images that are matched at once. Each takes about 400 bytes per pixel while it is matched."""
+"""Largest number of images that are matched at once; each takes about 400 bytes per pixel during the matching."""
 
 
 def densify(
@@ -29,10 +29,10 @@ def densify(
     options: DepthOptions | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Return the reconstruction with pointmaps of its images; those that a network predicted stay.
+    """Return the reconstruction with pointmaps of its images, or unchanged where it has pointmaps.
 
-    Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration.
-    Raises InputError where an image cannot be read.
+    Only cameras, intrinsics and tracks are used, so that the stage may run before or after the calibration. Raises
+    InputError for an image that cannot be read.
     """
     if reconstruction.pointmaps is not None:
         return reconstruction
@@ -58,13 +58,13 @@ def densify(
 def undistorted(
     folder: Path, names: Sequence[str], intrinsics: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "m h w 3"]:
-    """Return the images on the pinhole grid of pointmaps."""
+    """Return the images, read from `folder` and undistorted to the pixel grid of `pinhole`."""
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])
 
 
 def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
-    """Return the points, and the same points raised as far towards the cameras as objects beside the board may rise."""
+    """Return the tracks with every point of the board a second time, raised by RISE towards the mean camera centre."""
     on_board = tracks.points_in_recon
     middle = recon_from_camera[:, :3, 3].mean(0)
     raised = on_board + RISE * (middle - on_board)
@@ -80,9 +80,10 @@ def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Track
 def choose_neighbours(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int
 ) -> list[Int[ndarray, " _"]]:
-    """Return the rows of up to `count` others for each image that share most points under a useful angle.
+    """Return for each image the rows of up to `count` other images to match with, best first.
 
-    The angle's weight has the form of MVSNet's (Yao et al., ECCV 2018, section 4.1), its best at 15°.
+    The score is the number of shared points, each weighted by the angle between its two rays. The weight is largest at
+    15°, as in MVSNet (Yao et al., ECCV 2018, section 4.1).
     """
     m = len(recon_from_camera)
     seen = np.zeros((m, len(tracks.points_in_recon)), dtype=bool)
@@ -100,11 +101,12 @@ def choose_neighbours(
 
 
 def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
-    """Return two planes p·x_in_camera = 1 for each image, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
+    """Return for each image the nearest and farthest plane of its depth search, as vectors p with p·x_in_camera = 1.
 
-    All have the slope of the plane that the image's points lie on best, mostly the table (least absolute
-    deviations of inverse depth); between them lie the points from percentile 1 to 99, with some slack.
-    With fronto-parallel planes 6 % fewer pixels got a depth, and its median error was 1.6 times as large.
+    The inverse depth of a pixel on plane p is p·(x/z, y/z, 1). Both planes have the slope of the plane fitted to the
+    image's points, mostly the table (least absolute deviations of inverse depth). Percentiles 1 to 99 of the points lie
+    between them, with some margin. Fronto-parallel planes gave 6 % fewer pixels a depth, and 1.6 times the median
+    error.
     """
     planes = np.empty((len(recon_from_camera), 2, 3))
     for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
@@ -133,12 +135,11 @@ def dense_pointmaps(
     priors: bool = True,
     before: Pointmaps | None = None,
 ) -> Pointmaps:
-    """Estimate points in the recon frame for the pixels of undistorted images, with confidence, reason and sigma.
+    """Estimate pointmaps in the recon frame of undistorted images, with confidence, reason and standard deviation.
 
     The confidence is the correlation times the number of images that agree, 0 for no estimate. `neighbours` and
-    `planes` are those of `choose_neighbours` and `sweep_planes`. `before`: pointmaps of the first images, taken at
-    another time, whose depth is compared and not matched again; then an image that sees through a point of another one
-    may show an earlier scene, and nothing is filled by `priors`.
+    `planes` come from `choose_neighbours` and `sweep_planes`. `before` are known pointmaps of the first images, taken
+    at an earlier time: only later images are matched, images may show a changed scene, and `priors` is ignored.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth
@@ -182,7 +183,10 @@ def pointmaps_of(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> Pointmaps:
-    """Return the pointmaps of depths (z, recon units) with their relative standard deviation, on known cameras."""
+    """Return pointmaps from the depths (z, recon units) of images with known camera poses.
+
+    `relative_std` is the standard deviation of a depth over this depth.
+    """
     points, direction = np.empty((*depth.shape, 3)), rays(pinhole)
     for k, pose in enumerate(recon_from_camera):
         points[k] = (depth[k, ..., None].astype(np.float64) * direction) @ pose[:3, :3].T + pose[:3, 3]
@@ -197,7 +201,7 @@ def pointmaps_of(
 
 
 def compile_loops() -> None:
-    """Compile or load every loop of dense depth: estimate the depth of a small wall of noise before three cameras."""
+    """Compile or load every loop of dense depth by a run on a small random texture before three cameras."""
     pinhole = Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60)
     wall = np.random.default_rng(0).integers(0, 256, (30, 60, 3)).repeat(2, 0).repeat(2, 1).astype(np.uint8)
     images = np.stack([wall[:, 10 * k : 10 * k + pinhole.width] for k in range(3)])

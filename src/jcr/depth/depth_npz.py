@@ -1,6 +1,7 @@
-"""Format depth.npz: the estimated depth of the pixels of each image, 8.25 bytes a pixel.
+"""File format depth.npz: the estimated depth of the pixels of each image, 8.25 bytes a pixel.
 
-Points follow from the depth and the cameras of reconstruction.npz, colours from the images of the capture.
+The points are computed from the depth and the camera poses of reconstruction.npz; colours come from the capture's
+images.
 """
 
 from dataclasses import asdict
@@ -16,23 +17,23 @@ from jcr.records.npz import read_npz, require_shapes, write_npz
 
 FILE = "depth.npz"
 FORMAT = "jcr.depth/2"
-"""Changes with what the file holds."""
+"""Version of the format; a file of another version is rejected."""
 GREY = 128
-"""Colour where the images are no longer there."""
+"""Grey value that replaces the colours where the images are no longer available."""
 
 
 class DepthHeader(BaseModel):
-    """JSON part of depth.npz."""
+    """Header of depth.npz, in JSON: version, origin and intrinsics of the pointmaps."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     format: str
     made_from: str
-    """The fingerprint of the reconstruction and of the options."""
+    """Fingerprint of the reconstruction and the options that the depth was estimated with."""
     intrinsics: Intrinsics
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write the estimated pointmaps of a reconstruction whole or not at all."""
+    """Write the estimated pointmaps of a reconstruction to a file; an interrupted call leaves no partial file."""
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
     about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}
@@ -51,7 +52,7 @@ def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> N
 
 
 def is_made_from(path: Path, made_from: str) -> bool:
-    """Test whether a file exists and has this fingerprint; InputError where it is damaged."""
+    """Test whether the file exists and has the fingerprint `made_from`; raise InputError for a damaged file."""
     if not path.is_file():
         return False
     with read_npz(path, FORMAT) as (text, _):
@@ -59,9 +60,9 @@ def is_made_from(path: Path, made_from: str) -> bool:
 
 
 def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | None) -> Pointmaps:
-    """Return the pointmaps of a reconstruction, with the colours of the capture's images; grey without a capture.
+    """Read the pointmaps of a reconstruction, coloured by the images of the capture, or grey without a capture.
 
-    Raises InputError when the file is damaged, of another format, or of other images.
+    Raises InputError for a file that is damaged, of another version, or of other images.
     """
     with read_npz(path, FORMAT) as (text, file):
         pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics

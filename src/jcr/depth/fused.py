@@ -1,4 +1,4 @@
-"""Matched depths, checked across views, and planes where there are none: one depth, reason and sigma a pixel."""
+"""Fusion of matched depths, checked across views, with planes where no match is found."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,24 +17,26 @@ from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
 LEAST_CORRELATION = 0.3
-"""Least correlation with the best neighbours; below it there is no estimate."""
+"""Least correlation with the best neighbours for a depth to be used."""
 AGREEMENT = (0.01, 0.005, 0.003, 0.003)
-"""Per round: largest relative difference of two depths of one point that are averaged. On simulated views the
-rounds halve the median error and the share of gross ones."""
+"""Largest relative difference of two depths of one point that are averaged, one per round. On simulated views the
+rounds halve the median error and the share of gross errors."""
 FEWEST_MATCHED = 300
-"""Pixels of all images together from which planes are drawn at least."""
+"""Least number of matched pixels of all images together from which planes are fitted."""
 MATCHING_STD_PX = 0.6
-"""Error of a matched pixel in a neighbour. Fitted to simulated scenes: the errors of windows side by side go together,
-so that it is more than the scatter of one."""
+"""Standard deviation of a matched pixel in a neighbour, px. Fitted to simulated scenes; it is larger than the scatter
+of single pixels because the errors of adjacent windows are correlated."""
 PRIOR_FLOOR = 0.002
-"""Relative sigma of a depth that rests on a plane, beside what the pixels scatter that carry it."""
+"""Relative standard deviation of the depth of a plane, added in quadrature to the scatter of the pixels that support
+it."""
 PAIR_CORRELATION = 0.5
-"""Least correlation of a depth on which two images agree and no third, and which its region's plane confirms; without
-the plane, a third of such depths are off by 5 mm."""
+"""Least correlation of a depth that only one other image agrees with, and that the plane of its region confirms.
+Without the confirmation, a third of such depths are off by 5 mm."""
 BOTH_CONFIDENCE = 2.0
-"""Factor of the confidence of a matched depth on its region's plane: at most a quarter as many are off by 5 mm."""
+"""Factor of confidence for a matched depth that lies on its region's plane; at most a quarter as many of these are off
+by 5 mm."""
 PRIOR_CONFIDENCE = 0.5
-"""Confidence of a prior for each image that agrees, where a matched pixel has its correlation."""
+"""Confidence of a depth taken from a plane, per image that agrees; a matched depth has its correlation instead."""
 
 
 def fused_depth(
@@ -50,12 +52,12 @@ def fused_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return inverse depth, confidence, reason and relative sigma (m,h,w) of what views agree on.
+    """Return inverse depth, confidence, reason and relative standard deviation (m,h,w) of depths on which views agree.
 
-    With `priors` also the depths of planes that no view contradicts. A matched depth needs two images that agree (one,
-    if there are no more than two) and, but for `changing` scenes, more than twice as many as see through it. To see
-    through, an image's own depth must have as many that agree: what is found where nothing matches is as often behind
-    a surface as before it. Confidence and sigma are 0 without depth.
+    With `priors`, pixels without a match get the depth of a plane where no view contradicts it. A matched depth needs
+    two other images that agree (one, with fewer than three neighbours), and more than twice as many as see through it;
+    in `changing` scenes, sight through it does not count. Only pixels with enough agreeing images count as seeing
+    through. Confidence and standard deviation are 0 without depth.
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]
@@ -108,7 +110,7 @@ def _checked(
     sees: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
-    """Return `agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
+    """Return the maps of `agreement` of all images, (m,h,w) each; inverse depths that are not `known` are unchanged."""
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
     found = pool.map(
         lambda i: agreement(i, compared, *views[i], k, pinhole.width, tolerance), range(len(views))
@@ -146,7 +148,7 @@ def _chosen(
     reasons: list[int],
     stds: list[Float[ndarray, "m h w"]],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return inverse depth, confidence, reason and sigma of the first kind that holds at each pixel."""
+    """Return inverse depth, and confidence, reason and standard deviation by the first mask that holds at a pixel."""
     return (
         inverse_depth,
         np.select(which, confidences, 0).astype(np.float32),
@@ -161,7 +163,7 @@ def _support(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "4"]:
-    """Return the plane of most matched points, in the recon frame."""
+    """Return the plane (unit normal n, d with n·x + d = 0) in the recon frame on which most matched points lie."""
     direction = rays(pinhole).reshape(-1, 3)
     x_in_recon = []
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):

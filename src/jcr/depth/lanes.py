@@ -1,4 +1,4 @@
-"""Arithmetic of vector registers for numba intrinsics, with a fixed order of sums: the same bits on every machine."""
+"""Vector arithmetic for numba intrinsics, with a fixed order of sums: results are the same bits on every machine."""
 
 from functools import partialmethod
 from typing import Any
@@ -10,31 +10,31 @@ FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
 
 class Lanes:
-    """One number or condition a lane: the result of an instruction that `builder` emits."""
+    """Vector register with one number or condition per lane, as the result of an LLVM instruction of `builder`."""
 
     def __init__(self, builder: Any, value: Any) -> None:
-        """Take a value of a vector type that an instruction gives."""
+        """Wrap `value`, an LLVM value of a vector type."""
         self.builder, self.value, self.count = builder, value, value.type.count
 
     @classmethod
     def constant(cls, builder: Any, numbers: Any, kind: Any = FLOAT) -> "Lanes":
-        """Return given numbers, one a lane."""
+        """Return a vector of constants, one number per lane."""
         return cls(builder, ir.Constant(ir.VectorType(kind, len(numbers)), [kind(n) for n in numbers]))
 
     @classmethod
     def repeated(cls, builder: Any, number: Any, count: int) -> "Lanes":
-        """Return a scalar in all `count` lanes."""
+        """Return a vector with the scalar `number` in all `count` lanes."""
         empty = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
         return cls(builder, builder.insert_element(empty, number, INT(0))).at([0] * count)
 
     @classmethod
     def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
-        """Return `count` consecutive numbers from a place on."""
+        """Load `count` consecutive numbers from memory, beginning at element `place` of the array `start`."""
         there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any, used: int) -> "Lanes":
-        """Return 64 bits from each of these places after `start`; the lanes from `used` on are 0."""
+        """Load 64 bits from memory for the first `used` lanes, each at its index after `start`; other lanes are 0."""
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
         for lane in range(used):
             place = b.zext(b.extract_element(self.value, INT(lane)), LONG)
@@ -43,7 +43,7 @@ class Lanes:
         return Lanes(b, found)
 
     def _same(self, other: Any) -> Any:
-        """Return the other operand; a number stands for itself in every lane."""
+        """Return the other operand as a vector; a plain number is repeated in every lane."""
         kind = self.value.type.element
         return other if isinstance(other, Lanes) else Lanes.constant(self.builder, [other] * self.count, kind)
 
@@ -65,50 +65,50 @@ class Lanes:
     __ge__ = partialmethod(_compare, ">=")
 
     def __abs__(self) -> "Lanes":
-        """Return the absolute values."""
+        """Return the absolute value of each lane."""
         return (self < 0.0).choose(self * -1.0, self)
 
     def choose(self, yes: Any, no: Any) -> "Lanes":
-        """Return `yes` in the lanes where this condition holds, `no` in the others; numbers stand for floats."""
+        """Return `yes` in lanes where this condition holds, else `no`; plain numbers are repeated as floats."""
         zero = Lanes.constant(self.builder, [0.0] * self.count)
         return Lanes(
             self.builder, self.builder.select(self.value, zero._same(yes).value, zero._same(no).value)
         )
 
     def as_ints(self) -> "Lanes":
-        """Return the numbers as int32: floats without their fraction, the low bits of longer ones."""
+        """Convert each lane to int32: floats are truncated, longer integers keep their low 32 bits."""
         convert = self.builder.fptosi if self.value.type.element == FLOAT else self.builder.trunc
         return Lanes(self.builder, convert(self.value, ir.VectorType(INT, self.count)))
 
     def as_floats(self) -> "Lanes":
-        """Return the numbers of int32 as float32."""
+        """Convert each int32 lane to float32."""
         return Lanes(self.builder, self.builder.sitofp(self.value, ir.VectorType(FLOAT, self.count)))
 
     def as_pairs(self, kind: Any = FLOAT) -> "tuple[Lanes, Lanes]":
-        """Return the two numbers in the 64 bits of every lane."""
+        """Split each 64-bit lane into its low and its high 32 bits, as two vectors."""
         pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(kind, 2 * self.count)))
         return pairs.at(range(0, 2 * self.count, 2)), pairs.at(range(1, 2 * self.count, 2))
 
     def inverted(self) -> "Lanes":
-        """Return the inverse of the numbers."""
+        """Return the reciprocal 1/x of each lane."""
         return self._same(1.0) / self
 
     def root(self) -> "Lanes":
-        """Return the square roots."""
+        """Return the square root of each lane."""
         kind = ir.FunctionType(self.value.type, [self.value.type])
         root = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.sqrt.v{self.count}f32")
         return Lanes(self.builder, self.builder.call(root, [self.value]))
 
     def at(self, lanes: Any) -> "Lanes":
-        """Return the vector of the values of the lanes with these constant indices, in their order."""
+        """Return the vector of the lanes at the constant indices `lanes`, in this order."""
         chosen = Lanes.constant(self.builder, lanes, INT).value
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 
     def write(self, start: Any, place: Any) -> None:
-        """Write the lanes as consecutive floats from a place on."""
+        """Store the lanes to memory as consecutive floats, beginning at element `place` of the array `start`."""
         there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
         self.builder.store(self.value, there, align=4)
 
     def add_to(self, start: Any, place: Any) -> None:
-        """Add the lanes to consecutive floats from a place on."""
+        """Add the lanes to consecutive floats in memory, beginning at element `place` of the array `start`."""
         (self + Lanes.read(self.builder, start, place, self.count)).write(start, place)

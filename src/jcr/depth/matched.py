@@ -1,4 +1,4 @@
-"""Depth by matching: PatchMatch at half and at full resolution, image by image in threads."""
+"""Depth by PatchMatch stereo at half and then at full resolution, one image per thread."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,27 +16,29 @@ from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
 COMPARED = 5
-"""Neighbours that an image is matched with, the first that are given."""
+"""Number of neighbours that an image is matched with at half resolution: the first ones of its list."""
 ASKED = 3
-"""Number of neighbours that a pixel is matched with at full resolution, the best ones at half resolution."""
+"""Number of neighbours that a pixel is matched with at full resolution: those of highest correlation at half
+resolution."""
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
-"""Per pass at half and at full resolution: relative change of inverse depth that is tried, and how often."""
+"""Passes of PatchMatch at half (`_COARSE`) and at full resolution: relative change of inverse depth, and number of
+trials."""
 _PEAK = 0.003
-"""Relative change of inverse depth, to either side, by which the peak is found in the end."""
+"""Relative change of inverse depth, to either side, at which the parabola of the last refinement is sampled."""
 LEAST = 0.25
-"""Least inverse depth of the search, as a share of the largest one of the tracks."""
+"""Least inverse depth of the search, as a share of the largest inverse depth of the search planes."""
 
 
 Relative = tuple[Int[ndarray, " _"], Float[ndarray, "_ 3 3"], Float[ndarray, "_ 3"], Float[ndarray, " _"]]
-"""Projection of an image's pixels into its neighbours, u ~ a·ray + b·(inverse depth): rows of the neighbours, a, b, and
-z of each neighbour's camera in the image's camera."""
+"""Projection of pixels of an image into its neighbours, u ~ a·ray + b·(inverse depth): rows of the neighbours, a = K R,
+b = K t, and the z coordinate of each neighbour's camera centre in the image's camera frame."""
 
 
 def relative(
     i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
 ) -> Relative:
-    """Return the projection of image i into others, in the grid of `pinhole`."""
+    """Return the projection of pixels of image i into the images `others`, all on the pixel grid of `pinhole`."""
     motion = inverse(recon_from_camera[others]) @ recon_from_camera[i]
     a, b = pinhole.matrix @ motion[:, :3, :3], motion[:, :3, 3] @ pinhole.matrix.T
     a, b, centre = (np.ascontiguousarray(part, np.float32) for part in (a, b, inverse(motion)[:, 2, 3]))
@@ -44,12 +46,12 @@ def relative(
 
 
 def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
-    """Return fx, fy, cx, cy for the compiled loops."""
+    """Return fx, fy, cx, cy as float32 for the compiled loops."""
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 
 class _Level:
-    """All images at one resolution: colours, their sums (greys), and the greys as windows of other images read them."""
+    """All images at one resolution: RGB colours, greys (sum of the three colours), and greys packed by `quads`."""
 
     def __init__(self, colors: UInt8[ndarray, "m _ _ 3"], pinhole: Intrinsics) -> None:
         size, self.pinhole = (pinhole.width, pinhole.height), pinhole
@@ -64,14 +66,17 @@ class _Level:
         recon_from_camera: Float[ndarray, "m 4 4"],
         space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """Return `packed`, `motions`, `windows` (written to `space`) and k of image i for the compiled loops."""
+        """Return `packed`, `motions`, `windows` and k of image i, the arguments that the loops of patch_match.py share.
+
+        The windows are written to the buffer `space`.
+        """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
         k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
         return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
-        """Return a map of the level below at this resolution, each number for the pixels that it covers."""
+        """Return a map of half the resolution at this resolution, each number repeated in the pixels that it covers."""
         h, w = self.pinhole.height, self.pinhole.width
         row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
         column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)
@@ -88,10 +93,10 @@ def match_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[Float[ndarray, "k h w"], Float[ndarray, "k h w"]]:
-    """Return inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane for images `rows`.
+    """Match the images `rows` with their neighbours; return inverse depth (per recon unit) and correlation (-1 to 1).
 
-    `planes` of `views.sweep_planes` span what is searched, and half of the first guesses are parallel to them. The
-    result is the same whatever the number of threads.
+    The search lies between the two `planes` of `densify.sweep_planes`, and half of the initial planes are parallel to
+    them. The result does not depend on the number of threads.
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)

@@ -1,4 +1,4 @@
-"""Measured depth in pointmaps: scaled by the robot, weighed by its own noise, and held against what images match."""
+"""Fusion of depth images of a depth camera into pointmaps, with their scale corrected by the robot's motions."""
 
 from dataclasses import replace
 
@@ -12,27 +12,27 @@ from jcr.geometry import apply, inverse
 from jcr.records import MATCHED, PRIOR, Capture, DepthCheck, Reconstruction
 
 TOO_WRONG = 20.0
-"""Percent by which a depth camera's lengths may be off; more is another unit, or another camera's depth."""
+"""Largest error of scale of the depth images, percent; a larger one means another unit or images of another camera."""
 AGREES = 3.0
-"""Standard deviations within which matched and measured depth are of one thing."""
+"""Number of standard deviations up to which matched and measured depth count as the same surface."""
 SLOPE = 0.05
-"""Relative difference of depth between neighbouring pixels, beyond which one mixes both sides of an edge."""
+"""Relative difference of depth between neighbouring pixels beyond which a pixel lies on an edge and mixes two surfaces.
+Relative difference of depth between neighbouring pixels beyond which a pixel lies on an edge and mixes two surfaces."""
 UNKNOWN = 0.02
-"""Relative sigma of depths that come without one."""
+"""Relative standard deviation of depths that come without one."""
 REACH_M = (0.1, 6.0)
-"""Depth cameras for arms measure in between."""
+"""Range of depths that are used, m: depth cameras for robot arms measure between these limits."""
 
 
 def with_measured_depth(
     capture: Capture, reconstruction: Reconstruction, check: DepthCheck | None, scale: float
 ) -> tuple[Reconstruction, tuple[str, ...]]:
-    """Return the reconstruction with the depth images in its pointmaps, and notes about them.
+    """Return the reconstruction with the depth images in its pointmaps, and notes for the user.
 
-    `check` is the comparison of the depth images with the robot, None where there is none to rely on; `scale` is that of
-    the reconstruction (metres per unit).
-
-    Depth is divided by what the robot says it is too long. Where images match a depth too, the two are averaged if they
-    agree, and else the matched one stays, for several images say it; planes that were filled in give way.
+    `check` is the comparison of the depth images with the robot's motions, None if there is none to rely on; `scale` is
+    in metres per recon unit. The depth is divided by the scale error of `check`. Measured and matched depth are
+    averaged where they agree; where they differ the matched depth stays. Measured depth replaces the depth of fitted
+    planes.
     """
     if capture.depths is None:
         return reconstruction, ()
@@ -83,7 +83,7 @@ def with_measured_depth(
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
-    """Return the depth (m) at pixels (u, v), and where it is valid: at no edge, and within range."""
+    """Return the depth (m) at pixels `at` (u, v), and where it is valid: away from edges, and in the range REACH_M."""
     height, width = depth.shape
     u, v = at[..., 0], at[..., 1]
     inside = (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)

@@ -1,4 +1,4 @@
-"""Options of dense depth, apart from the stage, so that the command line's help imports little."""
+"""Options of dense depth, in a module of their own so that the command line's help imports little."""
 
 from dataclasses import dataclass
 from typing import Annotated

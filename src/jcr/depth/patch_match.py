@@ -21,15 +21,15 @@ from jcr.compiled import compiled, inlined, random_state, uniform
 from jcr.depth.window import LANES, STRIDE, correlate
 
 MOST_SLANTED = 0.12
-"""Cosine between a plane's normal and the ray, below which a surface shows too few pixels to be matched."""
+"""Least cosine between a plane's normal and the ray; a more slanted surface shows too few pixels to be matched."""
 BEST = 2
-"""Neighbours whose correlations count at a pixel; the worse ones are taken to be occluded."""
+"""Number of neighbours, the best ones, whose correlations are averaged at a pixel; others are taken to be occluded."""
 UNKNOWN = -2.0
-"""Score of a plane that has not been compared."""
+"""Score of a plane that has not been compared yet."""
 _PASSED = 3
-"""Planes that a pixel is passed from the row before: its own column's, and the best of those to either side."""
+"""Number of planes that a pixel tries from the row before: that of its own column, and the best one to either side."""
 _BESIDE = 3
-"""Columns to either side; the best plane of them is passed."""
+"""Number of columns to either side in which the best plane is looked for."""
 
 
 @inlined
@@ -41,7 +41,10 @@ def _ray(v, u, k):
 @inlined
 @no_type_check
 def _look(v, u, asked, packed, motions, k, near, starts):
-    """Write `near`, columns of K R from tap to tap in a row and a column, K R·ray and K t; and `starts`."""
+    """Write `near` and `starts` of 16 pixels of row v, from column u on.
+
+    `near` holds the columns of K R times one step of taps in u and in v, then K R·ray, and K t.
+    """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     size = packed.shape[1] * packed.shape[2]
     for slot in range(asked.shape[0]):
@@ -60,7 +63,7 @@ def _look(v, u, asked, packed, motions, k, near, starts):
 @inlined
 @no_type_check
 def _score(v, u, tried, packed, windows, k, near, starts, each):
-    """Write the score of the planes tried: the mean of the best correlations with the neighbours asked."""
+    """Write the scores of the planes in `tried`: the mean of the BEST highest correlations with the neighbours."""
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
@@ -80,7 +83,7 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
 @inlined
 @no_type_check
 def _keep_better(found, v, u, k, tried):
-    """Take the planes tried where they score better and the camera sees their front, not too slanted."""
+    """Replace planes of `found` by those of `tried` that score higher, face the camera and are not too slanted."""
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
         p0, p1, p2, here = tried[0, lane], tried[1, lane], tried[2, lane], tried[5, lane]
@@ -94,7 +97,7 @@ def _keep_better(found, v, u, k, tried):
 @inlined
 @no_type_check
 def _try_passed(found, row, u, side, tried):
-    """Write the planes of the pixels in a row, or of the best of three to one `side` of them (-1 or 1)."""
+    """Write to `tried` the planes of a row in the same columns (`side` 0), or the best to one side (-1 or 1)."""
     last = found.shape[2] - 1
     for lane in range(LANES):
         best = min(max(u + lane + side, 0), last)
@@ -109,7 +112,7 @@ def _try_passed(found, row, u, side, tried):
 @inlined
 @no_type_check
 def _try_changed(found, v, u, k, search, halvings, state, tried):
-    """Write planes like those of the pixels by chance."""
+    """Write to `tried` random changes of the pixels' planes, by the size of `search` after `halvings` halvings."""
     lowest, highest, size = search[:3]
     scale = size * 0.5**halvings
     for lane in range(LANES):
@@ -127,9 +130,9 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
 @compiled
 @no_type_check
 def random_planes(family, span, k, h, w, seed):
-    """Return a random plane for each pixel: half of them between the family's two, half with any normal.
+    """Return `found` with a random plane per pixel: half between the planes of `family`, half with random normals.
 
-    The inverse depth of these lies in the span.
+    The inverse depth of planes with a random normal lies in `span` (lowest, highest).
     """
     state = random_state(seed)
     lowest, highest = span
@@ -156,11 +159,11 @@ def random_planes(family, span, k, h, w, seed):
 @compiled
 @no_type_check
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
-    """Update each pixel once: it takes its neighbours' planes, or a changed one, where it scores better.
+    """Update the plane of every pixel once by planes of the row before or random changes, wherever these score higher.
 
-    Passes alternate in direction (Bleyer et al. 2011, section 3.2), with the lowest bit of the seed. `search` is the
-    span of inverse depths, the relative change of it that is tried, and of the normal, how often it is: the change
-    halves from try to try; and whether the planes have no score yet.
+    Passes go down for even and up for odd seeds (Bleyer et al. 2011, section 3.2). `search` is (lowest inverse depth,
+    highest one, relative change to try, number of tries, whether the planes have no score yet). The change of inverse
+    depth and normal halves from try to try.
     """
     state = random_state(seed)
     slots, h, w = asked.shape
@@ -212,7 +215,7 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
 @compiled
 @no_type_check
 def peaks(found, asked, packed, motions, windows, k, step):
-    """Return inverse depth (h,w) at the peak of the parabola through each plane's score and two beside it."""
+    """Return the inverse depth (h,w) at the peak of the parabola of the scores at factors 1 - step, 1, 1 + step."""
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
     each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)

@@ -1,8 +1,9 @@
 """Planes for regions without texture, supported by the matched depth around them.
 
 The method follows ACMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020), with a plane for
-each region of one colour (Romanoni and Matteucci, "TAPA-MVS", ICCV 2019) and one support plane of the scene. A plane
-is taken at a pixel where the other views show the point in the same colour and none of them sees through it.
+each region of one colour (Romanoni and Matteucci, "TAPA-MVS", ICCV 2019) and one support plane of the scene, mostly the
+table. A pixel takes its plane's depth where the other views show the point in the same colour and none of them sees
+through it.
 """
 
 from collections.abc import Sequence
@@ -19,31 +20,38 @@ from jcr.depth.regions import FEWEST, colour_regions, region_planes
 from jcr.records import Intrinsics
 
 ON_PLANE = 0.006
-"""Relative distance of inverse depth within which a matched pixel lies on a plane."""
+"""Largest relative difference of inverse depth at which a matched pixel counts as lying on a plane."""
 SAME_COLOUR = 0.1
-"""Distance (RGB, each 0 to 1, exposure and vignetting compensated) below which two pixels may show one point."""
+"""Distance of colours (RGB, each 0 to 1, exposure and vignetting compensated) below which two pixels may show one
+point."""
 FARTHEST = 3.5
-"""Standard deviations of the pixels that carry a plane, up to which it is continued; the support plane has no end."""
+"""Distance up to which a plane is continued, in standard deviations of the positions of its supporting pixels. The
+support plane is continued without limit."""
 CARRIED = 0.5
-"""Share of a region's matched pixels that lie on its plane at least."""
+"""Least share of a region's matched pixels that must lie on its plane."""
 STRONG = 0.6
-"""The share from which the plane contradicts matched pixels off it: beside outlines, matching gives the nearer depth."""
+"""Least share of a region's matched pixels on its plane, from which matched pixels off the plane count as wrong: beside
+outlines, matching gives the depth of the nearer surface."""
 OFF_PLANE = 0.015
-"""Relative distance from such a plane at which a matched pixel is wrong."""
+"""Relative difference of inverse depth from which a matched pixel off such a plane counts as wrong."""
 FEWEST_VIEWS = 2
-"""Others that must show a point in its colour."""
+"""Least number of other images that must show a point in its colour."""
 PATCH = 0.02
-"""Largest share of the image of a region without a plane that may be a part of the support plane."""
+"""Largest region without a plane of its own that may take the support plane, as a share of the image."""
 WHOLE = 0.8
-"""Least share of its pixels at which the support plane must hold; an object on it moves against it."""
+"""Least share of such a region's pixels at which the support plane must be confirmed; an object standing on the plane
+shows parallax."""
 _POINTS, _TRIALS = 4000, 400
-"""Number of samples in the search for the support plane."""
+"""Numbers of points and of trials of the RANSAC search for the support plane."""
 _PAIRS = 600
-"""Pixels of an image whose brightness is compared with other images'."""
+"""Largest number of pixels of an image whose brightness is compared with each other image."""
 
 
 def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
-    """Return the plane (unit normal n, d with n·x + d = 0) of most points, by RANSAC and total least squares."""
+    """Return the plane (unit normal n, d with n·x + d = 0) on which most points lie, by RANSAC and total least squares.
+
+    `tolerance` is the largest distance of a point on the plane, recon units.
+    """
     draw = np.random.default_rng(seed)
     some = x_in_recon[draw.choice(len(x_in_recon), min(_POINTS, len(x_in_recon)), replace=False)]
     corner = some[draw.integers(len(some), size=(_TRIALS, 3))]
@@ -67,10 +75,10 @@ def evened(
     views: Sequence[Relative],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "m h w 3"]:
-    """Return colours (0 to 1) without exposure and vignetting, which are estimated from matched points.
+    """Return colours (0 to 1) corrected for exposure and vignetting, which are estimated from matched points.
 
-    Log brightness of one point in two images differs by their exposures and by a·(r²₁ - r²₂), with r the tangent of the
-    angle off axis: least absolute deviations over matched points.
+    The log brightness of one point differs between images 1 and 2 by the difference of their exposures plus a·(r₁² -
+    r₂²), where r is the tangent of the angle off the optical axis. The fit uses least absolute deviations.
     """
     color = colors.astype(np.float32) / 255
     m, h, w = matched.shape
@@ -123,13 +131,13 @@ def planar_prior(
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
 ) -> tuple[ndarray, ...]:
-    """Return maps (h,w) of the planes of image i's regions; `support` is a plane (normal, d) in the recon frame.
+    """Return six maps (h,w) of the planes of image i's regions; `support` is a plane (normal, d) in the recon frame.
 
-    `surfaces` are the matched inverse depths of all images (0: none) and their colours, gain-compensated and a little
-    smooth. The maps: inverse depth; whether it holds, since colours agree and nothing sees through
-    it; whether it is confirmed, since it holds or the one other image that looks there agrees, which is enough where the
-    pixel's own match lies on it; images that show the point in the pixel's colour (of the support plane one is
-    enough); matched pixels that a well-carried plane shows to be wrong; relative sigma of inverse depth.
+    `surfaces` are the matched inverse depths of all images (0: none) and their colours, corrected and slightly
+    smoothed. The maps are: inverse depth of the plane; whether it holds, because colours agree and no image sees
+    through it; whether it confirms a match of the pixel, because it holds or the only other image there agrees; number
+    of images that must agree with it (1 on the support plane); matched pixels that a well-supported plane shows to be
+    wrong; relative standard deviation of the inverse depth.
     """
     k, (depths, colors) = grid(pinhole), surfaces
     label, count = colour_regions(colors[i])
@@ -165,7 +173,7 @@ def planar_prior(
 
 
 def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Return the regions that touch a chosen one."""
+    """Return which regions touch one of the `chosen` regions."""
     beside = np.zeros(len(chosen), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
         beside[one[chosen[other]]] = True

@@ -1,4 +1,4 @@
-"""Regions of one colour in an image, and the planes that the matched depths in each of them lie on."""
+"""Segmentation of an image into regions of one colour, and planes fitted to the matched depth in each region."""
 
 from typing import no_type_check
 
@@ -10,24 +10,25 @@ from numpy import ndarray
 from jcr.compiled import compiled, inlined
 
 SCALE = 0.35
-"""k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1: the larger, the larger the regions."""
+"""Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; larger values give larger regions.
+Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; larger values give larger regions."""
 SMALLEST = 12
-"""Pixels of a region; smaller ones join the neighbour most like them."""
+"""Least number of pixels of a region; smaller ones are merged with the neighbour of most similar colour."""
 TRIALS = 60
-"""Planes drawn for a region."""
+"""Number of RANSAC trials for the plane of a region."""
 FEWEST = 12
-"""Matched pixels that a region's plane rests on at least."""
+"""Least number of matched pixels from which a region's plane is fitted."""
 SAMPLED = 400
-"""Matched pixels of a region that take part in the drawing."""
+"""Largest number of matched pixels of a region, about, that RANSAC counts inliers among."""
 SPREAD = 0.08
-"""Least share of a region's variance across that the pixels which support its plane have: pixels along one edge do not
-determine the slope across it, and may belong to the next object."""
+"""Least ratio of the variance across of the pixels that support a plane to that of their region. Pixels along one edge
+do not determine the slope across it, and may belong to the adjacent object."""
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:
     """Return the label of each pixel's region and the number of regions (Felzenszwalb and Huttenlocher, IJCV 2004).
 
-    The image is smoothed with its edges kept; noise and JPEG blocks would otherwise join regions.
+    The image is smoothed first, with its edges kept; otherwise noise and JPEG blocks would join regions.
     """
     smooth = cv2.bilateralFilter(color, 7, 0.07, 3)
     weight = np.concatenate([np.abs(np.diff(smooth, axis=axis)).max(-1).ravel() for axis in (1, 0)])
@@ -86,12 +87,12 @@ def region_planes(
     tolerance: float,
     seed: int,
 ) -> tuple[ndarray, ...]:
-    """Return each region's plane (count,3), on which most of its matched pixels lie (RANSAC, least squares).
+    """Fit a plane p, p·ray = inverse depth, to the matched pixels of each region (RANSAC, then least squares).
 
-    Gives planes, whether each is the support's, inliers, matched pixels, root mean square of the inliers' relative
-    residuals, and mean (count,2) and inverse covariance (count,2,2) in the image of the pixels that carry it.
-    A region without a plane has 0 inliers. `support` is that plane in the camera's coordinates; it wins where it
-    carries nearly as many pixels as the best. `tolerance` is relative, of inverse depth.
+    Returns per region: plane (count,3), whether it is the support plane, numbers of inliers and of matched pixels, root
+    mean square of the inliers' relative residuals, and mean (count,2) and inverse covariance (count,2,2) of the
+    inliers' pixels. A region without a plane has 0 inliers. `support` is the scene's support plane in the camera frame,
+    preferred where it has nearly as many inliers as the best plane. `tolerance` is relative to the inverse depth.
     """
     pixel = np.stack(np.nonzero(label >= 0)[::-1], -1).astype(float)
     fixed = np.bincount(label[matched], minlength=count)
@@ -134,9 +135,9 @@ def _drawn_planes(
     tolerance: float,
     seed: int,
 ) -> tuple[Float[ndarray, "n 3"], Bool[ndarray, " n"]]:
-    """Return the plane of most of each region's pixels among drawn ones, and whether it is the support's.
+    """Return for each region the plane with most inliers among random ones and `support`, and whether it is `support`.
 
-    `of_region` are the first pixel and the number of pixels of each; `depth` is inverse depth.
+    `of_region` are the index of the first pixel and the number of pixels of each region; `depth` is inverse depth.
     """
     start, size = of_region
     share = np.random.default_rng(seed).random((len(start), TRIALS, 3))
@@ -161,7 +162,7 @@ def _drawn_planes(
 def _moments(
     label: Int[ndarray, " n"], pixel: Float[ndarray, "n 2"], count: int
 ) -> tuple[Int[ndarray, " r"], Float[ndarray, "r 2"], Float[ndarray, "r 2 2"]]:
-    """Return number, mean and covariance (px²) of the pixels of each label."""
+    """Return number, mean (px) and covariance (px²) of the pixels of each label."""
     number = np.bincount(label, minlength=count)
 
     def mean(values: Float[ndarray, " n"]) -> Float[ndarray, " r"]:

@@ -1,6 +1,6 @@
-"""Correlations of the windows of 16 pixels of a row with another image, in vector registers.
+"""Weighted correlation of the windows of 16 pixels of a row with another image, in vector registers.
 
-A correlation takes 20 to 30 ns; the reads of its 25 taps alone take 17 ns.
+A correlation takes 20 to 30 ns; the reads of its 25 taps (pixels of the window) alone take 17 ns.
 """
 
 import functools
@@ -19,25 +19,25 @@ from jcr.compiled import compiled
 from jcr.depth.lanes import INT, LONG, Lanes
 
 LANES = 16
-"""Pixels of a row that are correlated at once; the rows of all maps are continued to a multiple of it."""
+"""Number of pixels of a row that are correlated at once; the rows of all maps are padded to a multiple of it."""
 REACH, STRIDE = 2, 2
-"""The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""
+"""Size of the window: it has (2·REACH + 1)² pixels (taps), every STRIDE-th in a row and column."""
 TAPS = (2 * REACH + 1) ** 2
 MARGIN = REACH * STRIDE
 PAD = 12
-"""Pixels by which images are continued, so that windows at their borders need no question."""
+"""Pixels by which images are padded, so that windows at their borders need no check."""
 
 NOISE = 3.0
-"""Standard deviation of pixel noise, in the sum of three colours (each 0 to 255): where the texture is no stronger,
-the correlation fades to 0."""
+"""Standard deviation of pixel noise, in the sum of three colours (each 0 to 255): where the texture is no stronger, the
+correlation tends to 0."""
 COLOR_SIGMA = 25.5
-"""Distance of colours (RGB, each 0 to 255) at which a pixel of the window counts 0.6."""
+"""Distance of colours (RGB, each 0 to 255) from the central pixel at which a pixel of the window has the weight 0.6."""
 
 
 def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
-    """Return four greys in each pixel, from the lowest bits: its own, the right one, the one below, and its right one.
+    """Pack four greys into the 64 bits of each pixel, from the lowest: itself, right, below, below right.
 
-    A bilinear interpolation is then one read from memory.
+    A bilinear interpolation then reads memory once.
     """
     own = np.pad(grey, (0, 1), "edge").astype(np.uint64)
     rows = own[:, :-1] | own[:, 1:] << 16
@@ -47,13 +47,13 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 @compiled
 @no_type_check
 def windows(image, space):
-    """Return weight and weighted grey (h,blocks,taps,2,lanes) of each tap of each pixel's window.
+    """Return weight and weighted grey of each tap of each pixel's window, (h, blocks of 16 pixels, taps, 2, 16).
 
-    `image` (4,h,w), its colours and grey, is continued by the reach of a window and to whole blocks. The weights of a
-    window have the sum 1, and a tap's is its likeness to the central colour (Schönberger et al., ECCV 2016, eq. 6, with
-    1 / (1 + x/16)^16 for their exp(-x)). The second number is the weight times the tap's own grey less the window's
-    mean, over its standard deviation with noise. They are written to the beginning of `space` (`floats_of_windows`),
-    which serves one image after the other.
+    `image` (4,h,w) comes from `continued`. The weights of a window have the sum 1; a tap's weight grows with the
+    similarity of its colour to the central one (Schönberger et al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for
+    exp(-x)). The weighted grey is weight · (grey - mean) / standard deviation, both over the window, the latter with
+    noise. The result is written to the beginning of the buffer `space` of `floats_of_windows` floats, which is reused
+    for every image.
     """
     h, blocks = image.shape[1] - 2 * MARGIN, (image.shape[2] - 2 * MARGIN) // LANES
     rows = space[: h * blocks * TAPS * 2 * LANES].reshape((h, blocks, TAPS, 2, LANES))
@@ -64,17 +64,17 @@ def windows(image, space):
 
 
 def blocks_of(columns: int) -> int:
-    """Return the number of columns in whole blocks of lanes."""
+    """Return the number of columns rounded up to a multiple of LANES."""
     return -(-columns // LANES) * LANES
 
 
 def floats_of_windows(h: int, w: int) -> int:
-    """Return the number of floats that `windows` writes for an image."""
+    """Return the number of floats that `windows` writes for an image of h rows and w columns."""
     return h * blocks_of(w) * TAPS * 2
 
 
 def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> Float[ndarray, "4 _ _"]:
-    """Return an image for `windows`: colours and grey, continued by the reach of a window."""
+    """Return colours and grey of an image as `windows` needs them, padded by the window's reach and to whole blocks."""
     around = ((MARGIN, MARGIN), (MARGIN, MARGIN + -grey.shape[1] % LANES))
     channels = [*np.moveaxis(color, -1, 0), grey]
     return np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
@@ -83,7 +83,7 @@ def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> F
 @intrinsic
 @no_type_check
 def _write_windows(typing, rows, image, v, block):
-    """Write `windows` of 16 pixels."""
+    """Write the numbers of `windows` for 16 pixels of row v."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         out, channels = (context.make_array(signature.args[k])(context, builder, given[k]) for k in range(2))
@@ -121,12 +121,12 @@ def _write_windows(typing, rows, image, v, block):
 @intrinsic
 @no_type_check
 def correlate(typing, out, slot, packed, starts, motions, windows, place, tried):
-    """Write to out[slot] the correlations of the windows of 16 pixels with another image each; -1 where one is not seen.
+    """Write to out[slot] the correlations of the windows of 16 pixels with one other image each; -1 outside of it.
 
-    `place` (v, block) is where they are in `windows`; starts[slot] (16) where the other images begin in `packed`
-    (n,y,x; `quads`, continued by `PAD`). Rows 3 to 5 of `tried` (7,16) are the change of inverse depth from tap to tap
-    in a row and in a column, and inverse depth; motions[slot] (12,16) what these are multiplied with (`near` of
-    patch_match.py).
+    `place` (v, block) is the position of the pixels in `windows`. starts[slot] (16) are the indices at which the other
+    images begin in `packed` (n,y,x; made by `quads`, padded by `PAD`). Rows 3 to 5 of `tried` (7,16) are the changes of
+    inverse depth from tap to tap in a row and in a column, and the inverse depth. motions[slot] (12,16) are their
+    factors (`near` of patch_match.py).
     """
     sums = signature(types.void, out, types.int64, packed, starts, motions, windows, place, tried)
 
@@ -156,9 +156,10 @@ def correlate(typing, out, slot, packed, starts, motions, windows, place, tried)
 
 
 def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) -> tuple[list[Lanes], Lanes]:
-    """Return centre x, y of the windows in the padded other images, steps from tap to tap, and whether they lie there.
+    """Return six vectors that place the windows in the padded other images, and whether they lie there.
 
-    The window is small: its homography is taken as affine about the centre, which spares the divisions.
+    The vectors are the centre x, y and the steps from tap to tap: x, y along a row, x, y down a column. The homography
+    of a window is approximated as affine about its centre, which saves divisions.
     """
     (x0, y0, z0, x1, y1, z1, x, y, z, tx, ty, tz), (du, dv, here) = motion, plane
     z = z + tz * here
@@ -177,7 +178,10 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 
 
 def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
-    """Return Σ c·g over the standard deviation of g, with noise, of greys g interpolated at the taps of each lane."""
+    """Return Σ c·g / std(g) per lane: g are the interpolated greys at the taps, and c the weighted greys of `windows`.
+
+    The standard deviation std(g) includes the pixel noise.
+    """
     x, y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]
     along = [(xu * n, yu * n) for n in steps]
@@ -194,7 +198,7 @@ def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], we
 
 
 def _interpolated(image: Any, start: Lanes, width: Lanes, x: Lanes, y: Lanes) -> Lanes:
-    """Return the grey at (x, y) of the image that begins at `start`."""
+    """Return the bilinear grey at (x, y) of the image that begins at index `start` of the packed images."""
     left, top = x.as_ints(), y.as_ints()
     upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
     fx, fy = x - left.as_floats(), y - top.as_floats()

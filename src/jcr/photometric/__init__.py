@@ -1,1 +1,1 @@
-"""Alignment of cameras by the colours of their images, without features."""
+"""Estimation of camera poses by photometric alignment of the images, without features."""

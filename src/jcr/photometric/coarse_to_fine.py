@@ -1,4 +1,4 @@
-"""Cameras and depths brought to agree in colour at one size of the images: search along rays, and Gauss-Newton."""
+"""Photometric alignment of cameras and depths at one image size: depth search along rays, then Gauss-Newton."""
 
 from dataclasses import dataclass, replace
 
@@ -21,42 +21,43 @@ from jcr.photometric.residuals import (
 )
 
 DEPTHS = 40
-"""Tried along a ray, evenly spaced in inverse depth."""
+"""Number of depths tried along a ray, evenly spaced in inverse depth."""
 DEPTH_RANGE = (0.55, 1.8)
-"""Nearest and farthest depth, as shares of the distance at which the cameras' axes meet."""
+"""Nearest and farthest depth tried, as factors of a camera's depth of the point where the optical axes meet."""
 MEET_WITHIN = (0.1, 2.0)
-"""m. Distance at which they may."""
+"""Limits, m, to which the depth of the point where the optical axes meet is clipped."""
 AGREED = 0.5
-"""Cost of a point beyond which its depth is not used."""
+"""Largest cost (0 to 1) of a point whose depth and colour are used."""
 IMAGES_AT_FULL = 10
-"""Most images that each get all points; with more each has fewer, as each point is seen more often."""
+"""Largest number of images that each get all points; with more images each gets fewer, because more images see each
+point."""
 STEPS, ENOUGH = 8, 3e-4
-"""Most damped steps of a round, and the relative change of the cost that ends them: a step costs more than it gains."""
+"""Largest number of damped steps in a round, and the relative change of the cost below which the round ends."""
 SETTLED = 0.995
-"""A round that leaves more of the cost than this was the last."""
+"""Ratio of the costs of successive rounds above which the rounds end."""
 
 
 @dataclass(frozen=True)
 class PyramidLevel:
-    """One level of the pyramid."""
+    """Settings of the alignment at one level of the image pyramid."""
 
     height: int
     """Height of the images in pixels."""
     per_image: int
-    """Points."""
+    """Number of points per image."""
     rounds: int
-    """Largest number of rounds of search along all rays and Gauss-Newton."""
+    """Largest number of rounds; a round is a depth search along all rays followed by Gauss-Newton."""
     sigma: float
-    """Difference of colours (0 to 1) that counts half."""
+    """Colour difference (RGB, each 0 to 1) at which the robust cost reaches half of its maximum."""
 
 
 def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
-    """Return the point nearest to all optical axes."""
+    """Return the point in the base frame that is nearest to all optical axes."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
-    """Return the cost of the cameras' colour differences, at the best depth of each point."""
+    """Return the mean cost (0 to 1) of the colour differences between the images, at the best depth of each point."""
     host, x_px = strongest(level, _per_image(level, stage))
     return on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
@@ -66,7 +67,7 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Depths to try in every image."""
+    """Return the depths (m) to try in every image, one row per trial and one column per image."""
     pose = cameras.base_from_camera
     depth = ((axes_meet(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
     middle = np.clip(depth, *MEET_WITHIN)
@@ -74,12 +75,19 @@ def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
 
 
 def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
-    """Directions in which cameras on a robot's gripper, all alike, and their intrinsics may move."""
+    """Return the free steps of cameras that move as one, as columns: six of the pose, then the log focal length.
+
+    The focal length is free only where the intrinsics are not known.
+    """
     return np.eye(7)[:, : 6 if intrinsics_known else 7]
 
 
 def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, "p q"]:
-    """Directions in which cameras may move one by one: the first stays, and so does their common scale."""
+    """Return the free steps of cameras that move one by one, as orthonormal columns.
+
+    The rows are six per camera, then the log focal length. The first camera and the common scale are fixed, and so is
+    the focal length where the intrinsics are known.
+    """
     pose = cameras.base_from_camera
     grown = np.zeros((len(pose), 6))
     grown[:, :3] = np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3] - pose[0, :3, 3])
@@ -93,7 +101,10 @@ def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, 
 def align_photometrically(
     level: Level, cameras: Cameras, stage: PyramidLevel, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Search along the rays and Gauss-Newton, alternately."""
+    """Align cameras at one pyramid level by rounds of depth search and Gauss-Newton; return cameras and points.
+
+    The columns of `directions` are the free steps of the cameras (`tied_directions`, `free_directions`).
+    """
     host, x_px = strongest(level, _per_image(level, stage))
     before, points = np.inf, None
     for _ in range(stage.rounds):
@@ -109,7 +120,7 @@ def align_photometrically(
 def _after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Take a few damped steps of cameras and depths; the cameras move together where there are 7 parameters."""
+    """Return cameras and points after damped Gauss-Newton steps; the cameras move as one if there are 7 parameters."""
 
     def step(
         at: tuple[Cameras, Points], system: PhotometricEquations, damping: float
@@ -132,7 +143,10 @@ def _after_descent(
 
 
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
-    """Cameras after twists (v, ω) in camera axes, one for all or one for each, and a step of the log focal length."""
+    """Return the cameras after a step: twists (v, ω) in camera axes, then the change of the log focal length.
+
+    The step has one twist for all cameras, or one for each.
+    """
     pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(
         retract(pose, (step_axes(pose[:, :3, :3]) @ twist)[..., 0]),

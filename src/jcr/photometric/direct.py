@@ -1,13 +1,12 @@
-"""Direct alignment: wrist cameras by photometric alignment, on plain tables too, where features find nothing to match.
+"""Direct alignment: poses of wrist cameras by photometric alignment, for plain tables where features find no match.
 
-The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the intrinsics are
-not known). That is little enough to find it from nothing: the cameras look at a common place, which tells their viewing
-direction in the gripper's frame, and rotations about it and tilts are tried all around, on images 15 pixels high. From
-there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so that
-what disagrees with the robot's motion shows.
-
-Pointmaps are matched near edges; plain surfaces between them are filled with planes (jcr/depth/priors.py).
-The page `plain-tables` describes when, and with what errors.
+With the robot's poses, the only unknowns are the hand-eye transform, and the focal length if the intrinsics are not
+known. No initial estimate is needed: the cameras look at a common place, which gives their viewing direction in the
+gripper frame. Rotations about this direction and tilts of it are tried on images 15 pixels high. The alignment then
+goes from coarse to fine, with a depth for each of a few thousand pixels. In the last stages every camera moves by
+itself, so that disagreement with the robot's motion shows.
+Pointmaps are matched near edges; plain surfaces between the edges are filled with planes (jcr/depth/priors.py). The
+page `plain-tables` describes when this back end works, and its errors.
 """
 
 from collections.abc import Sequence
@@ -50,31 +49,32 @@ from jcr.progress import Progress, silent
 from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tracks
 
 FREED = (PyramidLevel(60, 300, 3, 0.12), PyramidLevel(120, 300, 3, 0.1))
-"""Found without the robot poses."""
+"""Pyramid levels of the stages in which every camera moves by itself, before the finest one."""
 FINEST = PyramidLevel(240, 300, 3, 0.1)
 BEFORE_GAINS = PyramidLevel(60, 300, 1, 0.2)
-"""Stage after which brightness is compared."""
+"""Stage after which the brightness of the images is compared."""
 GAIN_ROUNDS = 3
-"""Number of estimates of the gains; each time more points agree."""
+"""Number of times that the gains are estimated; the number of points that agree grows each time."""
 LEAST_GAIN = 0.05
-"""Difference of log brightness below which it is left alone: shading and gloss look like as much."""
+"""Largest log gain of any image at which all gains are ignored: shading and gloss have the same effect."""
 LEAST_AGREED = 0.25
-"""Share of the points that the views must agree on in the end."""
+"""Least share of the points whose colour the views agree on after the finest stage."""
 LEAST_POINTS = 100
-"""Fewer than this count as this many."""
+"""Least denominator of the share that is compared with LEAST_AGREED, so that a few points cannot reach it."""
 LEAST_SHARE = 0.4
-"""Least share of the other images' points that an image shows, relative to the median image: images with wrong poses
-have 0.1 to 0.25 of it, those of a robot that is 5 mm and 1° off 0.8."""
+"""Least share of the other images' points that an image must confirm, relative to the median image. Images with wrong
+poses have 0.1 to 0.25; images of a robot that is off by 5 mm and 1° have 0.8."""
 REGION = 0.05
-"""m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
+"""Side, m, of the cubes within which points share their errors: they are pixels of one edge seen from many sides."""
 
 
 def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Reconstruction:
     """Reconstruct camera poses by photometric alignment, initialised from the gripper poses.
 
-    Known intrinsics stay, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
-    is the first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and
-    RejectedError where another place of the camera fits as well, or too few pixels are explained.
+    Known intrinsics are kept; otherwise a focal length is estimated. The recon frame is the first camera's, and its
+    unit is only roughly the metre. `evidence` holds the covariance of the cameras. Raises InputError with fewer than
+    three images, and RejectedError where another hand-eye transform fits as well, or where the views agree on too few
+    points.
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
@@ -124,7 +124,7 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
 
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """Return the factors that make the images equally bright, where the camera changed its exposure."""
+    """Return a factor per image that makes the images equally bright; all 1 where the camera kept its exposure."""
     factor = np.ones(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
@@ -136,11 +136,11 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
 def images_that_fit(
     level: Level, cameras: Cameras, intrinsics_known: bool
 ) -> tuple[Int[ndarray, " m"], Cameras]:
-    """Return the images that agree with the others, and their cameras, aligned without the images that do not.
+    """Return the rows of the images that agree with the others, and their cameras, aligned without the rest.
 
-    Each image shows a share of the other images' points in their colour. One whose share is far below the others' even
-    when its camera is free is not where the robot reports it, or not of this scene. Raises RejectedError where fewer
-    than three are left.
+    The measure is the share of the other images' points that an image shows in their colour. An image with a far lower
+    share than the median, even with a free camera, has a wrong pose or shows another scene. Raises RejectedError where
+    fewer than three images are left.
     """
     rows = np.arange(level.count)
     while True:
@@ -161,7 +161,7 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Undistorted images by height in pixels."""
+    """Return the undistorted images at every height in pixels that a stage needs, by height."""
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
@@ -172,11 +172,11 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -
 def camera_covariance(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> Float[ndarray, "r r"]:
-    """Covariance (6n,6n) of the cameras' steps in the first camera's axes, as records.CameraEvidence has it.
+    """Return the covariance (6n,6n) of the cameras' steps in the first camera's axes, as in records.CameraEvidence.
 
-    Residuals of one region of the scene err together, in all images that look there. How far the gradients of regions
-    scatter about zero is measured, and the inverse normal matrix scaled to it on average (a sandwich estimate that has
-    one number to estimate instead of a full matrix, for which there are too few regions).
+    Residuals within one region of the scene are correlated, in all images that see it. The inverse normal matrix is
+    scaled by the measured scatter of the regions' gradients. This sandwich estimate has one number instead of a full
+    matrix, for which there are too few regions.
     """
     system = equations(level, cameras, points, sigma, tied=False)
     inverse_normal = np.linalg.inv(directions.T @ system.normal @ directions)
@@ -195,7 +195,7 @@ def camera_covariance(
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, intrinsics: Intrinsics) -> Tracks:
-    """Return tracks of the points: their pixels in the host and in the images that show their colour."""
+    """Return tracks of the points: their pixels in the host image, and in the images that show their colour."""
     _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
     image, point = np.nonzero(shown)

@@ -1,8 +1,8 @@
-"""Colour consistency of pixels over posed images: search along rays, and Gauss-Newton with the depths eliminated.
+"""Colour residuals of pixels over posed images: depth search along rays, and Gauss-Newton with eliminated depths.
 
-Points are pixels of one image (their host) with a depth of their own, as in Engel et al., "Direct Sparse
-Odometry" (PAMI 2018), taken where colour changes most. Their colour is compared with all other images, in RGB, with a
-robust weight that leaves out occluded views and gloss.
+Points are pixels of one image (their host) with a depth of their own, as in Engel et al., "Direct Sparse Odometry"
+(PAMI 2018), taken where colour changes most. Their colour is compared with all other images, in RGB, with a robust
+weight that excludes occluded views and gloss.
 """
 
 from collections.abc import Iterator
@@ -18,31 +18,32 @@ from jcr.geometry import inverse, skew
 from jcr.records import Intrinsics
 
 BLUR_PX = 1.0
-"""Standard deviation of the blur of every level, px: an edge becomes a slope that linear steps can follow."""
+"""Standard deviation, px, of the blur of every level, which turns an edge into a slope for linear steps."""
 SEEN_BY = 0.6
-"""Share of the other images, the best ones, that judge a depth: the rest may look at something in between."""
+"""Share of the other images, those of least cost, that the cost of a depth counts; an object may hide the point from
+others."""
 NEAREST = 0.05
-"""m. In front of the camera."""
+"""Least depth of a point in front of a camera, m."""
 _FAINT = 2.0 / 255
-"""Change of colour per pixel below which a pixel does not show where it is."""
+"""Change of colour (0 to 1) per pixel below which a pixel has too little contrast to be located."""
 _BORDER_PX = 2
 _SHARED = 5
-"""Points that two images must share before their brightness is compared."""
+"""Least number of points that two images must share for their brightness to be compared."""
 _KEEP_DEPTH = 1e-3
-"""Information that keeps a depth that the images do not determine where it is."""
+"""Information that is added to every log depth, so that a depth that the images do not determine keeps its value."""
 _CHUNK = 500
-"""Points whose equations are in memory at a time: less than 100 MB for 15 images."""
+"""Number of points whose equations are in memory at a time: less than 100 MB for 15 images."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Blurred images of one size, as one tall stack, with their derivatives."""
+    """Blurred images of one size, stacked along the rows, with their derivatives by u and v (per px)."""
 
     color: Float32[ndarray, "nh w 3"]
     by_u: Float32[ndarray, "nh w 3"]
     by_v: Float32[ndarray, "nh w 3"]
     grid: Intrinsics
-    """Its focal length is a guess where the intrinsics are not known; the cameras have it right."""
+    """Pinhole intrinsics of these images. The focal length is a guess if unknown; `Cameras.zoom` corrects it."""
 
     @property
     def count(self) -> int:
@@ -50,7 +51,7 @@ class Level:
         return len(self.color) // self.grid.height
 
     def rows(self, which: Int[ndarray, " m"]) -> "Level":
-        """Return some of the images."""
+        """Return the level with only the images `which`."""
         color, by_u, by_v = (
             x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
             for x in (self.color, self.by_u, self.by_v)
@@ -58,14 +59,14 @@ class Level:
         return Level(color, by_u, by_v, self.grid)
 
     def times(self, factor: Float[ndarray, " n"]) -> "Level":
-        """Return the images multiplied by gains."""
+        """Return the level with every image multiplied by its factor."""
         of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
         return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """Poses in metres, and one focal length for all, as a factor of the grid's."""
+    """Camera poses in the base frame (m), and the focal length of all cameras as a factor (`zoom`) of the grid's."""
 
     base_from_camera: Float[ndarray, "n 4 4"]
     zoom: float = 1.0
@@ -73,7 +74,7 @@ class Cameras:
 
 @dataclass(frozen=True, kw_only=True)
 class Points:
-    """Pixels with a depth."""
+    """Points to align: a pixel in a host image (its row), with colour (0 to 1) and depth (m) there."""
 
     host: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
@@ -83,28 +84,28 @@ class Points:
     """True for points whose colour most of the images that should see them show."""
 
     def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
-        """Return some of the points."""
+        """Return the points selected by a mask or slice."""
         return Points(**{name: values[kept] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometricEquations:
-    """Gauss-Newton equations of cameras, log focal length last, with the log depths eliminated (Schur)."""
+    """Gauss-Newton equations of the camera steps and log focal length (last), with log depths eliminated (Schur)."""
 
     normal: Float[ndarray, "p p"]
     gradient: Float[ndarray, "k p"]
-    """Gradient of each point; their sum is that of the cost."""
+    """Gradient of each point's cost; the sum over the points is the gradient of the whole cost."""
     by_depth: Float[ndarray, "k p"]
     depth_gradient: Float[ndarray, " k"]
     depth_information: Float[ndarray, " k"]
 
     def depth_step(self, step: Float[ndarray, " p"]) -> Float[ndarray, " k"]:
-        """Return the step of the log depths that belongs to one of the cameras."""
+        """Return the steps of the log depths that belong to a step of the cameras and the log focal length."""
         return -(self.depth_gradient + self.by_depth @ step) / self.depth_information
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """Return the images (0 to 1) reduced to a height in pixels, and blurred."""
+    """Return the images (RGB, 0 to 1) reduced to `height` pixels and blurred, with derivatives."""
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:
@@ -117,7 +118,10 @@ def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: in
 
 
 def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
-    """Return image and pixel of the strongest changes of colour, one from each block of pixels."""
+    """Return image row and pixel (u, v) of the strongest colour changes, at most one per block of pixels.
+
+    Each image has at most `per_image` of them.
+    """
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
     change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
@@ -144,10 +148,10 @@ def on_rays(
     sigma: float,
     least: float,
 ) -> tuple[Points, float]:
-    """Return points at the tried depths at which the other images agree best with their colour.
+    """Return the points at the best of the tried `depths`, and the mean of their costs.
 
-    `sigma` is the difference of colours that counts half. Points are agreed on whose cost, a mean of
-    r²/(r² + sigma²) over the best views, is below `least`. Also returns the mean cost of all points.
+    `depths` has one row per trial and one column per image. The cost of a point is the mean of r²/(r² + sigma²) over
+    the images with the smallest colour difference r. Points with a cost below `least` are marked as agreed.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)
@@ -159,7 +163,7 @@ def on_rays(
 
 
 def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
-    """Mean cost of the views that agree best; 1 where fewer than two look there."""
+    """Return the cost of each point: mean r²/(r² + sigma²) over the best views; 1 where fewer than two see it."""
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
@@ -172,7 +176,7 @@ def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
-    """Squared difference of the colours at those pixels from the points' own."""
+    """Return the squared colour difference between each image at pixels u, v and the points."""
     return _squared(_sample(level.color, level, u, v) - points.color)
 
 
@@ -181,12 +185,12 @@ def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
 
 
 def _in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return the points in the camera frame of their hosts."""
+    """Return the points in the camera frames of their host images."""
     return points.depth[:, None] * unproject(zoomed(level.grid, cameras.zoom), points.x_px)
 
 
 def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return the points in the frame of the cameras' poses."""
+    """Return the points in the base frame."""
     pose = cameras.base_from_camera[points.host]
     return np.einsum("kij,kj->ki", pose[:, :3, :3], _in_host(level, cameras, points)) + pose[:, :3, 3]
 
@@ -194,7 +198,10 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
 def in_view(
     level: Level, cameras: Cameras, points: Points
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
-    """Return points in every camera's frame, their pixels u and v, and whether a camera but their host sees them."""
+    """Return the points in every camera's frame, their pixels u and v, and whether the camera sees them.
+
+    A host image does not count as seeing its own points.
+    """
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
     x += camera_from_base[:, None, :3, 3]
@@ -210,14 +217,14 @@ def in_view(
 def _sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Bilinear samples of every image at its own pixels."""
+    """Return bilinear samples of every image of a stack at the pixels u, v."""
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
-    """Return each image's brightness relative to the others (geometric mean 1), from points that they share."""
+    """Return each image's brightness relative to the others (geometric mean 1), from points that images share."""
     _, u, v, seen = in_view(level, cameras, points)
     shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
     dark = 10 * _FAINT
@@ -236,7 +243,7 @@ def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: fl
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
-    """Mean robust misfit, 0 to 1, of the views of points agreed on."""
+    """Return the mean robust cost, 0 to 1, over all views of the points that are agreed on."""
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     weight = seen & points.agreed
@@ -246,7 +253,10 @@ def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> floa
 def equations(
     level: Level, cameras: Cameras, points: Points, sigma: float, tied: bool
 ) -> PhotometricEquations:
-    """Linearised for twists (v, ω) in camera axes, T ← T·exp(ξ): one for all cameras if `tied`, else one for each."""
+    """Return the Gauss-Newton equations for twists (v, ω) in camera axes, T ← T·exp(ξ), and the log focal length.
+
+    There is one twist for all cameras if `tied`, otherwise one for each camera.
+    """
     n, k = level.count, len(points.host)
     p = 7 if tied else 6 * n + 1
     normal = np.zeros((p, p))
@@ -286,7 +296,11 @@ def equations(
 def _linearised(
     level: Level, cameras: Cameras, points: Points, sigma: float
 ) -> Iterator[tuple[slice, ndarray, ndarray, ndarray, ndarray, ndarray]]:
-    """Yield weighted residuals (n,k,3) of chunks of points and derivatives by twists, log focal length, log depth."""
+    """Yield weighted residuals and derivatives for chunks of points, each an array (images, points, 3 colours, …).
+
+    The derivatives are by the twist of the viewing camera, the twist of the host, the log focal length and the log
+    depth. The first element is the slice of the points.
+    """
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
     for start in range(0, len(points.host), _CHUNK):

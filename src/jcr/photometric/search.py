@@ -20,16 +20,18 @@ from jcr.photometric.residuals import Cameras, Level, strongest
 from jcr.progress import Progress
 
 ROTATIONS, TILTS, TILT_DEG = 24, 6, 15.0
-"""Starts about the viewing direction that the robot's poses suggest, which was off by 4 to 22° in five captures."""
+"""Initial estimates around the viewing direction given by the robot's poses: rotations about it, tilts, and their
+angle. The direction was off by 4 to 22° in five captures."""
 SCREENED_POINTS = 40
-"""Per image, by which starts are ranked before any is improved."""
+"""Number of points per image by which the initial estimates are ranked before any is refined."""
 KEPT, KEPT_BASINS = 24, 6
-"""Numbers of initial estimates after screening, and of the different results that are refined."""
+"""Number of initial estimates kept after ranking, and number of different results that are refined further."""
 SAME_M, SAME_DEG = 0.03, 5.0
-"""Starts that ended closer than this found the same."""
+"""Largest distance (m) and angle (degrees) between two results that count as equal."""
 CLEARLY_BETTER = 0.9
-"""Largest cost of a found hand-eye transform, relative to the next different one. Right ones, where there was another
-at all, had 0.60 to 0.81; wrong ones 0.96 to 1.00 (nine captures, eight of them with gripper poses of other images)."""
+"""Largest accepted ratio of the best result's cost to that of the next different one. Correct results had 0.60 to 0.81
+where there was another result; wrong ones 0.96 to 1.00 (nine captures, eight of them with gripper poses of other
+images)."""
 COARSEST = PyramidLevel(15, 150, 3, 0.2)
 COARSE = PyramidLevel(30, 100, 8, 0.15)
 JUDGE = PyramidLevel(60, 100, 1, 0.12)
@@ -42,9 +44,9 @@ def search(
     intrinsics_known: bool,
     report: Progress,
 ) -> Cameras:
-    """Return the cameras by the hand-eye transform of best agreement of colours.
+    """Return the cameras posed by the hand-eye transform for which the colours of the images agree best.
 
-    Raises RejectedError where another one is as good.
+    Raises RejectedError where a different hand-eye transform fits as well, or where the images have no edges.
     """
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
@@ -59,7 +61,7 @@ def search(
         begin: float,
         share: float,
     ) -> list[tuple[float, Cameras]]:
-        """Align cameras at a stage and return them with their costs at the next one."""
+        """Align each of the cameras at `stage`, and return them with their costs at `judge`."""
         made = []
         for k, (_, cameras) in enumerate(found):
             report("direct alignment", begin + share * k / len(found))
@@ -83,7 +85,10 @@ def search(
 
 
 def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
-    """Hand-eye transforms by which the cameras look at a common place, rotated and tilted all around."""
+    """Return initial hand-eye transforms, without translation, by which all cameras look at a common place.
+
+    They are rotations about the common viewing direction, and tilts of it.
+    """
     # Directions evenly over the sphere (Fibonacci's spiral).
     k = np.arange(600) + 0.5
     height, around = 1 - 2 * k / len(k), np.pi * (1 + 5**0.5) * k
