@@ -1,9 +1,10 @@
 """Estimation problem, its state, and the layout of the columns of its equations.
 
 A rig is a rigid body that carries cameras or corners: the wrist of an arm at one image, a fixed camera, or a board.
-`world` has any origin and unit; the images determine the rigs up to one similarity of it. The rigs that an arm moves
-obey `base_from_gripper[i] · X = Z · S_λ(world_from_rig[i])`. Where the camera is fixed and the arm carries the scene,
-X is base_from_camera, Z is gripper_from_world, and the equation is that of gripper_from_base.
+The frame `world` has an arbitrary origin and unit, since images determine the rigs up to one similarity.
+Rigs that an arm moves satisfy `base_from_gripper[i] · X = Z · S_λ(world_from_rig[i])`, S_λ scaling translations.
+For a fixed camera and an arm that carries the scene, X is base_from_camera, Z is gripper_from_world, and
+gripper_from_base takes the place of base_from_gripper.
 """
 
 from dataclasses import dataclass, field, replace
@@ -35,58 +36,62 @@ from jcr.records import Intrinsics, Tracks
 
 TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
 BASE_TRANSLATION, BASE_ROTATION = slice(7, 10), slice(10, 13)
-"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
+"""Columns of the 13 unknowns of one arm: X, log scale, Z; the first seven are in records.COVARIANCE_ORDER."""
 UNKNOWNS = 13
+"""Number of unknowns of a problem with one arm and exact cameras: X (6), log scale (1), Z (6)."""
 
 
 def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
-    """Return the columns of X and Z of an arm among the unknowns."""
+    """Return the 12 columns of an arm's X and Z (by its number) among the unknowns; the scale is column 6."""
     first = 12 * arm
     return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Rig and camera of each image, and image, point and pixel of each observation."""
+    """Observations of points: rig and camera of each of n images; image, point and pixel of each of k observations."""
 
     rig: Int[ndarray, " n"]
     """Rig of each image."""
     camera: Int[ndarray, " n"]
     """Camera of each image."""
     image: Int[ndarray, " k"]
+    """Image of each observation."""
     x_px: Float[ndarray, "k 2"]
-    """Pixels of the original, distorted image."""
+    """Pixel of each observation in the original, distorted image."""
     point: Int[ndarray, " k"]
+    """Row of each observation's point."""
     std_px: Float[ndarray, " k"]
-    """Stated standard deviation of one coordinate, up to a common factor."""
+    """Stated standard deviation of one pixel coordinate of each observation, up to a common factor."""
     point_rows: Int[ndarray, " p"] | None = None
-    """Row of each point among those that were given; None: all points."""
+    """Row of each point among the points before some were removed; None: none were removed."""
 
 
 CELLS = 8
-"""Cells across the width of an image, within which features share errors."""
+"""Number of cells across an image's width; the features of one cell have correlated errors."""
 OF_IMAGE, PRISM = 4, 4
-"""Number of parameters of each image, and of those that all images share.
+"""Number of parameters of each image (focal, shear, x, y), and of the thin prism that all images share (s1 to s4).
 
-An image has the logarithm of its focal length over its camera's; a shear from top to bottom in focal lengths (rolling
-shutter); offsets in x and y, in widths. All images share s1 to s4 of OpenCV's thin prism."""
+Parameters of an image: log of its focal length over its camera's; shear from top to bottom, in focal lengths (rolling
+shutter); offset in x and in y, in image widths. s1 to s4 are those of OpenCV."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportedPoses:
-    """Reported poses of one arm, and the rigs that it moves."""
+    """Reported gripper poses of one arm, and the rigs that it moves."""
 
     rigs: Int[ndarray, " n"]
+    """Rig of each pose."""
     base_from_gripper: Poses
     error_covariance: Float[ndarray, "s s"]
-    """Covariance (6n,6n) of the systematic errors of the poses where their size is 1 rad."""
+    """Covariance (s,s), s = 6n, of the systematic errors of the n poses for a size σ_s of 1 rad."""
     carries: Literal["camera", "scene"] = "camera"
     confirmed_errors: Float[ndarray, "s b"] | None = None
-    """Columns of errors that were confirmed, one standard deviation each; None: none."""
+    """Errors of the poses (s = 6n rows) by each of b confirmed effects of one standard deviation; None: no effects."""
 
 
 class LinearPrior(NamedTuple):
-    """A measurement `row · coordinates = value ± std`, the coordinates being those of `Problem.coordinates`."""
+    """Linear prior `row · Problem.coordinates(state) = value ± std` (one standard deviation)."""
 
     row: Float[ndarray, " p"]
     value: float
@@ -94,17 +99,17 @@ class LinearPrior(NamedTuple):
 
 
 def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
-    """Return the prior of one arm's problem whose scale is known with a relative standard deviation."""
+    """Return the prior on the scale of a problem with one arm; `std` is relative."""
     return LinearPrior(np.eye(UNKNOWNS)[6], float(np.log(metres_per_unit)), std)
 
 
 def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> LinearPrior:
-    """Return the prior of one arm's problem whose camera is known to be so far along an axis of the gripper frame."""
+    """Return the prior on the camera's position along an axis of the gripper frame, metres ± std; one arm."""
     return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
 
 
 class RigGaussian(NamedTuple):
-    """Poses of the first rigs, and the covariance of their steps; None: exact."""
+    """Normal distribution of the first m rigs: poses, and covariance (6m,6m) of their steps; None: exact poses."""
 
     world_from_rig: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"] | None = None
@@ -112,15 +117,20 @@ class RigGaussian(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of the equations of images; six columns for each rig follow from `first_rig` on."""
+    """Layout of the columns of the image equations: cameras, model errors, boards, mounts, then six for each rig."""
 
     cameras: slice
     """Steps along `Problem.directions`."""
     model_error: tuple[slice, ...]
+    """Remaining distortion of each camera; an empty slice if it is not estimated."""
     boards: slice
+    """Shape of the boards."""
     mounts: tuple[slice | None, ...]
+    """Six columns of the pose of each camera on its rig; None for a fixed pose."""
     first_rig: int
+    """First column of the first rig."""
     count: int
+    """Number of all columns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,22 +138,24 @@ class State:
     """Estimates of all unknowns of a problem, and of the sizes of its errors."""
 
     x: Float[ndarray, "a 4 4"]
-    """Transform gripper_from_rig of each arm, or base_from_camera where the arm carries the scene."""
+    """X of each of a arms: gripper_from_rig, or base_from_camera if the arm carries the scene."""
     scale: float
     """Metres per unit of the world."""
     z: Float[ndarray, "a 4 4"]
-    """Transform base_from_world of each arm, or gripper_from_world; the world in metres."""
+    """Z of each arm: base_from_world, or gripper_from_world if the arm carries the scene; world scaled to metres."""
     world_from_rig: Float[ndarray, "m 4 4"]
+    """Pose of each of m rigs, in the unit of the world."""
     rig_from_camera: Float[ndarray, "c 4 4"] = field(default_factory=lambda: np.eye(4)[None])
+    """Pose of each of c cameras on its rig, in the unit of the world."""
     camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
-    """Steps of the columns before the mounts, from the initial values of the cameras."""
+    """Values of the first l columns (cameras, model errors, boards); 0 is the middle of their priors."""
     points_in_world: Float[ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     model_error_std: Float[ndarray, " g"] = field(default_factory=lambda: np.zeros(0))
-    """Size of the remaining distortion of each camera's model, in widths of its image."""
+    """Size of the remaining distortion of each camera's model, in image widths."""
     pixel_noise: PixelNoise | None = None
-    """None before the first estimate."""
+    """Sizes of the pixel errors; None before the first estimate."""
     robot_log_sizes: Float[ndarray, " s"] | None = None
-    """Logarithms of the sizes of the robot's errors; None before the first estimate."""
+    """Logarithms of σ_t (m), σ_r, σ_s (rad) of the robot's errors (robot_noise.py); None before the first estimate."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,21 +166,22 @@ class Problem:
     n_rigs: int
     cameras: tuple[CameraPrior, ...] = ()
     observations: Observations | None = None
-    """Sorted by point and rig, every point with at least two; None: the poses of the rigs are in `known_rigs`."""
+    """Observations sorted by point and rig, at least two for each point; None: `known_rigs` has the camera poses."""
     boards: BoardShapes | None = None
     freed: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((0, 0)))
-    """Directions that are free beside the priors of the cameras; rows are those of `directions`."""
+    """Additional free directions of cameras and images, one column each; rows are those of `directions`."""
     freed_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
+    """Prior standard deviation along each column of `freed`."""
     known_rigs: RigGaussian | None = None
     priors: tuple[LinearPrior, ...] = ()
     robot_noise_floor: tuple[float, float] | None = None
-    """Lower bound on the random errors of the reported poses (m, rad); None: unknown."""
+    """Lower bound on the random errors of the reported poses (m, rad); None: no bound is given."""
     used: Bool[ndarray, " n"] | None = None
-    """Reported poses that the estimate rests on; None: all. Of a problem without observations only."""
+    """Mask of the reported poses that are used; None: all. Only for a problem without observations."""
 
     @cached_property
     def columns(self) -> Columns:
-        """Columns of the equations of images."""
+        """Layout of the columns of the image equations."""
         boards = 0 if self.boards is None else len(self.boards.shape_std)
         mounts = [6 * camera.mount_free for camera in self.cameras]
         counts = [self.directions.shape[1], *self.model_error_counts, boards, *mounts]
@@ -180,15 +193,15 @@ class Problem:
 
     @cached_property
     def parameters_of(self) -> tuple[slice, ...]:
-        """Rows of `directions` that are the parameters of each camera."""
+        """Rows of `directions` for the intrinsics of each camera."""
         ends = np.cumsum([len(camera.directions) for camera in self.cameras]).tolist()
         return tuple(slice(a, b) for a, b in pairwise([0, *ends]))
 
     @cached_property
     def directions(self) -> Float[ndarray, "r l"]:
-        """Directions in which cameras and images may differ from the middle of their priors.
+        """Directions (columns) in which cameras and images may differ from the middle of their priors.
 
-        Rows are the parameters of each camera, the OF_IMAGE parameters of all images one after the other, and the prism.
+        Rows: intrinsics of each camera; focal of all images, then shear, x and y (OF_IMAGE); s1 to s4 of the prism.
         """
         own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
         own = np.pad(own, ((0, OF_IMAGE * self.n_images + PRISM), (0, 0)))
@@ -196,19 +209,19 @@ class Problem:
 
     @cached_property
     def images_differ(self) -> bool:
-        """Whether images may differ from their cameras."""
+        """Whether parameters of single images, or the thin prism, are free."""
         return bool(self.directions[-OF_IMAGE * self.n_images - PRISM :].any())
 
     @cached_property
     def model_error_counts(self) -> list[int]:
-        """Number of displacements of each camera: none of an exact one or of one with too few observations."""
+        """Number of model-error columns of each camera; 0 for exact intrinsics or too few observations."""
         counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
         seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
         return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
 
     @cached_property
     def layout(self) -> Layout:
-        """Groups and cells of the observations, for the estimate of their errors."""
+        """Groups and image cells of the observations, from which the pixel noise is estimated."""
         assert self.observations is not None
         observations, cameras = self.observations, len(self.cameras)
         camera, rig = observations.camera[observations.image], observations.rig[observations.image]
@@ -232,16 +245,16 @@ class Problem:
 
     @cached_property
     def seen(self) -> Sightings:
-        """Observations of each point by rig."""
+        """Observations sorted by point, with the rig of each."""
         assert self.observations is not None
         rig = self.observations.rig[self.observations.image]
         return Sightings.of(self.observations.point, rig, self.n_rigs)
 
     @cached_property
     def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
-        """Order of the rows of the equations, which are sorted by point, and their points, rigs and sightings.
+        """Order that sorts the rows of the image equations by point and rig, and the sorted points, rigs and sightings.
 
-        The unsorted rows are the observations, then two rows for each corner of a board.
+        Before sorting, the rows are the observations, then two rows for each board corner.
         """
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
@@ -255,7 +268,7 @@ class Problem:
 
     @cached_property
     def displacements(self) -> Float[ndarray, "k 2 e"]:
-        """Displacement of each observation by the remaining distortion of its camera's model, px."""
+        """Derivatives (px) of each observation by the e model-error columns, which are in image widths."""
         assert self.observations is not None
         each = zip(self.cameras, self.parameters_of, self.model_error_counts, self.camera_rows, strict=True)
         x_px, columns = self.observations.x_px, [np.zeros((len(self.observations.x_px), 2, 0))]
@@ -267,12 +280,12 @@ class Problem:
 
     @cached_property
     def camera_rows(self) -> list[Int[ndarray, "..."]]:
-        """Observations of each camera."""
+        """Rows of the observations of each camera."""
         return [np.flatnonzero(self.layout.camera == c) for c in range(len(self.cameras))]
 
     @cached_property
     def prism(self) -> Float[ndarray, "k 2 4"]:
-        """Displacement of each observation by the coefficients of a thin prism, px."""
+        """Derivatives (px) of each observation by the thin prism coefficients s1 to s4."""
         assert self.observations is not None
         out = np.zeros((len(self.observations.image), 2, PRISM))
         for camera, rows in zip(self.cameras, self.camera_rows, strict=True):
@@ -295,29 +308,29 @@ class Problem:
 
     @cached_property
     def by_arm(self) -> Int[ndarray, " s"]:
-        """Columns of the rigs that arms move, in the order of the reported poses."""
+        """Columns of the rigs that arms move, six for each reported pose, in the order of the poses."""
         moving = np.concatenate([arm.rigs for arm in self.arms])
         return (self.columns.first_rig + 6 * moving[:, None] + np.arange(6)).ravel()
 
     @cached_property
     def free(self) -> Int[ndarray, " e"]:
-        """Columns that are unknowns beside those of the arms: cameras, mounts, and rigs that no arm moves."""
+        """Columns of cameras, model errors, boards, mounts, and of the rigs that no arm moves."""
         return np.setdiff1d(np.arange(self.columns.count), self.by_arm)
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns of the mixed model."""
+        """Number of unknowns: those of the arms, then the columns `free`."""
         return self.arm_unknowns + len(self.free)
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
-        """Return the prior standard deviations of the columns before the mounts."""
+        """Return the prior standard deviations of the first l columns: cameras, model errors, boards."""
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std
         return np.concatenate([*(camera.std for camera in self.cameras), self.freed_std, *each, boards])
 
     def displacement(self, state: State) -> Float[ndarray, " r"]:
-        """Return the displacement of cameras and images from the middle of their priors, as `directions` count it."""
+        """Return the parameters of cameras and images less the middle of their priors, in the rows of `directions`."""
         return self.directions @ state.camera_steps[self.columns.cameras]
 
     def intrinsics(self, state: State) -> tuple[Intrinsics, ...]:
@@ -329,7 +342,7 @@ class Problem:
         )
 
     def coordinates(self, state: State) -> Float[ndarray, " p"]:
-        """Return the unknowns that linear priors measure: translation of X and log scale, m; steps of the cameras."""
+        """Return the values for linear priors: translation of the first X (m), log scale, camera steps; 0 for others."""
         out = np.zeros(self.unknowns)
         out[:3], out[SCALE] = state.x[0][:3, 3], np.log(state.scale)
         steps = self.free[self.free < self.columns.boards.stop]
@@ -338,10 +351,10 @@ class Problem:
 
 
 def with_observations(problem: Problem, state: State, observations: Observations) -> tuple[Problem, State]:
-    """Return the problem with the observations of all points that two or more show, and its initial state.
+    """Return the problem with the observations of all points that have two or more, and its initial state.
 
-    Observations are sorted by point and rig. The first of several of one point in one image is kept; the points are
-    counted again. The cameras start at the middle of their priors.
+    Observations are sorted by point and rig. Only the first observation of a point in an image is kept, and points are
+    numbered anew. The cameras start at the middle of their priors.
     """
     rig = observations.rig[observations.image]
     order = np.lexsort((observations.image, rig, observations.point))
@@ -372,17 +385,17 @@ def with_observations(problem: Problem, state: State, observations: Observations
 
 
 WEAK = 0.3, 0.3, 0.2, 0.2
-"""Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
+"""Weak prior standard deviations of fx, fy (relative), cx, cy (image widths): they keep unobservable ones finite."""
 WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
-"""Standard deviations of the distortion, of a thin prism, and of the parameters of each image."""
+"""Weak prior standard deviations of distortion, thin prism, and the OF_IMAGE parameters of each image."""
 
 
 def rows_of(
     problem: Problem, camera: int, images: Int[ndarray, " m"], n_images: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return the rows of `Problem.directions` of a camera, its images and the prism, their units and weak priors.
+    """Return rows of `Problem.directions` for a camera, its images and the prism; their units; their weak prior std.
 
-    The units are focal lengths and widths for the centre; the standard deviations are in these.
+    Units: fx and fy for the focal lengths, the image width for the principal point, else 1. The std is in these units.
     """
     intrinsics, own, end = (
         problem.cameras[camera].intrinsics,
@@ -405,9 +418,10 @@ def freed(
     n_images: int,
     camera: int = 0,
 ) -> Problem:
-    """Return the problem with combinations of the columns of one camera's `Alternatives` free, too.
+    """Return the problem in which also linear combinations of the parameters of one camera and its images are free.
 
-    Parameters of the camera and of its `images`, of `n_images`, are freed each by themselves.
+    `combinations` (e,p) has one column each; its rows are those of `hypotheses.Alternatives`. `images` are the camera's
+    images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -423,7 +437,7 @@ def freed(
 
 
 def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
-    """Return an orthonormal basis of the space of the combinations."""
+    """Return an orthonormal basis (e,r) of the column space of a matrix (e,p) of rank r."""
     u, size, _ = np.linalg.svd(combinations, full_matrices=False)
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
@@ -435,8 +449,7 @@ OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacement
 def with_free(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with other priors or other free directions of the cameras (`freed`, `freed_std`).
 
-    What depends on the observations is kept, and with it the displacements of the remaining distortion, although the
-    cameras may express other ones.
+    Cached properties of the observations are kept, `displacements` too, which would change a little with the directions.
     """
     other = replace(problem, **changes)
     if problem.observations is not None:
@@ -445,16 +458,16 @@ def with_free(problem: Problem, **changes: Any) -> Problem:
 
 
 def transferred(problem: Problem, state: State, other: Problem) -> State:
-    """Return the state in a problem of the same rigs whose cameras have other free directions, or that has fewer points.
+    """Return the state as a state of `other`: the same rigs, other free camera directions, the same points or fewer.
 
-    The cameras stay as they are, as far as the directions of the other problem can express that.
+    Camera parameters keep their values as far as the free directions of `other` allow.
     """
     before, after = problem.columns, other.columns
     off, along = problem.displacement(state), np.zeros(after.boards.stop)
     middles = zip(problem.cameras, other.cameras, other.parameters_of, strict=True)
     for old, new, own in middles:
         off[own] += parameters(old.intrinsics) - parameters(new.intrinsics)
-    # Of several steps that lead there the most likely ones.
+    # Several steps may lead to these values; the most likely ones are taken.
     std = other.prior_std(state)[after.cameras]
     along[after.cameras] = std * (np.linalg.pinv(other.directions * std) @ off)
     for old, new in zip(before.model_error, after.model_error, strict=True):
@@ -473,9 +486,9 @@ def stepped(
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
 ) -> State:
-    """Return the state after a step of the arms' unknowns and one of the columns of the images; points stay.
+    """Return the state after a step of the arms' unknowns and a step of the image columns; points do not move.
 
-    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms.
+    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms; None: no step.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -496,7 +509,7 @@ def stepped(
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step of the unknowns of the mixed model."""
+    """Return the state after a step of all unknowns: those of the arms, then `Problem.free`."""
     columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
     columns[problem.free] = step[arms:]
     return stepped(problem, state, step[:arms], columns if columns.any() else None)
@@ -505,7 +518,7 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
 def step_to(
     problem: Problem, state: State, other: State
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
-    """Return the steps of the arms' unknowns and of the columns of the images that lead to another state."""
+    """Return the steps of the arms' unknowns and of the image columns that lead from `state` to `other`."""
     own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
     arms = np.zeros(problem.arm_unknowns)
     arms[SCALE] = np.log(other.scale / state.scale)
@@ -521,7 +534,10 @@ def step_to(
 
 
 def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
-    """Return the steps of all columns with a similarity of the world, which no image shows; the scale first."""
+    """Return the derivative of all image columns by a similarity of the world: log scale, translation, rotation.
+
+    Images do not determine these seven directions.
+    """
     out = np.zeros((problem.columns.count, 7))
     out[problem.columns.first_rig :] = similarities_of_rigs(state.world_from_rig)
     out[problem.columns.boards, 0][:1] = 1.0  # the logarithm of their size
@@ -532,7 +548,7 @@ def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
-    """Return the steps of rigs with a similarity of the world; r = 6m."""
+    """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation."""
     position = world_from_rig[:, :3, 3]
     rigs = np.zeros((len(position), 6, 7))
     rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
@@ -541,15 +557,15 @@ def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarr
 
 
 Start = tuple[Transform, float, Transform]
-"""Initial estimate of gripper_from_camera, scale and base_from_recon."""
+"""Initial estimate of gripper_from_camera, scale (metres per unit) and base_from_recon."""
 NO_ARM: Start = np.eye(4), 1.0, np.eye(4)
-"""Start of a problem of images alone."""
+"""Initial estimate for a problem without arms."""
 
 
 def wrist_arm(
     base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None
 ) -> ReportedPoses:
-    """Return an arm that moves rig i at pose i; `error_covariance` None: errors that are smooth over the poses."""
+    """Return the reported poses of an arm whose pose i moves rig i; `error_covariance` None: `smooth_errors`."""
     if error_covariance is None:
         error_covariance = smooth_errors(base_from_gripper)
     rigs = np.arange(len(base_from_gripper))
@@ -566,7 +582,10 @@ def pose_problem(
     noise_floor: tuple[float, float] | None = None,
     priors: tuple[LinearPrior, ...] = (),
 ) -> tuple[Problem, State]:
-    """Return the problem of camera poses with the covariance of their steps (None: exact), and its initial state."""
+    """Return the problem of reported gripper poses and given camera poses, without images, and its initial state.
+
+    `camera_covariance` (6n,6n) is of the steps of the camera poses; None: exact camera poses.
+    """
     x, scale, z = start
     problem = Problem(
         arms=(wrist_arm(base_from_gripper, error_covariance),),
@@ -591,7 +610,7 @@ def wrist_problem(
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
     `arm` moves rig i at image i; None: images alone, without boards. `noise` is a lower bound on the random errors of
-    the poses (m, rad), and `combinations` of the columns of hypotheses.Alternatives are free.
+    the poses (m, rad). `combinations` are additional free parameters of the camera, as in `freed`.
     """
     x, scale, z = start
     arms, n = () if arm is None else (arm,), len(recon_from_camera)
