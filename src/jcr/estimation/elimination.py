@@ -1,7 +1,7 @@
 """Linear algebra of normal equations: Cholesky factors of dense matrices, and the Schur complement of points.
 
-A point's block is 3x3 and touches its own observations alone; without the points a small dense system is left (Triggs
-et al., "Bundle adjustment: a modern synthesis", 2000, section 6).
+Each point has a 3x3 block of the normal equations and is coupled to the images that observe it. Eliminating all points
+leaves a small dense system (Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6).
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from scipy.sparse import bsr_array
 Matrices = Float[ndarray, "*k n n"]
 Columns = Float[ndarray, "*#k n r"]
 JITTER = (0.0, 1e-14, 1e-12, 1e-10)
-"""Added to correlations whose least eigenvalue is lost in rounding."""
+"""Values tried in turn on the diagonal of a correlation matrix whose smallest eigenvalue is lost in rounding."""
 _solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float64)
 
 
 def cholesky(matrix: Matrices) -> Matrices:
-    """Return L of a matrix that is positive definite but for rounding, which that of degenerate motions is not."""
+    """Return the lower Cholesky factor L of V = L Lᵀ; V of degenerate motions may be singular up to rounding."""
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None] / size[..., None, :]
     for rounding in JITTER:
@@ -35,32 +35,33 @@ def cholesky(matrix: Matrices) -> Matrices:
 
 
 def lower(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return L⁻¹ times matrices."""
+    """Return L⁻¹ · right, for lower Cholesky factors L = `root`."""
     return _triangular(root, right, transposed=False)
 
 
 def upper(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return L⁻ᵀ times matrices."""
+    """Return L⁻ᵀ · right, for lower Cholesky factors L = `root`."""
     return _triangular(root, right, transposed=True)
 
 
 def over(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return V⁻¹ times matrices."""
+    """Return V⁻¹ · right, for V = L Lᵀ with lower Cholesky factors L = `root`."""
     return upper(root, lower(root, right))
 
 
 def inverse_of(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
-    """Return V⁻¹."""
+    """Return V⁻¹ for V = L Lᵀ, L = `root`."""
     half = np.tril(_invert(root, lower=1)[0])
     return half + np.tril(half, -1).T
 
 
 def log_root_determinant(root: Matrices) -> Float[ndarray, "*k"] | np.floating:
-    """Return log √det V."""
+    """Return log √det V for V = L Lᵀ, L = `root`."""
     return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
 
 
 def _triangular(root: Matrices, right: Columns, transposed: bool) -> Float[ndarray, "*k n r"]:
+    """Return L⁻¹ · right, or L⁻ᵀ · right if `transposed`."""
     # A row-major L is a column-major Lᵀ, which LAPACK takes without a copy.
     if root.ndim == right.ndim == 2:
         return _solve_triangular(root.T, right, lower=0, trans=not transposed)[0]
@@ -72,50 +73,53 @@ def _triangular(root: Matrices, right: Columns, transposed: bool) -> Float[ndarr
 
 
 POINTS_AT_ONCE = 1024
-"""Points whose coupling to the cameras is in memory together."""
+"""Number of points that are eliminated together, which bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Derivatives:
-    """Derivatives of observations, and their residuals, all times the root of their weights."""
+    """Derivatives and residuals of k observations, each multiplied by the square root of its weight."""
 
     shared: Float[ndarray, "k 2 s"]
-    """Derivatives by the columns that all images share, which come first."""
+    """Derivatives by the s columns that all images share (intrinsics, boards, mounts)."""
     own: Float[ndarray, "k 2 o"]
-    """Derivatives by the `o` columns that each image has of its own."""
+    """Derivatives by the o columns of the observation's own rig (its pose)."""
     by_point: Float[ndarray, "k 2 3"]
+    """Derivatives by the observed point, in axes of the world."""
     residual: Float[ndarray, "k 2"]
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Observations sorted by point and then by image, and the images that they are in."""
+    """Index of observations that are sorted by point and then by image, or rig."""
 
     image: Int[ndarray, " k"]
+    """Image, or rig, of each observation."""
     starts: Int[ndarray, " p"]
-    """Each point's first observation."""
+    """First observation of each point."""
     rows: list[Int[ndarray, "..."]]
-    """Observations of each image."""
+    """Observations of each image, or rig."""
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Return the sightings of sorted observations, each point with at least one."""
+        """Return the index of sorted observations; every point has at least one. `images` is the number of images."""
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(image, np.flatnonzero(np.diff(point, prepend=-1)), rows)
 
 
 @dataclass(frozen=True)
 class Normal:
-    """The normal equations after the points are eliminated."""
+    """Normal equations `hessian · step = right` of all d unknowns except the points, which are eliminated."""
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
+    """Negative gradient."""
     _blocks: list[tuple[ndarray, ndarray, ndarray, ndarray]]
-    """Per group its points, its columns, the inverse roots of the points' own blocks, and these times their coupling to
-    the columns and their gradients."""
+    """For each group of points: rows of its points; its columns; inverse Cholesky factors L⁻¹ of the points' 3x3 blocks;
+    L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """Return the points after the Gauss-Newton step that belongs to a step of all other unknowns."""
+        """Return the points after their Gauss-Newton step, given the `step` of all other unknowns."""
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -126,7 +130,7 @@ class Normal:
 def with_fixed_points(
     rows: Derivatives, seen: Sightings
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
-    """Return Hessian and right side of all unknowns but the points."""
+    """Return Hessian JᵀJ and right side −Jᵀr of all unknowns but the points, as if the points were fixed."""
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)
     hessian, right = np.zeros((size, size)), np.zeros(size)
@@ -148,17 +152,17 @@ def without_points(
     seen: Sightings,
     damping: float = 0.0,
 ) -> Normal:
-    """Return the equations of all unknowns but the points, in place, with the Schur complement of the points."""
+    """Return the normal equations without the points (Schur complement); `hessian` and `right` are overwritten."""
     s, o = rows.shared.shape[2], rows.own.shape[2]
     blocks, ends = [], np.append(seen.starts, len(seen.image))
-    # Few of many images show the points of a group, which are in the order of the first image that shows them.
+    # Points are grouped in the order of their first image, so that each group touches few of many images.
     by_first = np.argsort(seen.image[seen.starts], kind="stable")
     for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)) if len(by_first) else []:
         counts = ends[points + 1] - ends[points]
         begins, of_point = np.cumsum(counts) - counts, np.repeat(np.arange(len(points)), counts)
         of_group = np.repeat(ends[points] - begins, counts) + np.arange(counts.sum())
         images, of_image = np.unique(seen.image[of_group], return_inverse=True)
-        # First observation of each point in each image: rigs see a point by several cameras.
+        # First observation of each point in each image; a rig with several cameras may observe a point several times.
         pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
         own_columns = s + o * np.arange(len(images))[:, None] + np.arange(o)
         columns = np.r_[:s, (s + o * images[:, None] + np.arange(o)).ravel()]
@@ -182,12 +186,12 @@ def without_points(
 
 
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
-    """Return each point's own block of the normal equations."""
+    """Return the 3x3 block JᵀJ of each of n points, whose first observations are `starts`."""
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 
 
 def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
-    """Return blocks that are damped, and regular where the rays of a point are parallel."""
+    """Return the blocks after damping; a small diagonal makes them invertible if the rays of a point are parallel."""
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v

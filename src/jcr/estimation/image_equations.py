@@ -1,8 +1,8 @@
-"""Equations of images: bundle adjustment, and the evidence about rigs and cameras that images give by themselves.
+"""Image equations: bundle adjustment, and the normal distribution of rigs and cameras that images alone determine.
 
-Reprojection errors under a Cauchy loss, over intrinsics, nuisances of images, mounts, rigs and points. The points are
-eliminated (elimination.py); the rest is a small dense system. The evidence excludes the reported poses, even where these
-keep the rigs in place while the images are adjusted, so that nothing is counted twice.
+Reprojection errors under a Cauchy loss are minimised over intrinsics, parameters of images, mounts, rigs and points.
+The points are eliminated (elimination.py); the rest is a small dense system. Reported poses may guide an adjustment, but
+`ImageEvidence` never contains them, so that they are not counted twice.
 """
 
 from collections.abc import Sequence
@@ -29,40 +29,44 @@ from jcr.geometry import step_between
 from jcr.least_squares import damped_gauss_newton, one_blas_thread
 
 ROUNDS = 3
-"""Number of adjustments of images alone, between which the sizes of errors are estimated."""
+"""Number of adjustments in `adjust_images`; the pixel noise is estimated before each."""
 SIZES_SETTLED = 0.01
 """Relative change of the sizes of errors, of pixels and of robots, that ends the rounds."""
 ENOUGH = 1e-5
 """Change of the cost, in squared standard deviations, that ends an adjustment."""
 STEPS = 60
+"""Largest number of steps of an adjustment."""
 FAINT = 1e-6
-"""Information added to every column (1/m², 1/rad²): an image without observations is anywhere within a kilometre."""
+"""Information added to every column (1/m², 1/rad²): a standard deviation of 1 km for images without observations."""
 
 
 class RigInformation(NamedTuple):
-    """Twice a cost that is quadratic in the steps of the first rigs from a reference: sᵀ H s + 2 gᵀ s."""
+    """Information about the first m rigs: sᵀ H s + 2 gᵀ s is twice the cost of steps s from reference poses."""
 
     world_from_rig: Float[ndarray, "m 4 4"]
+    """Reference poses."""
     information: Float[ndarray, "r r"]
+    """Matrix H, r = 6m."""
     gradient: Float[ndarray, " r"]
+    """Vector g."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
-        """Return the steps of the rigs of a state from the reference."""
+        """Return the steps (6m,) from the reference poses to the rigs of a state."""
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageEvidence:
-    """Normal distribution of the columns of the images about a state, without the reported poses."""
+    """Normal distribution of all d image columns about a state, from images and priors without the reported poses."""
 
     problem: Problem
     state: State
     view: ProjectedObservations
+    """Observations as the state projects them."""
     information: Float[ndarray, "d d"]
-    """Information, including that of the priors of intrinsics and nuisances, and a negligible one of the world's
-    similarity."""
+    """Information matrix with the priors of the cameras, and small information along the similarity of the world."""
     gradient: Float[ndarray, " d"]
-    """Gradient of half the squared distance."""
+    """Gradient of half the cost (squared standard deviations) at the state."""
 
     @cached_property
     def weight(self) -> Float[ndarray, " k"]:
@@ -71,7 +75,10 @@ class ImageEvidence:
 
     @cached_property
     def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
-        """Steps of the arms' rigs with each free column and to their mean, signs reversed, and their covariance."""
+        """Conditional distribution of the steps r of the arms' rigs given steps f of the free columns.
+
+        Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b.
+        """
         by_arm, free = self.problem.by_arm, self.problem.free
         root = cholesky(self.information[np.ix_(by_arm, by_arm)])
         coupling = self.information[np.ix_(by_arm, free)]
@@ -81,7 +88,10 @@ class ImageEvidence:
 
 @one_blas_thread
 def adjust_images(problem: Problem, state: State) -> State:
-    """Adjust images of exact cameras alone; the rigs keep their mean place, rotation and extent."""
+    """Return the state after bundle adjustment without reported poses, for cameras with exact intrinsics.
+
+    Mean position, rotation and extent of the rigs stay fixed.
+    """
     unseen = information_along(similarities_of_rigs(state.world_from_rig), 1.0)
     world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
     for _ in range(ROUNDS):
@@ -91,10 +101,9 @@ def adjust_images(problem: Problem, state: State) -> State:
 
 
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
-    """Return the state with the pixel errors that its residuals show.
+    """Return the state with the pixel noise estimated from its residuals.
 
-    Groups of observations, and observations by their stated variances, are distinguished where an estimate was made
-    before.
+    The first estimate has one size for all observations; later ones distinguish groups and stated variances.
     """
     layout, residual_px, depth, before = problem.layout, view.residual_px, view.depth, state.pixel_noise
     if before is None or (layout.groups == 1 and not layout.states_variances):
@@ -109,15 +118,15 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
 
 
 def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
-    """Return the weight of each observation, 1/px²."""
+    """Return the weight (1/px²) of each observation for the residuals of the state."""
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
 
 def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
-    """Adjust the columns of the images with the weights that observations have at the start.
+    """Return the state after bundle adjustment with constant weights, those of the observations at the start.
 
-    `known` is information about the rigs beside that of the images and `known_rigs`.
+    `known` is information about the rigs in addition to that of the images and `known_rigs`.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
@@ -145,18 +154,18 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the evidence of the images and of the priors of their cameras about a state."""
+    """Return the normal distribution of the image columns about a state, from images and priors."""
     return linearised(problem, state, view_of(problem, state))[0]
 
 
 def linearised(problem: Problem, state: State, view: ProjectedObservations) -> tuple[ImageEvidence, Normal]:
-    """Return the evidence about a state, and the normal equations, which step the points."""
+    """Return the evidence of images and priors about a state, and the normal equations, which give the points' steps."""
     weight = weights_of(problem, state, view)
     normal = _normal_equations(problem, state, view, weight, _known_rigs(problem), 0.0)
     information = normal.hessian
     information[np.diag_indices(len(information))] += FAINT
     if problem.known_rigs is None:
-        # The unit of the world is that of the positions of its rigs. Boards are left out: λ would depend on their size.
+        # The rigs of cameras fix the unit of the world; boards do not, for λ would then depend on their size.
         boards, first = problem.boards, problem.columns.first_rig
         rigs = slice(first, len(information) if boards is None else first + 6 * boards.first_rig)
         by_similarity = similarities(problem, state)
@@ -169,7 +178,7 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
 
 
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
-    """Return the evidence with the estimated size of the remaining distortion, and the relative change of that size."""
+    """Return the evidence with newly estimated sizes of the remaining distortion, and their largest log change."""
     state, columns = images.state, [c for c in images.problem.columns.model_error if c.stop > c.start]
     if not columns:
         return images, 0.0
@@ -190,7 +199,7 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
 
 
 def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Float[ndarray, " n"]:
-    """Return the median reprojection error of every image; NaN of an image without observations."""
+    """Return the median reprojection error (px) of each of n images; NaN for an image without observations."""
     assert problem.observations is not None
     length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
     out = np.full(problem.n_images, np.nan)
@@ -200,14 +209,14 @@ def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Flo
 
 
 def cost_of_images(images: ImageEvidence, state: State) -> float:
-    """Return the cost of another state, with the weights and priors of the evidence."""
+    """Return the cost of a state in squared standard deviations, with the weights and priors of the evidence."""
     view, sizes = view_of(images.problem, state), images.state.model_error_std
     state = replace(state, model_error_std=sizes)
     return _cost(images.problem, state, view, images.weight, _known_rigs(images.problem))
 
 
 def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
-    """Return information of this strength along the steps of a similarity, which nothing else determines."""
+    """Return an information matrix of this strength in the space of seven steps, those of a similarity of the world."""
     unseen = np.linalg.qr(steps)[0]
     return strength * unseen @ unseen.T
 
@@ -219,7 +228,7 @@ def _cost(
     weight: Float[ndarray, " k"],
     known: Sequence[RigInformation],
 ) -> float:
-    """Return the cost in squared standard deviations, with these weights of the observations."""
+    """Return the cost in squared standard deviations: weighted residuals, priors, boards and `known` information."""
     total = float(weight @ (view.residual_px**2).sum(1))
     total += float(((state.camera_steps / problem.prior_std(state)) ** 2).sum())
     total += float((shape_residuals(problem, state) ** 2).sum())
@@ -230,7 +239,7 @@ def _cost(
 
 
 def _known_rigs(problem: Problem) -> list[RigInformation]:
-    """Return the information of the problem about its rigs."""
+    """Return the information of `Problem.known_rigs`, as a list of one element or none."""
     if problem.known_rigs is None:
         return []
     poses, covariance = problem.known_rigs
@@ -246,7 +255,7 @@ def _normal_equations(
     known: Sequence[RigInformation],
     damping: float,
 ) -> Normal:
-    """Return the normal equations of all columns, the points eliminated."""
+    """Return the damped normal equations of all image columns, with the points eliminated."""
     first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
     weighted = derivatives(problem, state, view, weight)
     hessian, right = with_fixed_points(weighted, seen)

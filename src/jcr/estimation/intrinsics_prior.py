@@ -1,4 +1,4 @@
-"""Prior distribution of a camera's intrinsics, and of the error that its model leaves beside them."""
+"""Prior distribution of a camera's intrinsics, and of the remaining distortion that its model does not describe."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ MEASURED = {
     "s3": 1e-3,
     "s4": 1e-3,
 }
-"""Standard deviations of intrinsics that were given without any: focal length and its aspect relative, principal point
-relative to the width, distortion absolute. Factory values are off by 0.3 to 0.9 % and a few pixels."""
+"""Prior standard deviations of given intrinsics without stated ones: focal length and aspect relative, principal point
+in image widths, distortion absolute. Errors of factory values: 0.3 to 0.9 % and a few pixels."""
 ESTIMATED = {
     "f": 0.5,
     "aspect": 3e-3,
@@ -40,36 +40,37 @@ ESTIMATED = {
     "p1": 3e-3,
     "p2": 3e-3,
 }
-"""Standard deviations of intrinsics that a reconstruction estimated, of a cheap camera."""
+"""Prior standard deviations of intrinsics that a reconstruction estimated, for a cheap camera; units of MEASURED."""
 PRISM = {"cx": 0.02, "cy": 0.02, "p1": 0.03, "p2": 0.03, "s1": 0.1, "s2": 0.1, "s3": 0.1, "s4": 0.1}
-"""Standard deviations of what a thin prism trades against, once the images show one: 23 px of a real camera are 0.05."""
+"""Prior standard deviations of a free thin prism and the parameters correlated with it; 23 px of a camera are 0.05."""
 DECENTRING = 1e-3
-"""Standard deviation of thin prism coefficients that nobody calibrated: tangential distortion at the factory."""
+"""Standard deviation of thin prism coefficients that were not calibrated, from tangential distortion of new cameras."""
 FIXED: Mapping[str, float] = {}
-"""Standard deviations of exact intrinsics: no parameter is free."""
+"""Prior of exact intrinsics: no parameter is free."""
 LEAST = 1e-12
 """Standard deviation below which a parameter is fixed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraPrior:
-    """A camera, independent directions in which its intrinsics may differ, and their standard deviations."""
+    """Normal prior of a camera's intrinsics: mean, and independent directions with a standard deviation each."""
 
     intrinsics: Intrinsics
-    """Middle of the prior."""
+    """Mean of the prior."""
     directions: Float[ndarray, "q c"]
-    """Directions of the parameters, in the order of camera.parameters."""
+    """Directions (columns) of change; the q rows are in the order of camera.parameters."""
     std: Float[ndarray, " c"]
+    """Standard deviation along each direction."""
     mount_free: bool = False
-    """Whether its pose on the rig is estimated."""
+    """Whether the camera's pose on its rig is estimated."""
 
 
 def camera_with_prior(
     intrinsics: Intrinsics, std: Mapping[str, float] | Float[ndarray, " q"] = MEASURED
 ) -> CameraPrior:
-    """Return the camera with relative standard deviations as in MEASURED, or one for each of its `parameters`.
+    """Return the prior of a camera; `std` is a mapping like MEASURED, or one number per element of `parameters`.
 
-    One that is not a number is that of MEASURED. Coefficients that the distortion model does not have are left out.
+    NaN stands for the value of MEASURED. Coefficients that the distortion model does not have are ignored.
     """
     if isinstance(std, ndarray):
         usual = camera_with_prior(intrinsics)
@@ -93,19 +94,18 @@ def camera_with_prior(
 
 
 def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> CameraPrior:
-    """Return a camera whose intrinsics were given, with standard deviations or not, or were estimated."""
+    """Return the prior of intrinsics that were `given`, with or without `std`, or that a reconstruction estimated."""
     if not given:
         return camera_with_prior(found, ESTIMATED)
     return camera_with_prior(found, MEASURED if std is None else std)
 
 
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
-    """Return the steps of X, log scale and intrinsics that no image distinguishes from a thin prism in x and in y.
+    """Return the steps of X, log scale and intrinsics (r = 7 + q rows) that images confuse with a thin prism in x, in y.
 
-    To second order in the image, a prism that displaces x by s · r² is p2 = s with the principal point moved by
-    2 · s · fx and the camera rotated by 2 · s about its y axis; in y alike. One standard deviation each, r = 7 + q: that
-    of DECENTRING or, where the estimated tangential distortion is larger, its size, since one defect of the optics
-    causes both.
+    To second order, a prism that displaces x by s · r² equals p2 = s, the principal point moved by 2 · s · fx and the
+    camera rotated by 2 · s about its y axis; likewise for y. s is one standard deviation: DECENTRING, or the estimated
+    tangential distortion if larger, because one defect of the optics causes both.
     """
     names = parameter_names(camera)
     out = np.zeros((7 + len(names), 2))
@@ -120,21 +120,21 @@ def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
 
 
 DEGREE, POLYNOMIALS = 5, 42
-"""Total degree of the polynomials, and their number."""
+"""Total degree of the polynomials of the remaining distortion, and their number (21 for x, 21 for y)."""
 TYPICAL = 1e-4
-"""Middle of the weak prior of the size of each polynomial, in widths of the image."""
+"""Middle of the weak prior on the size of the remaining distortion, in image widths."""
 UPDATES, SETTLED = 100, 1e-3
-"""Most updates of the size, and the relative change of its square that ends them."""
+"""Largest number of updates of the size, and the relative change of its square that ends them."""
 WORTH = 2.0
-"""Polynomials that the typical size counts for, beside those that the images determine."""
+"""Weight of the weak prior on the size, as a number of polynomials."""
 
 
 def displacements(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "k 2 e"]:
-    """Return the displacement of each observation by each polynomial, of one image width.
+    """Return the displacement (px) of k observations by each of e polynomials with a coefficient of one image width.
 
-    Displacements that the intrinsics can express along `directions` are taken out.
+    The part that a change of the intrinsics along `directions` can produce is removed.
     """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     basis = np.linalg.qr(by_prior.reshape(2 * len(x_px), -1))[0]
@@ -143,13 +143,13 @@ def displacements(
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
-    """Return the size of the displacements of one camera, from their estimate under a prior of size `std`.
+    """Return the likeliest size (image widths) of the remaining distortion of one camera, by MacKay's fixed point.
 
-    The fixed point of MacKay's update, with a weak prior of the size.
+    `likeliest` and `covariance` of the e polynomial coefficients were estimated under a prior of size `std`.
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
-    # The images alone count, along directions that they measure independently.
+    # The prior is subtracted; the images measure the coefficients independently along these directions.
     known, directions = np.linalg.eigh(posterior - np.eye(len(likeliest)) * std**-2.0)
     known, right = np.maximum(known, 0.0), directions.T @ right
     variance = std**2
@@ -166,7 +166,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
 def expressed(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "q e"]:
-    """Return the part of each polynomial over these pixels that the camera's parameters express along `directions`."""
+    """Return the change of the q camera parameters along `directions` that best fits each polynomial at the pixels."""
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
     return (
@@ -177,9 +177,9 @@ def expressed(
 def second_moment_px2(
     left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
 ) -> Float[ndarray, "*points 2 2"]:
-    """Return the second moment of the displacement at pixels (px²).
+    """Return the second moment (px²) of the remaining distortion `left` at pixels: squared mean plus covariance.
 
-    A projection with the camera alone errs by the displacement and by its uncertainty.
+    A projection with the intrinsics alone has this error.
     """
     flat = x_px.reshape(-1, 2)
     by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
@@ -188,7 +188,7 @@ def second_moment_px2(
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Return the displacements (px) of x, then of y, by products of Legendre polynomials, one image width each."""
+    """Return the displacements (px) by products of Legendre polynomials, first of x, then of y; one image width each."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
@@ -202,6 +202,6 @@ def joint_covariance(
     of_camera: Float[ndarray, "q q"],
     camera: Intrinsics,
 ) -> JointCovariance:
-    """Return the covariance of transform and scale together with that of the intrinsics, from its blocks."""
+    """Return the joint covariance of transform, scale and the q intrinsics from its blocks; `cross` is (7,q)."""
     together = np.block([[covariance, cross], [cross.T, of_camera]])
     return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))
