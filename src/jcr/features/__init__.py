@@ -1,1 +1,1 @@
-"""Features, matches and the two-view geometries that the robot confirms, in front of any mapper."""
+"""Features, matches, and two-view geometries checked against the robot poses, as input of any mapper."""

@@ -1,7 +1,8 @@
-"""Verification of pairs of images by the gripper poses, and X's rotation from the confirmed pairs.
+"""Verification of image pairs by the gripper poses, and estimation of the hand-eye rotation from confirmed pairs.
 
-The angle between two cameras is the angle between two grippers, whatever X is (Chen 1991). Once enough pairs agree, X's
-rotation is known, and the whole relative rotation must agree, R_A R_X = R_X R_B.
+X is gripper_from_camera, and R_X its rotation. The angle between two cameras equals the angle between the two gripper
+poses for every X (Chen 1991). Once enough pairs agree, R_X is known and the whole relative rotation is checked, R_A R_X
+= R_X R_B, where A is the gripper's motion and B the camera's.
 """
 
 import math
@@ -17,23 +18,24 @@ from jcr.features.two_view import TwoViewMotion
 from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log
 
 ROBOT_STD = math.radians(0.3)
-"""Standard deviation of a reported gripper rotation; an industrial arm errs by 0.05°, a servo arm by 1°."""
+"""Standard deviation of a reported gripper rotation, rad; an industrial arm has 0.05°, a servo arm 1°."""
 SYSTEMATIC = 0.015
-"""Share of the angle by which cameras and robots disagree systematically; real captures show 0.001 to 0.021."""
+"""Systematic difference between camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021.
+Systematic difference between camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021."""
 SYSTEMATIC_OF_GUESS = 0.04
-"""Systematic share where the focal length is estimated from the gripper's angles."""
+"""Value of SYSTEMATIC where the focal length is estimated from the gripper's angles."""
 SIGMAS = 3.0
 LARGEST_STD = math.radians(3)
-"""A pair that knows its rotation less well neither confirms nor contradicts."""
+"""Largest standard deviation (rad) of a pair's rotation angle; a less certain pair neither confirms nor contradicts."""
 SURE_STD = math.radians(2.5)
-"""X's rotation counts as known from here on."""
+"""Largest standard deviation (rad, along any axis) at which R_X counts as known."""
 UPRIGHT_ENOUGH = math.radians(15)
-"""An image is rotated by multiples of 90° where that leaves no more than this, for it costs no resampling."""
+"""Largest remaining roll (rad) at which an image is rotated by a multiple of 90° instead, which needs no resampling."""
 LEAST_PAIRS = 4
-"""Least number of pairs that agree on X's rotation; three wrong ones can agree by chance."""
+"""Least number of pairs that must agree on R_X; three wrong ones can agree by chance."""
 MAX_HYPOTHESES = 3000
 LEAST_INFORMATION = 6.25e-3
-"""Least information of the pairs on a direction of X's rotation, per squared residual: less fixes nothing."""
+"""Least information of the pairs on R_X along any axis, in units of one residual; with less, R_X is not determined."""
 ROUNDS = 20
 
 
@@ -43,43 +45,48 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True)
 class Pair:
-    """Matched keypoints of two images that one two-view geometry explains."""
+    """Matched keypoints of two images that one two-view geometry explains, with its possible motions."""
 
     key: Key
     """Rows of the two images."""
     rows: Int[ndarray, "m 2"]
-    """Rows of the matched keypoints of both."""
+    """Rows of the matched keypoints among those of the first and of the second image."""
     readings: tuple[TwoViewMotion, ...]
-    """Best first; empty where none could be found."""
+    """Possible relative motions of the two cameras, best first; empty where none could be found."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotationOfX:
-    """gripper_from_camera's rotation, how sure it is, and which pairs say so."""
+    """Rotation R_X of gripper_from_camera, its covariance, and the pairs that agree on it."""
 
     rotation: Float[ndarray, "3 3"]
     covariance: Float[ndarray, "3 3"]
     """Covariance of a rotation vector in gripper axes, rad²."""
     agreeing: Bool[ndarray, " p"]
+    """True for each pair, or motion of a pair, that agrees with R_X."""
     sigma: float
-    """Robust size of the residuals of those that agree, rad."""
+    """Robust standard deviation of the residuals of the agreeing pairs, rad per axis."""
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Pairs of a capture, classified by the gripper's motions."""
+    """Pairs of a capture, classified by whether their relative rotation agrees with the gripper's motion."""
 
     confirmed: tuple[Pair, ...]
-    """Each with the reading that agrees best in front."""
+    """Pairs that agree with the gripper's motion; the first of their `readings` is the motion that agrees best."""
     undecided: tuple[Pair, ...]
-    """Too unsure of their rotation to be judged."""
+    """Pairs whose rotation is too uncertain to be judged."""
     contradicted: tuple[Pair, ...]
+    """Pairs that disagree with the gripper's motion."""
     of_x: RotationOfX | None
-    """None while too few pairs agree."""
+    """Hand-eye rotation R_X from the confirmed pairs; None while too few pairs agree."""
 
 
 def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[TwoViewMotion, float]]:
-    """Return the readings whose angle is the gripper's, with the largest difference (rad) that each allows."""
+    """Return the motions of a pair whose angle agrees with the gripper's `angle`, each with its tolerance (rad).
+
+    `systematic` is the share of the angle by which camera and gripper may differ systematically.
+    """
     found = []
     for reading in pair.readings:
         tolerance = SIGMAS * math.sqrt(
@@ -96,10 +103,10 @@ def judge(
     systematic: float = SYSTEMATIC,
     known: RotationOfX | None = None,
 ) -> Gate:
-    """Classify the pairs by the gripper's motions.
+    """Classify the pairs by the gripper's motions, `motion` (i_from_j of gripper poses).
 
-    First by angle alone; among those that pass, X's rotation is sought; with it, every reading of every pair is judged
-    by its whole rotation. `known` is X's rotation where more pairs than these have spoken.
+    Pairs pass first by angle alone. R_X is estimated from these, and every motion of every pair is then judged by its
+    whole rotation. `known` is R_X from a larger set of pairs, used where these pairs do not determine it.
     """
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     undecided, passing, judged = [], [], []
@@ -135,7 +142,7 @@ def judge(
 
 
 def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX, systematic: float) -> float:
-    """Return the largest angle (rad) between a pair's rotation and the one that X predicts."""
+    """Return the largest accepted angle (rad) between a pair's rotation and the rotation that R_X predicts."""
     own = float(np.trace(reading.covariance[:3, :3]))
     of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
     robot = 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
@@ -145,7 +152,7 @@ def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX,
 def _common_rotation(
     passing: Sequence[tuple[Key, TwoViewMotion, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
-    """Return X's rotation where enough pairs agree on it."""
+    """Return R_X if at least LEAST_PAIRS pairs agree on it, else None."""
     keys = [key for key, _, _ in passing]
     if len(set(keys)) < LEAST_PAIRS:
         return None
@@ -164,10 +171,10 @@ def rotation_of_x(
     camera: Float[ndarray, "p 3 3"],
     tolerance: Float[ndarray, " p"],
 ) -> RotationOfX | None:
-    """Return R_X from relative rotations i_from_j of gripper and camera; None where no three pairs about two axes agree.
+    """Return R_X from relative rotations i_from_j of gripper and camera; None if no three pairs about two axes agree.
 
-    Hypotheses come from two pairs each, as in RANSAC; the best is refined on all pairs that agree with it. `tolerance`
-    (rad) is the largest disagreement of a sound pair.
+    Each hypothesis comes from two pairs, as in RANSAC; the best one is refined on all pairs that agree with it.
+    `tolerance` (rad) is the largest disagreement of a correct pair.
     """
     axis_a, axis_b = sine_axis(gripper), sine_axis(camera)
     first, second = np.triu_indices(len(gripper), 1)
@@ -216,15 +223,16 @@ def rotation_of_x(
 def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
 ) -> Float[ndarray, "..."]:
-    """Return the angle (rad; batch by p) by which each pair contradicts R_X."""
+    """Return the angle (rad, one row per R_X of the batch) by which each pair of motions contradicts R_X."""
     trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
-    """Return angles (rad) to rotate images about the viewing axis by so that none is rotated against another.
+    """Return the angle (rad) to rotate each image by about its viewing axis, so that all images are upright alike.
 
-    The twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015).
+    It is the twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015). The
+    largest group of similar images is rotated least.
     """
     mean = base_from_camera[:, :, 2].sum(0)
     z = mean / max(float(np.linalg.norm(mean)), 1e-12)
@@ -239,7 +247,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
 
 
 def by_quarters(roll: float) -> float:
-    """Return the nearest multiple of 90° if it is near, else the angle to a degree; rad in [0, 2π)."""
+    """Return the nearest multiple of 90° if the angle is near one, else the angle rounded to 1°; rad in [0, 2π)."""
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)

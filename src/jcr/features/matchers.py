@@ -1,4 +1,4 @@
-"""Two-view geometries of matched keypoints by COLMAP's robust estimation, with all their readings, for any features."""
+"""Robust estimation of two-view geometries from matched keypoints by COLMAP, for any kind of features."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,40 +18,45 @@ from jcr.features.two_view import readings
 from jcr.records import Intrinsics
 
 FeatureName = Literal["auto", "sift", "xfeat"]
-"""Kinds of features; auto stands for sift, unless a rejected result is followed by xfeat."""
+"""Kinds of features; auto means sift, and xfeat after a rejected result."""
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 MIN_INLIERS = 25
-"""Least number of inliers; with COLMAP's 15 a view of a board was registered 30 cm off, by the wrong squares."""
+"""Least number of inliers of a two-view geometry; with COLMAP's 15 a view of a board was registered 30 cm off, by wrong
+squares."""
 STATIONARY_PX = 4.0
-"""Largest way of a match that keeps its pixel while the gripper moves: of its fingers, or text drawn into the images."""
+"""Largest displacement, px, of a match that is discarded if the gripper moved: it lies on the gripper's fingers, or on
+text drawn into the images."""
 CELL_PX = 16
+"""Side, px, of the image cells in which stationary matches are counted."""
 NEAR_PX = 2.5
-"""Largest distance of a keypoint's positions in two images that counts as no motion."""
+"""Largest displacement, px, of a match that counts as stationary in a cell."""
 LEAST_PAIRS, LEAST_SHARE = 4, 0.2
-"""Least number and share of the pairs with matches in a cell; by chance a point keeps its pixel in one or two."""
+"""Least number, and least share of the pairs with matches in a cell, of pairs with a stationary match there. By chance,
+a point keeps its pixel in one or two pairs."""
 LEAST_CELLS = 3
+"""Least number of connected cells that form a stationary part of the image."""
 
 
 @runtime_checkable
 class Features(Protocol):
-    """Keypoints of a capture's images, of any kind."""
+    """Keypoints of a capture's images, of any kind, and a matcher of them."""
 
     x_px: list[Float[ndarray, "_ 2"]]
     """Keypoints of every image found so far, px; pixel centres are whole numbers."""
 
     @property
     def minds_roll(self) -> bool:
-        """True if the features need images that are rotated upright."""
+        """True if images must be rotated upright before matching."""
         ...
 
     @property
     def every_pair(self) -> int:
-        """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
+        """Largest number of images of which all pairs are matched; above, pairs grow in proportion to images."""
         ...
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return rows of matching keypoints of pairs, their images rotated (rad) before."""
+        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its two images before."""
         ...
 
 
@@ -60,47 +65,51 @@ class ImageGeometry:
     """Keypoints, rays and intrinsics of the images at the working size."""
 
     x_px: Sequence[Float[ndarray, "_ 2"]]
-    """Keypoints of every image; pixel centres are whole numbers."""
+    """Keypoints of every image, px; pixel centres are whole numbers."""
     intrinsics: Intrinsics
-    """Given, or a guess."""
+    """Intrinsics at the working size, given or estimated."""
     rays: Sequence[Float[ndarray, "_ 2"]]
-    """x/z, y/z of the keypoints through those intrinsics."""
+    """Undistorted directions x/z, y/z of the keypoints."""
 
     @staticmethod
     def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "ImageGeometry":
-        """Return the keypoints with their rays."""
+        """Return the keypoints with their rays by the intrinsics."""
         return ImageGeometry(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
 
 class Matcher:
-    """Verified matches between a capture's images, all of one camera."""
+    """Verified matches between a capture's images, all of one camera; results are cached."""
 
     def __init__(
         self, features: Features, scale: Float[ndarray, "2"], camera: pycolmap.Camera, known: bool, seed: int
     ) -> None:
-        """`camera` is at the working size, `scale` its pixels per pixel of the features; `known`: it is given."""
+        """Begin without matches; `camera` belongs to images of the working size.
+
+        `scale` is the working size over the size of the features' images, for x and y. `known` says that the camera's
+        intrinsics are given.
+        """
         self.features, self._scale = features, scale
         self._camera, self.known, self.seed = camera, known, seed
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
-        """All matches of the pairs that were tried last, right or wrong."""
+        """All matches of the pairs that were matched last, correct or wrong."""
         self.still: Bool[ndarray, "r c"] | None = None
-        """Cells of the image that do not move while the gripper does, whose matches are left out."""
+        """Cells of the image that do not move while the gripper does; matches there are discarded."""
         self._verified: dict[tuple[Key, bytes], pycolmap.TwoViewGeometry | None] = {}
-        """Geometries by pair and matches."""
+        """Verified geometries by pair and matches; None where the verification failed."""
         self._pairs: dict[tuple[Key, int, Intrinsics], tuple[Pair, pycolmap.TwoViewGeometry]] = {}
-        """Pairs by the identity of their geometry, which is kept with them so that no other takes its place."""
+        """Pairs by key, identity of the geometry, and intrinsics; storing the geometry keeps its identity unique."""
 
     @property
     def x_px(self) -> list[Float[ndarray, "_ 2"]]:
-        """Keypoints at the working size; more come with every angle by which an image is rotated."""
+        """Keypoints of every image at the working size, px; a network adds more for every angle of rotation."""
         return [(x + 0.5) * self._scale - 0.5 for x in self.features.x_px]
 
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], repeats: Bool[ndarray, "n n"]
     ) -> Geometries:
-        """Return verified two-view geometries of pairs, their images rotated (rad) before.
+        """Return the verified two-view geometries of pairs, whose images are rotated by `rolls` (rad) before matching.
 
-        `repeats` are the pairs between whose images the gripper did not move.
+        `repeats` marks pairs of images between which the gripper did not move.
         """
         new = [k for k, key in enumerate(pairs) if self.features.minds_roll or key not in self.raw]
         some = [pairs[k] for k in new]
@@ -113,9 +122,9 @@ class Matcher:
     def verified(
         self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]], moved: bool
     ) -> pycolmap.TwoViewGeometry | None:
-        """Return the geometry of some of a pair's matches, kept in memory; None where too few agree on one.
+        """Return the geometry of the matches `rows` of a pair; None where too few matches agree. The result is cached.
 
-        Matches that keep their pixel are left out where the gripper `moved`, and those in `still` cells.
+        If the gripper `moved`, matches that keep their pixel are discarded; matches in `still` cells are discarded, too.
         """
         if moved:
             x_i, x_j = (x_px[image][own] for image, own in zip(key, rows.T, strict=True))
@@ -136,7 +145,7 @@ class Matcher:
         return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
-        """Return a geometry with its readings through the view's intrinsics, kept in memory."""
+        """Return the pair of a geometry, with its possible motions by the intrinsics of `view`; cached."""
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
@@ -146,10 +155,10 @@ class Matcher:
         return self._pairs[depends][0]
 
     def image_removed(self, row: int) -> None:
-        """Forget the pairs of an image that the features no longer have; the rows of later images are one less."""
+        """Remove the pairs of an image that the features no longer have; rows of later images decrease by one."""
 
         def after(key: Key) -> Key:
-            """Return the rows of a pair without the image."""
+            """Return the rows of a pair after the removal of the image."""
             return key[0] - (key[0] > row), key[1] - (key[1] > row)
 
         self._pairs.clear()
@@ -167,7 +176,7 @@ def matched(
     seed: int,
     known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
-    """Return the geometry on which most matches agree; None where too few do. `known`: the intrinsics are no guess."""
+    """Return the geometry that most matches agree on; None below MIN_INLIERS. `known`: the intrinsics are given."""
     if len(rows) < MIN_INLIERS:
         return None
     options = pycolmap.TwoViewGeometryOptions()
@@ -187,7 +196,7 @@ def matched(
 def matrices(
     found: pycolmap.TwoViewGeometry, intrinsics: Intrinsics
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
-    """Return essential matrix and homography of normalised coordinates, j from i, where COLMAP found one."""
+    """Return essential matrix and homography j from i for normalised coordinates, each None if COLMAP found none."""
     k = intrinsics.matrix + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     essential, homography = found.E, found.H
     if essential is None and found.F is not None:
@@ -201,9 +210,9 @@ def still_cells(
     size: tuple[int, int],
     moving: Iterable[Key],
 ) -> Bool[ndarray, "r c"]:
-    """Return cells of the image in which matches keep their pixel in many of the `moving` pairs.
+    """Return the cells of the image whose matches keep their pixel in many of the `moving` pairs.
 
-    Such are the gripper's own fingers, a logo, text drawn into the images.
+    Such cells show the gripper's own fingers, a logo, or text drawn into the images. `size` is width and height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)
@@ -222,10 +231,10 @@ def still_cells(
 
 
 def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
-    """Test which keypoints lie in a part that does not move."""
+    """Test which keypoints lie in the `still` cells of the image."""
     return still[tuple(_cells(x_px, still.shape).T)]
 
 
 def _cells(x_px: Float[ndarray, "k 2"], shape: tuple[int, int]) -> Int[ndarray, "k 2"]:
-    """Return the row and column of the cell of each keypoint."""
+    """Return the row and column of the cell of each keypoint, for a grid of `shape` rows and columns."""
     return np.clip((x_px // CELL_PX).astype(int), 0, [shape[1] - 1, shape[0] - 1])[:, ::-1]

@@ -1,4 +1,4 @@
-"""Choice of the pairs of images to match: all of a few images, of many those that are near or see the same points."""
+"""Choice of the image pairs to match: all pairs of a few images, else pairs of near viewpoints or of a common scene."""
 
 import math
 
@@ -12,23 +12,25 @@ from jcr.features.matchers import ImageGeometry
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
-"""Numbers of partners of an image by the gripper's motion: to find X, and where these do not show it."""
+"""Numbers of near viewpoints that each image is paired with: in the first search, and where R_X is not found from it.
+Numbers of near viewpoints that each image is paired with: in the first search, and where R_X is not found from it."""
 FEW = 16
-"""Largest number of images of which every pair is matched at once. It is cheap, and a pair that happens to match may
-tie a camera that is far from all others (doosan_bench: 12 mm from its gripper with the nearest alone, 7 mm with all)."""
+"""Largest number of images whose pairs are all matched at once. This is cheap, and a pair that happens to match may
+register a camera far from all others (doosan_bench: 12 mm from its gripper with near pairs alone, 7 mm with all)."""
 PARTNERS = 8
-"""Number of partners of an image by the points that both see, once X is known."""
+"""Number of viewpoints that each image is paired with by the scene they share, once R_X is known."""
 WIDEST = math.radians(60)
-"""Largest angle between two viewing directions; nothing matches beyond."""
+"""Largest angle (rad) between two viewing directions of a pair; beyond it nothing matches."""
 LEAST_COMMON = 0.25
-"""Least share of the scene in an image that the other must see, too."""
+"""Least share of the scene points in an image that the other image must see, too."""
 SAME_VIEWPOINT = 5e-3, math.radians(1)
-"""m, rad: images between which the gripper moved by less repeat one viewpoint, and show no parallax."""
+"""Largest motion (m, rad) of the gripper between images of one viewpoint; such images show no parallax."""
 PRIOR_STD_M = 0.2
-"""Standard deviation of t_X around zero: a camera is mounted on the flange or near it."""
+"""Standard deviation, m, of the camera's position about the flange: a camera is mounted on the flange or near it."""
 ROBOT_STD_M = 2e-3
 LEAST_DIRECTION_STD = 0.01
-"""rad; of a two-view translation, which forward motion and plane scenes leave loose."""
+"""Least standard deviation, rad, of the direction of a two-view translation; forward motion and plane scenes determine
+it weakly."""
 ROUNDS = 15
 POINTS_OF_PAIR = 60
 
@@ -39,19 +41,19 @@ def all_pairs(n: int) -> list[Key]:
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """Return the pairs of every image with its nearest viewpoints by the gripper's motion, in proportion to n."""
+    """Return the pairs of every image with its `neighbours` nearest viewpoints by the gripper's motion."""
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
 def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
-    """Test which images repeat each other's viewpoint."""
+    """Test for each pair of images whether they are of one viewpoint (SAME_VIEWPOINT)."""
     metres, radians = SAME_VIEWPOINT
     way = np.linalg.norm(motion[..., :3, 3], axis=-1)
     return (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
 
 
 def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return the row of the first image of each image's viewpoint."""
+    """Return for each image the row of the first image of the same viewpoint."""
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -60,7 +62,10 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
 
 
 def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
-    """Return the pairs of every image with the viewpoints that share most of its scene, by X and the points so far."""
+    """Return the pairs of every image with the viewpoints that share most of its scene; empty while X is unknown.
+
+    The shared scene is measured by the points of the confirmed pairs.
+    """
     x = translation_of_x(found, motion)
     if x is None:
         return []
@@ -86,8 +91,8 @@ def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n
 def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
     """Return gripper_from_camera from the confirmed pairs; None while its rotation is unknown.
 
-    d = R_X t_B is known but for its length, so d × ((R_A − I) t_X + t_A) = 0 is linear in t_X: no scale and no map are
-    needed.
+    A pair's translation has a known direction d = R_X t_B. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X
+    and needs neither the scale nor a map.
     """
     if found.of_x is None or not found.confirmed:
         return None
@@ -110,7 +115,7 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[nd
 def _scene_points(
     view: ImageGeometry, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
 ) -> Float[ndarray, "p 3"]:
-    """Return points that confirmed pairs see with parallax, in the frame of the first gripper (m)."""
+    """Return the points that confirmed pairs see with parallax, in the frame of the first image's gripper, m."""
     kept = [np.zeros((0, 3))]
     for pair in found.confirmed:
         rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
@@ -126,9 +131,10 @@ def _scene_points(
 
 
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:
-    """Return pairs of every image with the `count` other viewpoints of highest finite score, one image of each.
+    """Return the pairs of every image with one image of each of the `count` other viewpoints of highest finite score.
 
-    Repeats of a viewpoint take different images of another one, so that all are tied together and average their noise.
+    Repeats of a viewpoint are paired with different images of the other one, so that all images are connected and their
+    noise averages.
     """
     repeat = np.array([(viewpoint[:row] == of).sum() for row, of in enumerate(viewpoint)])
     pairs = set()

@@ -1,4 +1,4 @@
-"""SIFT by OpenCV, which is three times as fast as COLMAP's: keypoints, descriptors, and which of two images' are alike.
+"""SIFT keypoints, descriptors and matches by OpenCV, which is three times as fast as COLMAP.
 
 Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 """
@@ -17,28 +17,29 @@ from jcr.features.gate import Key
 from jcr.progress import Progress, steps
 
 WORKING_SIZE_PX = 1600
-"""Images whose long side is larger are reduced to this before features are found."""
+"""Largest long side of an image in which features are found, px; larger images are reduced to it."""
 KEYPOINTS = 2000
-"""Largest number of keypoints of an image, by contrast."""
+"""Largest number of keypoints of an image, those of highest contrast."""
 CONTRAST = 0.01
 """Least contrast of a keypoint. With COLMAP's 0.02 elephant_floor has 420 an image, and 2 of its 15 images register."""
 RATIO = 0.8
-"""A match must be so much nearer than the second nearest (Lowe 2004)."""
+"""Largest ratio of the descriptor distances to the nearest and the second nearest keypoint (Lowe 2004)."""
 FARTHEST = 0.7
-"""Distance of the unit descriptors of a match at most, as COLMAP's."""
+"""Largest distance of the unit descriptors of a match, as in COLMAP."""
 
 
 def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
-    """Return an image in grey, resized to this width and height for the detector.
+    """Return an image in grey, resized to `size` (width, height).
 
-    Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
+    Area interpolation shares the pixels at the borders of an area; Pillow's BOX assigns each to one area, which moves
+    2400 px images by 0.25 px.
     """
     grey = np.asarray(Image.fromarray(pixels).convert("L"))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
-    """Return keypoints (px; pixel centres are whole numbers) and unit descriptors."""
+    """Return keypoints (px; pixel centres are whole numbers) and unit descriptors of an image."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -52,7 +53,7 @@ def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[
 def matches(
     first: Float32[ndarray, "k 128"], second: Float32[ndarray, "l 128"]
 ) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
-    """Return rows of descriptors that are mutual nearest neighbours and pass the ratio test."""
+    """Return the rows in `first` and `second` of mutual nearest neighbours that pass the ratio test."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     cosine = first @ second.T
@@ -67,7 +68,7 @@ def matches(
 
 
 class SiftFeatures:
-    """SIFT of a capture's images at a working size; how images are rotated against each other is no matter."""
+    """SIFT keypoints and descriptors of a capture's images at the working size; invariant to image rotation."""
 
     minds_roll = False
     every_pair = 24
@@ -79,7 +80,7 @@ class SiftFeatures:
         threads: int,
         report: Progress,
     ) -> None:
-        """Find the features of all images, some at once."""
+        """Find the features of all images, resized to `size` (width, height), in `threads` threads."""
         self._size = size
         with ThreadPoolExecutor(threads) as pool:
             found = pool.map(lambda image: detect(grey_of(image, size)), images)
@@ -96,11 +97,11 @@ class SiftFeatures:
         self.descriptors.append(descriptors)
 
     def remove(self, row: int) -> None:
-        """Remove an image; the rows of later ones are one less."""
+        """Remove the features of an image; rows of later images decrease by one."""
         del self.x_px[row], self.descriptors[row]
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return rows of matching keypoints of each pair; SIFT does not use the rotations (rad)."""
+        """Return the rows of matching keypoints of each pair; `rolls` (rad) are not used."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

@@ -1,6 +1,7 @@
-"""Search for pairs of images that match and that the gripper poses confirm.
+"""Search for image pairs that match and that the gripper poses confirm.
 
-Pairs with little rotation between them are matched first; they give X's rotation, by which images are rotated upright.
+Pairs with little rotation between them are matched first. They give the rotation R_X of gripper_from_camera, by which
+images are then rotated upright.
 """
 
 import math
@@ -40,19 +41,22 @@ from jcr.geometry import rotation_angle
 from jcr.records import Intrinsics
 
 WORTH_SAYING = 0.1
-"""Share of the matched pairs: a few wrong ones are left out of every set."""
+"""Share of contradicted pairs from which the user is told; a few wrong pairs are normal."""
 AS_TAKEN = math.radians(50)
-"""Networks match images that are rotated against each other by up to this; no rotation is larger than its angle."""
+"""Largest angle (rad) of the gripper's motion at which a network matches the images without rotating them first."""
 GUESSED_AT_ONCE = 6
-"""Pairs whose rotations by 90° are guessed before the robot is asked again."""
+"""Number of pairs that are matched at all multiples of 90° before R_X is estimated again."""
 GUESSED_AT_MOST = 30
+"""Largest number of pairs that are matched at all multiples of 90°."""
 FOCALS = np.geomspace(0.35, 2.5, 40)
-"""Focal lengths that are tried where no intrinsics are given, in long sides."""
+"""Focal lengths that are tried where no intrinsics are given, as multiples of the long side."""
 FOCAL_TOLERANCE = math.radians(1.5)
+"""Standard deviation, rad, of the angles' difference by which a pair supports a focal length."""
 LEAST_SUPPORT = 3.0
-"""Pairs that must agree at the best one; with fewer any focal length does."""
+"""Least sum of the pairs' supports (0 to 1 each) for the best focal length; with less, the focal length is
+undetermined."""
 FOCAL_MATCHES = 200
-"""Largest number of a pair's matches by which points in front of both cameras are counted."""
+"""Largest number of matches of a pair by which points in front of both cameras are counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +64,7 @@ class Matched:
     """Verified pairs of a capture and the intrinsics that they were verified with."""
 
     geometries: Geometries
-    """Geometries for the mapper."""
+    """Two-view geometries for the mapper, by pair."""
     intrinsics: Intrinsics
     """Intrinsics at the working size, given or estimated from the gripper's angles."""
     notes: tuple[str, ...] = ()
@@ -74,19 +78,21 @@ class _Search:
 
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
+    """Gripper's motions i_from_j."""
     view: ImageGeometry
     repeats: Bool[ndarray, "n n"]
-    """Pairs between whose images the gripper did not move."""
+    """True for pairs of images between which the gripper did not move."""
     pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
     tried: set[tuple[int, int, int, int]] = field(default_factory=set)
-    """Pairs, and the angles (degrees) by which their images were rotated."""
+    """Rows of the two images and the angles (degrees) that they were rotated by, for each attempt to match a pair."""
 
     @property
     def systematic(self) -> float:
+        """Systematic difference of camera and gripper angle, as a share of the angle."""
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
-        """Match pairs, the images of each rotated by two angles (rad); of two geometries of a pair keep the better."""
+        """Match pairs, their two images rotated by the given angles (rad); keep the better geometry of a pair."""
         todo = {}
         for key, both in rotations.items():
             if not self.matcher.features.minds_roll:
@@ -106,7 +112,7 @@ class _Search:
                 self.pairs[key] = pair, geometry
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
-        """Match pairs rotated by multiples of 90° until X's rotation is known, and return the gate."""
+        """Match pairs rotated by multiples of 90° until R_X is known, and return the classified pairs."""
         for start in range(0, min(len(pairs), GUESSED_AT_MOST), GUESSED_AT_ONCE):
             for quarter in range(4):
                 guess = (0.0, quarter * math.pi / 2)
@@ -117,12 +123,12 @@ class _Search:
         return found
 
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
-        """Match pairs with images rotated upright, and return the gate after it."""
+        """Match pairs with their images rotated by the angles `upright` (rad), and return the classified pairs."""
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x)
 
     def hide_still_parts(self) -> None:
-        """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
+        """Find the parts of the image that stay while the gripper moves, and verify all pairs again without them."""
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
@@ -138,7 +144,11 @@ class _Search:
                 self.pairs[key] = self.matcher.pair(self.view, key, geometry), geometry
 
     def _is_better(self, new: Pair) -> bool:
-        """Test whether a pair's new geometry is confirmed where the old one is not, or has more matches."""
+        """Test whether a pair's new geometry is to replace the old one.
+
+        It does if only the new one agrees with the gripper's angle; if both or neither agree, it needs more than half
+        as many matches as the old one.
+        """
         if new.key not in self.pairs:
             return True
         old, angle = self.pairs[new.key][0], float(rotation_angle(self.motion[new.key][:3, :3]))
@@ -147,7 +157,7 @@ class _Search:
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def gate(self) -> Gate:
-        """Return the gate with the given intrinsics, or with those for which most pairs agree with the gripper."""
+        """Return the classified pairs, by the given intrinsics or those for which most pairs agree with the gripper."""
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
             self.view = ImageGeometry.of(self.view.x_px, intrinsics)
             self.pairs = {
@@ -157,9 +167,9 @@ class _Search:
         return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
 
     def _intrinsics_by_robot(self) -> Intrinsics | None:
-        """Return undistorted intrinsics with square pixels; None where too few pairs agree on a focal length.
+        """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
 
-        The angles between cameras become those between grippers.
+        Returns None where too few pairs agree on a focal length.
         """
         size = self.view.intrinsics.width, self.view.intrinsics.height
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
@@ -198,8 +208,8 @@ def match_with_robot(
 ) -> Matched:
     """Match pairs of images and return those that the gripper poses do not contradict.
 
-    `intrinsics` are at the working size, and a first guess unless the matcher's are known. Where X's rotation cannot be
-    found from the pairs, the robot poses are not used: they may be of another convention, or too few pairs match.
+    `intrinsics` are at the working size, and an initial estimate unless the matcher's are known. If R_X cannot be found
+    from the pairs, the pairs are not checked against the robot poses, which may be of another convention.
     """
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
@@ -245,7 +255,7 @@ def match_with_robot(
 def _believed(
     search: _Search, found: Gate, names: Sequence[str]
 ) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
-    """Return the pairs that the robot does not contradict, with notes and warnings on the others."""
+    """Return the pairs that the robot poses do not contradict, with notes and warnings about the others."""
     notes, warnings = tuple[str, ...](), tuple[str, ...]()
     stale = _contradicted_by_all(found, search.motion)
     believed = {pair.key for pair in found.confirmed}
@@ -267,7 +277,7 @@ def _believed(
 
 
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
-    """Return images whose pairs agree with each other and contradict their pose: the pose is wrong, not the matches."""
+    """Return the images with a wrong pose: their pairs agree with each other and contradict the pose."""
     assert found.of_x is not None
     x = found.of_x.rotation
     confirmed = {row for pair in found.confirmed for row in pair.key}

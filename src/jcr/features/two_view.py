@@ -1,4 +1,4 @@
-"""Relative rotation of two cameras from matched directions, its alternatives and its covariance.
+"""Relative motions of two cameras from matched directions, with covariance.
 
 A homography has two solutions (Malis and Vargas, INRIA RR-6303, 2007). Each motion is refined on the Sampson error
 (Hartley and Zisserman, section 11.4.3), whose curvature gives the covariance.
@@ -15,25 +15,25 @@ from jcr.geometry import rotation_exp, skew
 from jcr.least_squares import minimise
 
 ROUNDS, ENOUGH = 2, 1e-4
-"""Estimates of the size of the errors, and relative change of a cost that ends the steps between."""
+"""Number of estimates of the noise, and relative change of the cost that ends the optimisation after each."""
 LEAST_SIGMA_PX = 0.3
-"""Least standard deviation of a match; no detector is better over a whole image."""
+"""Least standard deviation of a match, px; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
-"""An alternative that fits its own inliers worse is none."""
+"""Largest standard deviation, px, of the matches of an accepted motion."""
 
 
 @dataclass(frozen=True)
 class TwoViewMotion:
-    """One way in which two images can have been taken."""
+    """One possible relative motion of the two cameras i and j of an image pair."""
 
     rotation: Float[ndarray, "3 3"]
-    """i_from_j."""
+    """Rotation i_from_j."""
     direction: Float[ndarray, "3"]
     """Unit vector from camera i to camera j, in the frame of camera i."""
     covariance: Float[ndarray, "5 5"]
-    """Covariance of (rotation vector in axes of camera i, two components of the direction), rad²."""
+    """Covariance (rad²) of the rotation vector in axes of camera i and of two components across the direction."""
     sigma_px: float
-    """Robust size of the matches' distances from their epipolar lines."""
+    """Robust standard deviation of the matches' Sampson distances, px."""
 
     def angle_std(self) -> float:
         """Return the standard deviation of the angle of rotation, rad."""
@@ -52,9 +52,9 @@ def readings(
     j_from_i_essential: Float[ndarray, "3 3"] | None,
     j_from_i_homography: Float[ndarray, "3 3"] | None,
 ) -> list[TwoViewMotion]:
-    """Return the motions that explain matched directions (x/z, y/z), best first; empty where none fits.
+    """Return the possible motions that explain matched directions (x/z, y/z), best first; empty where none fits.
 
-    The matrices are of normalised coordinates, each where one was found.
+    The matrices, each None if not found, map normalised coordinates.
     """
     found: list[TwoViewMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
@@ -72,10 +72,10 @@ def starting_motions(
     essential: Float[ndarray, "3 3"] | None,
     homography: Float[ndarray, "3 3"] | None,
 ) -> list[tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]]:
-    """Return i_from_j's rotation and direction by the matrices j from i.
+    """Return rotations i_from_j and unit directions from camera i to j, decomposed from the matrices j from i.
 
-    Of an essential matrix's four decompositions the one counts that puts most points in front of both cameras; of a
-    homography's those whose plane lies in front of camera i at every match.
+    An essential matrix gives the one decomposition of four that has most points in front of both cameras. A homography
+    gives those whose plane lies in front of camera i at nearly every match.
     """
     found = []
     if essential is not None:
@@ -98,7 +98,7 @@ def sampson_px(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, " m"]:
-    """Return signed distances of matches from their epipolar lines, both images together."""
+    """Return the signed Sampson distances (px) of matches from the epipolar geometry."""
     essential = skew(direction) @ rotation  # x_i · E x_j = 0
     h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
     line_i, line_j = h_j @ essential.T, h_i @ essential
@@ -112,7 +112,7 @@ def _by_step(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, "m 5"]:
-    """Return the derivatives of `sampson_px` by the step of `_retracted`."""
+    """Return the derivatives of `sampson_px` by the five components of the step in `_retracted`."""
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
     essential = of_direction @ rotation
     by_step = np.concatenate(
@@ -131,7 +131,7 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return the length of the gradient of x_i · E x_j by the four coordinates of a match."""
+    """Return the length of the gradient of x_i · E x_j with respect to the four coordinates of a match."""
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
@@ -142,7 +142,7 @@ def _least_squares_motion(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> TwoViewMotion | None:
-    """Refine a motion over five numbers under a Cauchy loss, whose scale is estimated in turn."""
+    """Refine a motion by five parameters under a Cauchy loss, whose scale is estimated alternately."""
     if len(ray_i) < 8:
         return None
     at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)
@@ -175,7 +175,7 @@ def _retracted(
 
 
 def _sideways(direction: Float[ndarray, "3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return two unit vectors across a direction and each other."""
+    """Return two unit vectors that are orthogonal to a direction and to each other."""
     across_with = skew(direction)
     one = _unit(across_with[:, int(np.argmin(np.abs(direction)))])
     return one, across_with @ one

