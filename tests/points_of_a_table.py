@@ -22,7 +22,7 @@ GRIPPER_FROM_CAMERA = transform(rotation_exp(np.array([0.1, -0.2, 0.4])), np.arr
 class PointsOfATable:
     """Features that match without error, of points along a table; a camera sees a fifth of its length."""
 
-    every_pair = 12
+    every_pair, farthest = 12, 0.7
 
     def __init__(self, minds_roll: bool) -> None:
         rng = np.random.default_rng(0)
@@ -44,6 +44,10 @@ class PointsOfATable:
             seen = np.flatnonzero(((x_px > 0) & (x_px < [639, 479])).all(1))
             self.ids.append(seen)
             self.x_px.append(x_px[seen] + rng.normal(scale=0.3, size=(len(seen), 2)))
+        of_point = rng.normal(size=(len(points), 32)).astype(np.float32)
+        of_point /= np.linalg.norm(of_point, axis=1, keepdims=True)
+        self.descriptors = [of_point[seen] for seen in self.ids]
+        self.asked: dict[bool, list[Key]] = {True: [], False: []}
 
         self.base_from_gripper: Transforms = self.base_from_camera @ inverse(GRIPPER_FROM_CAMERA)
 

@@ -8,7 +8,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from scipy.ndimage import binary_dilation, label
 
@@ -44,6 +44,10 @@ class Features(Protocol):
 
     x_px: list[Float[ndarray, "_ 2"]]
     """Keypoints of every image found so far, px; pixel centres are whole numbers."""
+    descriptors: list[Float32[ndarray, "_ d"]]
+    """Descriptors of these keypoints, of unit length."""
+    farthest: float
+    """Largest distance of the descriptors of a match."""
 
     @property
     def minds_roll(self) -> bool:

@@ -72,6 +72,7 @@ class SiftFeatures:
 
     minds_roll = False
     every_pair = 24
+    farthest = FARTHEST
 
     def __init__(
         self,

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -38,6 +38,10 @@ MULTIPLE = 32
 """Divisor, px, of the image sides that the network accepts."""
 LEAST_SCORE = 0.05
 """Threshold of the keypoint heat map, as published."""
+LENGTH = 64
+"""Length of a descriptor."""
+FARTHEST = 0.6
+"""Largest distance of the descriptors of a match: the published cosine of 0.82."""
 SHA256 = {
     "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
     "xfeat-lighterglue.pt": "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
@@ -161,6 +165,7 @@ class LearnedFeatures:
 
     minds_roll = True
     every_pair = 12
+    farthest = FARTHEST
 
     def __init__(self, images: Sequence[UInt8[ndarray, "h w 3"]], report: Progress = silent) -> None:
         """Load the networks; keypoints are found when pairs are matched."""
@@ -170,6 +175,8 @@ class LearnedFeatures:
         """Keypoints by row of the image and angle (degrees) of its rotation."""
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Keypoints of every image at all angles, px; pixel centres are whole numbers."""
+        self.descriptors: list[Float32[ndarray, "_ d"]] = [np.zeros((0, LENGTH), np.float32) for _ in images]
+        """Descriptors of these keypoints, of unit length."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its two images before."""
@@ -191,6 +198,7 @@ class LearnedFeatures:
             ):
                 self._sets[row, degrees] = _Keypoints(len(self.x_px[row]), x_px, descriptor, size)
                 self.x_px[row] = np.concatenate([self.x_px[row], given_px])
+                self.descriptors[row] = np.concatenate([self.descriptors[row], descriptor.numpy()])
             found = pool.map(of_pair, rotated)
             return [rows for _, rows in zip(steps(self._report, "matching", pairs), found, strict=True)]
 

@@ -37,13 +37,12 @@ from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
 from jcr.features.stage import Matched, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
+from jcr.sfm.missing_images import model_near_cameras, with_missing_images
 from jcr.sfm.model import (
     ENOUGH,
-    ROUGHLY,
     adjust_robustly,
     colmap_camera,
     intrinsics_of,
-    model_near_cameras,
     observations,
     poses_of,
     quiet_colmap,
@@ -62,6 +61,8 @@ cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
 _MANY, _GROWN = 40, 1.3
 """Number of images above which COLMAP adjusts all only after growth by the second (its default is 1.1)."""
+_ROUGHLY = 1e-3
+"""Relative change of the cost that ends the adjustment before the last one."""
 _MOST_OBSERVATIONS = 60_000
 """Largest number of observations of a map; the robot's errors limit what more could add."""
 _MOST_MATCHED = 120_000
@@ -155,7 +156,7 @@ def _adjusted(
 ) -> Reconstruction:
     """Return cameras and tracks of a model after alignment of its observations and the last adjustment."""
     _thin(model, seed)
-    adjust_robustly(model, known, ROUGHLY)
+    adjust_robustly(model, known, _ROUGHLY)
     std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
     adjust_robustly(model, known)
     intrinsics, notes = intrinsics_of(model.camera(1), like, known), ()
@@ -196,7 +197,7 @@ def map_images(
     report: Progress,
     begun: pycolmap.Reconstruction | None = None,
 ) -> tuple[Matched, pycolmap.Reconstruction | None]:
-    """Match the images, and map the pairs by COLMAP's mapper.
+    """Match the images, and map the pairs by COLMAP's mapper, then by predicted cameras of the images it left out.
 
     `cameras` are tried in turn, after the intrinsics by the gripper's angles where none are given. A map that is `begun`
     is continued with the images that it lacks and that match others.
@@ -220,6 +221,8 @@ def map_images(
         if model is None or model.num_reg_images() < matching:
             some = cameras if model is None else [model.camera(1)]
             model = _map_incrementally(database, some, matcher, report, model)
+        if model is not None and model.num_reg_images() < matching:
+            model = with_missing_images(database, model, base_from_gripper, matcher)
     return matched, model
 
 

@@ -25,13 +25,6 @@ from jcr.records import Intrinsics, Reconstruction, Tracks
 ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
-ROUGHLY = 1e-3
-"""Relative change of a cost that ends an adjustment before the last one."""
-PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
-"""Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
-adjustment after it, for cameras that are predicted."""
-LEAST_POINTS = 15
-"""Least number of points of an image whose camera is predicted."""
 
 
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
@@ -176,32 +169,6 @@ def triangulated_model(
         return pycolmap.triangulate_points(
             model, database, folder, Path(folder), refine_intrinsics=False, options=options
         )
-
-
-def model_near_cameras(
-    database: Path,
-    camera: pycolmap.Camera,
-    recon_from_camera: Mapping[int, Float[ndarray, "4 4"]],
-    known: bool,
-) -> pycolmap.Reconstruction:
-    """Return a model of predicted cameras, by row, adjusted to all verified matches, without images of few points.
-
-    Points are triangulated and adjusted in turn; intrinsics that are `known` stay.
-    """
-    model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
-    for largest_px, refinements, scale_px in PASSES:
-        model = triangulated_model(database, camera, cameras, largest_px, refinements)
-        for row in cameras:
-            if model.image(row + 1).num_points3D < LEAST_POINTS:
-                model.deregister_frame(model.image(row + 1).frame_id)
-        if not model.num_reg_images():
-            break
-        adjust_robustly(model, known, ROUGHLY, scale_px)
-        camera, cameras = (
-            model.camera(1),
-            dict(zip(rows_of(model), poses_of(model, rows_of(model)), strict=True)),
-        )
-    return model
 
 
 def adjust_robustly(

@@ -1,0 +1,135 @@
+"""Models near predicted cameras, for images that the mapper left out and for the cameras of a network.
+
+Points are triangulated and adjusted in turn. The mapper's images are predicted by gripper poses and the map's own X, and
+more points of the map are searched near their projections.
+"""
+
+from collections import Counter
+from collections.abc import Container, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from jcr.camera import HALF_PIXEL
+from jcr.estimation.robust import robust_fit
+from jcr.features.matchers import Matcher
+from jcr.geometry import inverse
+from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated_model
+
+PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
+"""Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
+adjustment after it."""
+ROUGHLY = 1e-3
+"""Relative change of the cost that ends these adjustments."""
+LEAST_POINTS = 15
+"""Least number of points of an image that images of the map see, too."""
+LEAST_MAPPED = 4
+"""Least number of mapped cameras from which others are predicted."""
+RADII_PX = (8.0, 4.0)
+"""Largest distances from a projection in turn; the camera is adjusted after each."""
+RATIO = 0.85
+"""Largest ratio of a descriptor's distances to the best and second best keypoint near the projection."""
+LARGEST_PX = 4.0
+"""Reprojection error above which an observation is a mismatch, as COLMAP's."""
+
+
+def with_missing_images(
+    database: Path,
+    model: pycolmap.Reconstruction,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    matcher: Matcher,
+) -> pycolmap.Reconstruction:
+    """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts."""
+    rows = rows_of(model)
+    poses = poses_of(model, rows)
+    if len(rows) < LEAST_MAPPED:
+        return model
+    fit = robust_fit(base_from_gripper[rows], poses)
+    agree, state = fit.problem.used, fit.state
+    assert agree is not None
+    if state.scale <= 0 or agree.sum() < LEAST_MAPPED - 1:
+        return model
+    predicted = inverse(state.z[0]) @ base_from_gripper @ state.x[0]
+    predicted[:, :3, 3] /= state.scale
+    cameras = dict(enumerate(predicted)) | dict(zip(rows, poses, strict=True))
+    larger = model_near_cameras(database, model.camera(1), cameras, matcher.known, rows)
+    if larger.num_reg_images() <= len(rows):
+        return model
+    images = {row + 1 for row in rows_of(larger) if row not in rows}
+    filters = pycolmap.ObservationManager(larger)
+    for radius_px in RADII_PX:
+        for image_id in sorted(images):
+            _complete(larger, image_id, matcher, radius_px)
+        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+        adjust_robustly(larger, matcher.known, ROUGHLY, PASSES[-1][2])
+        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+    return larger
+
+
+def model_near_cameras(
+    database: Path,
+    camera: pycolmap.Camera,
+    recon_from_camera: Mapping[int, Float[ndarray, "4 4"]],
+    known: bool,
+    mapped: Container[int] | None = None,
+) -> pycolmap.Reconstruction:
+    """Return a model of predicted cameras, by row, adjusted to all verified matches; intrinsics that are `known` stay.
+
+    It lacks images with few points; those count that an image of `mapped` (None: any) sees, too.
+    """
+    model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
+    for largest_px, refinements, scale_px in PASSES:
+        model = triangulated_model(database, camera, cameras, largest_px, refinements)
+        tied = Counter[int]()
+        for point in model.points3D.values():
+            seen_by = {element.image_id - 1 for element in point.track.elements}
+            if mapped is None or any(row in mapped for row in seen_by):
+                tied.update(seen_by)
+        for row in cameras:
+            if tied[row] < LEAST_POINTS:
+                model.deregister_frame(model.image(row + 1).frame_id)
+        if not model.num_reg_images():
+            break
+        adjust_robustly(model, known, ROUGHLY, scale_px)
+        camera, cameras = (
+            model.camera(1),
+            dict(zip(rows_of(model), poses_of(model, rows_of(model)), strict=True)),
+        )
+    return model
+
+
+def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
+    """Add the keypoints of one image that match points projected near them."""
+    image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
+    observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
+    free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)
+    point_ids = np.array(sorted(set(model.point3D_ids()) - observed), int)
+    if not len(free) or not len(point_ids):
+        return
+    pose = image.cam_from_world()
+    xyz = np.array([model.point3D(int(one)).xyz for one in point_ids])
+    x_in_camera = xyz @ pose.rotation.matrix().T + pose.translation
+    point_ids, x_in_camera = (part[x_in_camera[:, 2] > 0] for part in (point_ids, x_in_camera))
+    projected = np.asarray(model.camera(image.camera_id).img_from_cam(x_in_camera)).reshape(-1, 2)
+    near = KDTree(x_px[image_id - 1][free] + HALF_PIXEL).query_ball_point(projected, radius_px)
+    # The distances of each point's mean descriptor to the keypoints near its projection; a keypoint has one point.
+    candidates = []
+    for point_id, some in zip(point_ids.tolist(), near, strict=True):
+        if not len(some):
+            continue
+        track = model.point3D(point_id).track.elements
+        mean = sum(descriptors[element.image_id - 1][element.point2D_idx] for element in track)
+        cosine = descriptors[image_id - 1][free[some]] @ (mean / max(float(np.linalg.norm(mean)), 1e-9))
+        distance = np.sqrt(np.maximum(2 - 2 * cosine, 0))
+        first, second = np.sort(np.append(distance, np.inf))[:2]
+        candidates.append((first, second, int(free[some[int(distance.argmin())]]), point_id))
+    taken = set()
+    for first, second, keypoint, point_id in sorted(candidates):
+        if keypoint not in taken:
+            taken.add(keypoint)
+            if first < matcher.features.farthest and first < RATIO * second:
+                model.add_observation(point_id, pycolmap.TrackElement(image_id, keypoint))
