@@ -1,7 +1,6 @@
-"""Estimate of the errors of image observations, one model for every adjustment.
+"""Estimate of the pixel noise: size of the errors of image observations, and correlation between neighbours.
 
-The size comes from the median point, for wrong matches are many; what neighbours share of their errors from sums over
-cells of the images.
+The size comes from the median point, because many matches are wrong. The correlation comes from sums over image cells.
 """
 
 from dataclasses import dataclass, replace
@@ -14,48 +13,49 @@ from jcr.estimation.elimination import point_blocks
 from jcr.least_squares import loss_weight
 
 LOSS_SCALE = 2.0
-"""Cauchy loss: observations count half at this many sigma."""
+"""Scale of the Cauchy loss: residual in standard deviations at which an observation has half its weight."""
 MIN_SIGMA_PX = 0.02
+"""Lower bound of the estimated standard deviation, px."""
 RATIOS = (0.25, 100.0)
-"""Bounds of the ratio of the variances of other groups' observations to those of the first camera."""
+"""Bounds of a group's variance over that of the first camera's features."""
 FAR_OFF = 6.0
-"""Median residuals; seven sigma."""
+"""Residual of an outlier in units of the median residual, about seven standard deviations."""
 COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
-"""Shares of the variance of the median observation that are tried as what all observations have in common."""
+"""Candidate values of `PixelNoise.common`."""
 SCALE_STEPS = 10
+"""Number of reweighted estimates of the variance for each candidate."""
 NEAREST = 0.05
-"""Least depth of an observation as a share of the median depth: no camera focuses on nearer points."""
+"""Smallest depth of an observation over the median depth; a camera does not focus on nearer points."""
 LEAST_LEFT = 0.1
-"""Least share of an observation's variance after its point took its part; below, the residual shows nothing of it."""
+"""Smallest usable share of an observation's variance that remains in its residual after its point was estimated."""
 
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Errors of image observations."""
+    """Sizes of the errors of image observations, and their correlation."""
 
     sigma_px: Float[ndarray, " g"]
-    """Standard deviation of one coordinate by group of observations: the features of each camera, then the corners of
-    boards, which another detector finds."""
+    """Standard deviation of one pixel coordinate for each of g groups: features of each camera, then board corners."""
     inflation: float = 1.0
-    """Factor on the variance of sums of many observations, because neighbours share errors. It is one for all cameras:
-    where points follow the few observations of a camera, its own residuals do not show it."""
+    """Factor on all variances for correlated errors of neighbouring observations. One factor serves all cameras: the
+    residuals of a camera with few observations do not show it."""
     common: float = 1.0
-    """Share of the variance of a median observation that all have alike; the rest is as its match states it."""
+    """Share c of the variance that is equal for all observations; the share 1 − c varies as the matching states."""
 
     def change(self, before: "PixelNoise") -> float:
-        """Return the largest relative change of the sizes."""
+        """Return the largest change of log sigma from an earlier estimate."""
         return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
 
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
-        """Return the variance of each observation's coordinates, px², shape (n,)."""
+        """Return the variance (px²) of each of k observations' coordinates, without the inflation."""
         return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
 
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
     ) -> Float[ndarray, " k"]:
-        """Return the inverse variances of observations under the Cauchy loss.
+        """Return the weights (1/px²): inverse inflated variances times the weight of the Cauchy loss.
 
-        They are 0 for points behind a camera, or so near that no camera is in focus there.
+        Points behind a camera, or nearer than NEAREST of the median depth, have weight 0.
         """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance
@@ -66,34 +66,36 @@ class PixelNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Values of the observations that the estimate needs and no adjustment changes."""
+    """Constant data of k observations for the pixel noise: groups, points, image cells, stated variances."""
 
     camera: Int[ndarray, " k"]
     """Camera of each observation."""
     group: Int[ndarray, " k"]
-    """Group of each observation, as PixelNoise counts them."""
+    """Group of each observation, a row of PixelNoise.sigma_px."""
     groups: int
+    """Number of groups."""
     point: Int[ndarray, " k"]
+    """Point of each observation."""
     cell: Int[ndarray, " k"]
-    """Cell of each observation. The images of a fixed camera show the same features with the same errors: their cells
-    are one."""
+    """Image cell of each observation. All images of a fixed camera share their cells, since the same features have the
+    same errors in each."""
     stated_variance: Float[ndarray, " k"]
-    """Variance that matching states, over that of the median observation."""
+    """Variance stated by the matching, over that of the median observation."""
     median_square: Float[ndarray, " p"]
-    """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
-    views its position takes up 3, but for a corner of a board, whose place is known."""
+    """Median of each point's sum of squared residuals for unit variance: χ² with 2n − 3 degrees of freedom for n views,
+    or 2n for a board corner, whose position is known."""
 
     @property
     def states_variances(self) -> bool:
-        """Whether matching distinguishes the observations."""
+        """Whether the stated variances differ between observations."""
         return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
 
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:
-        """Return the variance of each observation over the median one, all having this share in common."""
+        """Return each observation's variance over that of the median one: common + (1 − common) · stated variance."""
         return common + (1 - common) * self.stated_variance
 
     def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
-        """Return the sum of the squared sums of weighted residuals over cells."""
+        """Return the sum over cells and both axes of the squared sum of weighted residuals `pull`."""
         return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
 
 
@@ -104,12 +106,11 @@ def pixel_noise(
     ratio: Float[ndarray, " g"],
     common: float = 1.0,
 ) -> PixelNoise:
-    """Return the pixel noise from the median point without outliers and from cells of the images.
+    """Return the pixel noise: size from the median point without outliers, inflation from image cells.
 
-    `ratio` is that of the variances of each group's observations to those of the first. With independent errors the
-    squared sum of the weighted residuals over a cell is, on average, the sum of their squares. The factor beyond that
-    is the information that errors shared by neighbours cost the images (variance inflation of cluster sampling; Liang
-    and Zeger, Biometrika 73, 1986).
+    `ratio` (g,) is each group's variance over that of the first. For independent errors, the squared sum of weighted
+    residuals over a cell equals on average the sum of squares; the inflation is the factor beyond (variance inflation
+    of cluster sampling; Liang and Zeger, Biometrika 73, 1986).
     """
     relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
@@ -118,7 +119,7 @@ def pixel_noise(
     factor = float(np.median(squares[clean] if clean.any() else squares))
     noise = PixelNoise(np.maximum(np.sqrt(factor * ratio), MIN_SIGMA_PX), common=common)
     pull = noise.weights(residual_px, depth, layout)[:, None] * residual_px
-    # Of points that are all behind their cameras nothing pulls.
+    # All weights are 0 if all points are behind their cameras.
     inflation = layout.squares_of_cells(pull) / max(float((pull**2).sum()), 1e-300)
     return replace(noise, inflation=max(1.0, inflation))
 
@@ -132,11 +133,11 @@ def refined_noise(
     starts: Int[ndarray, " p"],
     known: Float[ndarray, "p 3 3"] | None = None,
 ) -> PixelNoise:
-    """Return the pixel noise with the variances of each group over those of the first, and of matches as stated.
+    """Return the pixel noise with new estimates of the variance of each group and of the common share.
 
-    Sums of squares are divided by the share of each variance that the leverage of the points left in the residuals: a
-    group whose residuals are small because points follow it is not the better one. `by_point` are derivatives by the
-    points, `starts` each point's first observation, `known` the information that each point has beside its observations.
+    Squared residuals are corrected for the leverage of the points, which follow groups with few observations.
+    `by_point` are derivatives by the points, `starts` each point's first observation, and `known` is information about
+    each point other than its observations.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point
@@ -159,9 +160,9 @@ def _common_share(
     left: Float[ndarray, " k"],
     ratio: Float[ndarray, " g"],
 ) -> float:
-    """Return the most likely share of variance that all observations have alike.
+    """Return the likeliest value of `PixelNoise.common` among COMMON, under the t distribution of the Cauchy loss.
 
-    Each share has its most likely size, under the Student's t distribution whose negative logarithm is the loss.
+    `left` is the share of each observation's variance in its residual, `ratio` is that of `pixel_noise`.
     """
     if not layout.states_variances:
         return 1.0
@@ -169,6 +170,7 @@ def _common_share(
     square = (residual_px[shown] ** 2).sum(1) / (ratio[layout.group] * left)[shown]
 
     def cost(common: float) -> float:
+        """Return twice the negative log likelihood of a common share, at its likeliest variance."""
         relative = layout.relative_variance(common)[shown]
         variance = float(np.median(square / relative))
         for _ in range(SCALE_STEPS):

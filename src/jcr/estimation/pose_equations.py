@@ -1,10 +1,10 @@
 """Equations of reported gripper poses, and their linear mixed model with the evidence of images about the rigs.
 
-Each image gives `base_from_gripper · X = Z · S_λ(world_from_rig)`. The first 13 unknowns are steps of
-geometry.retract: of X (6), of the logarithm of the scale λ, of Z (6). Each further arm adds 12.
-The result is the *effective* hand-eye transform: of all (X, Z) the one that best predicts the camera from the reported
-poses over the workspace of the capture, where 1 mm and 2 mrad count alike. A systematic error e leaves
-e' = (I − J A) e of itself, A = (JᵀWJ)⁻¹JᵀW.
+Each image gives `base_from_gripper · X = Z · S_λ(world_from_rig)`. The first 13 unknowns are steps
+(geometry.retract): of X (6), of log λ (1), of Z (6). Each further arm adds 12.
+The *effective* hand-eye transform (X, Z) predicts the camera from the reported poses with the least squared error over
+the workspace of the capture; 1 mm and 2 mrad weigh the same. It absorbs part of a systematic error e of the poses and
+leaves e' = (I − J A) e, A = (JᵀWJ)⁻¹JᵀW.
 """
 
 from dataclasses import dataclass, replace
@@ -43,41 +43,43 @@ from jcr.geometry import (
 from jcr.least_squares import minimise
 
 EFFECTIVE_WEIGHT = np.repeat([1 / 1e-3, 1 / 2e-3], 3)
-"""Weights of errors of position (1/m) and rotation (1/rad) in the effective transform."""
+"""Weights (1/m, 1/rad) of position and rotation errors in the fit of the effective hand-eye transform."""
 LEAST_FREE = 0.4
-"""Least value of one minus the leverage of a pose: a fit to three or four images nearly follows each of them."""
+"""Lower bound of one minus the leverage of a pose; with three or four images the leverage is nearly 1."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Fit of an effective transform to the poses of a capture, s = 6n; the scale is not part of it."""
+    """Linear fit of the effective hand-eye transform (X and Z without scale) to the s = 6n errors of n poses."""
 
     by_unknown: Float[ndarray, "s u"]
-    """J, without the scale: 12 unknowns, and of further arms 12 each."""
+    """J: derivative of the residuals by the u unknowns X and Z, 12 for each arm."""
     fit: Float[ndarray, "u s"]
-    """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
+    """A = (JᵀWJ)⁻¹JᵀW; zero for unused poses."""
     unknowns: int = 13
-    """Number of unknowns of the whole problem, which begin with X, log λ and Z."""
+    """Number p of all unknowns of the problem, which begin with X, log λ and Z."""
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
-        """Return the region of residuals with this derivative by the unknowns of the effective transform."""
+        """Return the fit for residuals with the derivative `by_unknown` by X and Z; `unknowns` is the number of all."""
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
         return Region(by_unknown, fit, unknowns)
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
-        """Return the covariance of the part of a systematic error that the effective transform leaves."""
+        """Return the covariance of e' = (I − J A) e, the part of a systematic error e that X and Z do not absorb.
+
+        `systematic` (s,s) is the covariance of e.
+        """
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
         half = systematic - self.by_unknown @ (self.fit @ systematic)
         return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
-        """Return the covariance of the unknowns for other poses of the region, from E[e'e'ᵀ] of each used pose.
+        """Return the covariance of all p unknowns from the choice of the m poses, given E[e'e'ᵀ] (m,6,6) of each pose.
 
-        The poses of the capture are a sample of the region: a regression on them differs from one on the region by
-        what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
-        1985, "HC3").
+        The poses are a sample of the workspace; other poses would give another effective transform. Residuals are
+        corrected for each pose's leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
         """
         own, m = self._corrected, second_moment.shape[-3]
         spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
@@ -88,7 +90,7 @@ class Region:
 
     @cached_property
     def _corrected(self) -> Float[ndarray, "m u 6"]:
-        """Gain with which each pose's residuals pass into the unknowns, without the pose's own leverage."""
+        """Derivative of the u unknowns by each pose's residuals, divided by one minus the pose's leverage."""
         m = len(self.by_unknown) // 6
         u = self.by_unknown.shape[1]
         own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
@@ -99,11 +101,11 @@ class Region:
 
 
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
-"""Standard deviations (m, rad, log scale) of a prior that only keeps unobservable directions finite."""
+"""Standard deviations of X (m, rad) and log scale in a weak prior, which keeps unobservable directions finite."""
 LARGEST_ROTATION = 0.5
-"""Largest step of a rotation (rad) and of the logarithm of scale: below a half turn."""
+"""Largest component of a rotation step (rad), and largest step of the log scale."""
 ASSUMED_NOISE = (5e-4, np.radians(0.1))
-"""Assumed noise (m, rad) of a robot that has not been measured."""
+"""Assumed random errors (m, rad) of the gripper poses of a robot without an estimate."""
 
 
 def predicted_gripper_poses(
@@ -112,7 +114,7 @@ def predicted_gripper_poses(
     z: Transforms,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n 4 4"]:
-    """Return gripper poses (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
+    """Return predicted gripper poses (...,n,4,4): Z · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
     scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
     return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
 
@@ -125,10 +127,10 @@ def pose_residuals(
     recon_from_camera: Poses,
     exchanged: bool = False,
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Return steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian.
+    """Return steps (m, rad; base axes) from reported to predicted gripper poses, and their derivative by X, log λ, Z.
 
-    `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z
-    gripper_from_recon, and they predict gripper_from_base; the residuals are still those of base_from_gripper.
+    `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z is
+    gripper_from_recon, and the predicted gripper_from_base is inverted before it is compared.
     """
     predicted = predicted_gripper_poses(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
@@ -149,7 +151,7 @@ def pose_residuals(
 def residuals_by_camera(
     x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
 ) -> Float[ndarray, "n 6 6"]:
-    """Return the derivative of `residuals` by a step of each camera."""
+    """Return the derivative of the residuals of `pose_residuals` by a step of each camera pose."""
     base_from_recon = z[:3, :3]
     lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
     j = np.zeros((len(lever), 6, 6))
@@ -160,12 +162,12 @@ def residuals_by_camera(
 
 
 def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
-    """Return the product of a block-diagonal matrix, one block a pose, and a matrix of r = 6n rows."""
+    """Return the product of a block-diagonal matrix with n blocks (6,6) and a matrix of r = 6n rows."""
     return (blocks @ matrix.reshape(len(blocks), 6, -1)).reshape(matrix.shape)
 
 
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
-    """Return the information that keeps unobservable directions of the unknowns of some arms finite."""
+    """Return the information matrix of a weak prior (PRIOR_STD) on each arm's X and on log λ; none on Z."""
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
         std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]
@@ -174,14 +176,14 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Return the share of a step of the arms' unknowns that keeps all rotations within LARGEST_ROTATION."""
+    """Return the largest factor ≤ 1 that keeps rotations and log scale of a step within LARGEST_ROTATION."""
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
 
 
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Return the covariance of X and scale that information and the weak prior leave, in COVARIANCE_ORDER."""
+    """Return the covariance of X and log λ from the information about the 13 unknowns and the weak prior."""
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
 
 
@@ -192,7 +194,7 @@ def paper_residuals(
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
-    """Return the mean δ_t (m) and δ_R (Frobenius norm) of A·X − X·B(λ) over consecutive used images (paper, eq. 16)."""
+    """Return the means over consecutive used images of δ_t (m) and δ_R (Frobenius) of A·X − X·B(λ) (paper, eq. 16)."""
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
     translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()
@@ -201,13 +203,14 @@ def paper_residuals(
 
 @dataclass(frozen=True, eq=False)
 class PoseEquations:
-    """Equations of the reported poses about a state, and the mixed model of those that are used."""
+    """Linearised equations of the reported poses of all arms about a state."""
 
     every: Equations
-    """Equations of all poses; residuals are steps from the reported to the predicted ones, at the mean of the rigs."""
+    """Equations of all poses, used or not; the rigs are at their mean given the images."""
     region: Region
-    """Effective transform of the used poses."""
+    """Fit of the effective hand-eye transform to the used poses."""
     used: Bool[ndarray, " n"]
+    """Mask of the used poses."""
 
     @cached_property
     def equations(self) -> Equations:
@@ -218,7 +221,11 @@ class PoseEquations:
 def reported_poses(
     problem: Problem, state: State
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
-    """Return the residuals of all reported poses, and their derivatives by the arms' unknowns and by their rigs."""
+    """Return the residuals of the n reported poses of all arms, and their derivatives.
+
+    Residuals are steps (m, rad; base axes) from reported to predicted poses. Derivatives are by the u unknowns of the
+    arms, and by a step of each pose's rig.
+    """
     each, begin = [], 0
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
     for k, arm in enumerate(problem.arms):
@@ -234,9 +241,9 @@ def reported_poses(
 
 
 def pose_equations(problem: Problem, state: State, images: ImageEvidence | None) -> PoseEquations:
-    """Return the equations of the reported poses about a state, with the evidence of the images about the rigs.
+    """Return the equations of the reported poses about a state; the rigs are integrated out, given the images.
 
-    Without observations the rigs are where `Problem.known_rigs` has them, with that covariance.
+    If `images` is None, the rigs have the poses and the covariance of `Problem.known_rigs`.
     """
     residual, by_arms, by_rig = reported_poses(problem, state)
     n, arms, free = len(residual), problem.arm_unknowns, problem.free
@@ -288,12 +295,12 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
 
 
 class Fit(NamedTuple):
-    """Transforms with base_from_gripper · `gripper_from_camera` ≈ `base_from_recon` · recon_from_camera."""
+    """Fit of X and Z with base_from_gripper · X ≈ Z · recon_from_camera: gripper_from_camera X, base_from_recon Z."""
 
     gripper_from_camera: Transform
     base_from_recon: Transform
     residual: Float[ndarray, "n 6"]
-    """Steps of `residuals` (m, rad)."""
+    """Residuals of `pose_residuals` (m, rad) at the fit."""
 
 
 def fit_known_scale(
@@ -303,10 +310,10 @@ def fit_known_scale(
     noise: tuple[float, float],
     exchanged: bool = False,
 ) -> Fit:
-    """Return the weighted least-squares fit from `start` (gripper_from_camera, base_from_recon); `noise` in m, rad.
+    """Return the least-squares fit of X and Z from the initial estimate `start` (X, Z), for camera poses in metres.
 
-    Directions that the motions do not determine stay as they are in `start`. `exchanged` is that of
-    `residuals`.
+    `noise` (m, rad) weighs the residuals; `exchanged` is that of `pose_residuals`. Directions that the motions do not
+    determine stay as in `start`.
     """
     weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
 

@@ -1,8 +1,8 @@
-"""Projection of the points of a state into its images, and the derivatives by all columns.
+"""Projection of the points of a state into its images, and the derivatives by all columns of the image equations.
 
-With the projection π and the principal point c of its camera, an image shows a point at x = c + A (π − c) + offset,
-where A = [[e^l, a], [0, e^l]] holds the image's own logarithm of the focal length l and its shear a (rolling
-shutter). A thin prism and the remaining distortion of the camera's model (intrinsics_prior.py) are added.
+An image shows a point at the pixel x = c + A (π − c) + offset, with the projection π and principal point c of its
+camera. A = [[e^l, a], [0, e^l]] contains the image's log focal factor l and its shear a (rolling shutter). A thin prism
+and the remaining distortion of the camera's model (intrinsics_prior.py) are added.
 """
 
 from dataclasses import dataclass
@@ -18,25 +18,27 @@ from jcr.geometry import skew
 from jcr.records import Intrinsics
 
 CENTRE = slice(2, 4)
-"""Principal point among the parameters of a camera."""
+"""Rows of the principal point among the parameters of a camera."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProjectedObservations:
-    """Observed points in the frames of their cameras, and the residuals."""
+    """Projection of k observed points for one state, with residuals."""
 
     cameras: tuple[Intrinsics, ...]
+    """Intrinsics of each camera in this state."""
     from_rig: Float[ndarray, "k 3"]
     """Vector from the rig to the point, rig axes."""
     from_camera: Float[ndarray, "k 3"]
     """Vector from the camera to the point, rig axes."""
     in_camera: Float[ndarray, "k 3"]
+    """Point in the frame of its camera."""
     from_centre_px: Float[ndarray, "k 2"]
-    """Projection by the camera alone, from the principal point."""
+    """π − c: pixel by the intrinsics alone, less the principal point."""
     own_map: Float[ndarray, "k 2"] | None
-    """Factor e^l and shear (px/px) of each observation's image; None where images do not differ from their cameras."""
+    """e^l and a (px/px) of each observation's image; None if no parameters of images are free."""
     residual_px: Float[ndarray, "k 2"]
-    """Projection minus observation."""
+    """Predicted minus observed pixel."""
 
     @property
     def depth(self) -> Float[ndarray, " k"]:
@@ -45,7 +47,7 @@ class ProjectedObservations:
 
 
 def view_of(problem: Problem, state: State) -> ProjectedObservations:
-    """Return the observed points as the state projects them."""
+    """Return the projection of all observed points for a state."""
     observations = problem.observations
     assert observations is not None
     cameras, k = problem.intrinsics(state), len(observations.image)
@@ -85,7 +87,7 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
 def derivatives(
     problem: Problem, state: State, view: ProjectedObservations, weight: Float[ndarray, " k"]
 ) -> Derivatives:
-    """Return residuals of the observations and their derivatives by all parameters, times the roots of the weights."""
+    """Return residuals of observations and board corners with their derivatives, times the roots of the weights."""
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
     shared = np.zeros((len(weight), 2, columns.first_rig))
@@ -122,7 +124,7 @@ def derivatives(
 
 
 def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
-    """Return the distance of corners from the shape of their boards, in standard deviations."""
+    """Return the residual of each board corner from its board's shape, in standard deviations, along board axes."""
     if problem.boards is None:
         return np.zeros((0, 3))
     shape = state.camera_steps[problem.columns.boards]
@@ -130,7 +132,7 @@ def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
 
 
 def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative of every observation by its point, world axes."""
+    """Return the derivative (px per unit) of each observation by its point, in world axes."""
     out = _by_rig(problem, state, view)
     for pose, rows in zip(state.world_from_rig, problem.seen.rows, strict=True):
         out[rows] = _rotated(out[rows], pose[:3, :3])
@@ -138,7 +140,7 @@ def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Fl
 
 
 def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative of every observation by its point, rig axes."""
+    """Return the derivative (px per unit) of each observation by its point, in rig axes."""
     out = np.empty((len(view.in_camera), 2, 3))
     for camera, mount, rows in zip(view.cameras, state.rig_from_camera, problem.camera_rows, strict=True):
         out[rows] = _rotated(by_point(camera, view.in_camera[rows]), mount[:3, :3])
@@ -146,7 +148,7 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
-    """Return the derivative of every observation by the steps of cameras and images."""
+    """Return the derivative (px) of each observation by the l columns of `Problem.directions`."""
     directions, own_map = problem.directions, view.own_map
     out = np.zeros((len(view.in_camera), 2, directions.shape[1]))
     for camera, own, rows in zip(view.cameras, problem.parameters_of, problem.camera_rows, strict=True):
@@ -155,7 +157,7 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
         by_camera = by_parameters(camera, view.in_camera[rows]) @ along
         if own_map is not None:
             by_camera = _mapped(own_map[rows], by_camera - along[CENTRE]) + along[CENTRE]
-            # The shear is counted in focal lengths, and grows with it.
+            # The shear is a multiple of the focal length, so it changes with fx.
             by_camera[:, 0] += (own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx)[:, None] * along[
                 0
             ]
@@ -164,13 +166,13 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
         return out
     assert problem.observations is not None
     first, image = problem.parameters_of[-1].stop, problem.observations.image
-    # Parameters of images are freed by themselves.
+    # No column frees parameters of images together with intrinsics, so that these columns are contiguous.
     columns = _slice(directions[first:])
     about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
     focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, -1, of_images.shape[1])
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
     width = _of_camera(problem, [camera.width for camera in view.cameras])
-    # One block at a time: of hundreds of images each has hundreds of megabytes.
+    # Each parameter is added in turn: with hundreds of images one term takes hundreds of megabytes.
     by_image += (own_map[:, :1] * about)[..., None] * focal[image][:, None]
     by_image[:, 0] += shear_px[:, None] * sheared[image]
     for axis, one in enumerate(offset):
@@ -181,23 +183,23 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
 
 
 def _slice(directions: Float[ndarray, "r l"]) -> slice:
-    """Return the columns from the first to the last that is not 0."""
+    """Return the slice from the first to the last column that is not zero."""
     columns = np.flatnonzero(directions.any(0))
     return slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)
 
 
 def _mapped(own_map: Float[ndarray, "k 2"], v: Float[ndarray, "k 2 p"]) -> Float[ndarray, "k 2 p"]:
-    """Return A v for each observation."""
+    """Return A v for each observation, A = [[e^l, a], [0, e^l]] with (e^l, a) in `own_map`."""
     out = own_map[:, :1, None] * v
     out[:, 0] += own_map[:, 1:] * v[:, 1]
     return out
 
 
 def _of_camera(problem: Problem, values: list[float] | list[int]) -> Float[ndarray, " k"]:
-    """Return the value of each observation's camera."""
+    """Return for each of k observations the value of its camera; `values` has one per camera."""
     return np.array(values, float)[problem.layout.camera]
 
 
 def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:
-    """Return derivatives by a point in other axes; one product, where NumPy would make one of each observation."""
+    """Return derivatives by a point in b axes, from those in a axes; `rotation` is b_from_a."""
     return (by.reshape(-1, 3) @ rotation.T).reshape(by.shape)
