@@ -1,4 +1,4 @@
-"""Images added to a run after its calibration: a capture folder of their own in the run folder."""
+"""Images that are added to a run after its calibration: a capture folder inside the run folder."""
 
 import tempfile
 from dataclasses import replace
@@ -19,9 +19,10 @@ FOLDER, OWNER = "added", "added_to"
 
 
 def read_added(run_folder: Path, capture: Capture) -> Capture:
-    """Read the images added to a run of the capture so far, oldest first; none where nothing was added.
+    """Read the images that were added to a run, oldest first; return a capture without images if none was added.
 
-    Raises InputError where one is gone, or where they were added to the run of another capture.
+    Raises InputError if an image file is missing, or if the images were added to the run of another capture than
+    `capture`.
     """
     folder = run_folder / FOLDER
     file = folder / capture_json.FILE
@@ -38,9 +39,10 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
 
 
 def with_added_images(added: Capture, path: Path, options: ReadOptions | None = None) -> Capture:
-    """Return the added images and those of one more capture, which are copied; `write_added` makes them part of the run.
+    """Copy the images of the capture at `path` to the added images; return all added images.
 
-    Raises InputError for images of another size than the run's, and for images that were added before.
+    The run has the new images only after `write_added`. Raises InputError for images of another size than the run's,
+    and for images that were added before.
     """
     with tempfile.TemporaryDirectory(prefix="jcr-added-") as scratch:
         new = read_capture(path, options, into=scratch, at_least=1)
@@ -60,5 +62,5 @@ def with_added_images(added: Capture, path: Path, options: ReadOptions | None = 
 
 
 def write_added(added: Capture, capture: Capture) -> None:
-    """Make the images part of the run, so that each later map has them."""
+    """Write the capture.json of the added images, so that they belong to the run of `capture` and its later maps."""
     capture_json.write(added.folder, added, **{OWNER: str(capture.folder.resolve())})

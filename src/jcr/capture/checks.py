@@ -1,4 +1,4 @@
-"""Checks of all formats: frames that can be used, rigid poses in metres, one camera at one resolution."""
+"""Checks of captures of all formats: readable frames, rigid poses in metres, one camera at one resolution."""
 
 import hashlib
 from collections import Counter
@@ -20,9 +20,10 @@ from jcr.records import Capture
 from jcr.records.capture_json import other_size
 
 ROTATED = {3: "rotated by 180°", 6: "rotated by 90° clockwise", 8: "rotated by 90° counter-clockwise"}
-"""Rotation that shows an image of each EXIF orientation (EXIF 2.32, tag 274); the others mirror it."""
+"""Rotation that shows an image upright, by its EXIF orientation (EXIF 2.32, tag 274). Orientations that are not listed
+mirror the image."""
 SAME_POSE = (0.5e-3, np.radians(0.05))
-"""Position (m) and rotation (rad) within which gripper poses count as the same."""
+"""Position (m) and rotation (rad) within which two gripper poses count as equal."""
 
 
 def checked_capture(
@@ -32,11 +33,11 @@ def checked_capture(
     where: str,
     faults: Mapping[int, str] | None = None,
 ) -> tuple[Capture, list[int]]:
-    """Return a capture of `images` in `folder`, without intrinsics, and its rows among the images and poses.
+    """Check images and gripper poses; return a capture without intrinsics, and the indices of the frames in it.
 
-    Every image is decoded once. A few frames that cannot be used are left out with a note: those of `faults` (row to
-    message), and images that are missing, damaged, of another size, or there twice. Raises InputError where more of
-    them cannot be used; `where` begins the messages, the file that names the images. One image will do here.
+    Every image is decoded once. Frames that cannot be used are left out with a note: those in `faults` (index to
+    message), and images that are missing, damaged, duplicated or of another size. Raises InputError if more frames than
+    `tolerated` are faulty. Messages begin with `where`, the file that names the images. One image is enough here.
     """
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
@@ -79,7 +80,7 @@ def checked_capture(
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
-    """Raise InputError for fewer than `at_least` frames, or too many."""
+    """Raise InputError for fewer frames than `at_least`, or more than MAX_FRAMES."""
     if count > MAX_FRAMES:
         raise InputError(f"{where}: {count} frames; choose {MAX_FRAMES} at most, 8 to 15 are good")
     if count < at_least:
@@ -87,7 +88,7 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError where three gripper poses or more are all the same."""
+    """Raise InputError if three or more gripper poses are all equal within SAME_POSE."""
     steps = np.abs(step_between(base_from_gripper[:1], base_from_gripper)).max(axis=0, initial=0.0)
     metres, radians = steps[:3].max(), steps[3:].max()
     if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:
@@ -99,7 +100,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
-    """Return the EXIF orientation of all images; raise InputError where they differ or mirror the images."""
+    """Return the EXIF orientation that all images share; raise InputError if they differ or it mirrors them."""
     (first, orientation), *others = orientation_of.items()
     remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
     if orientation not in (1, *ROTATED):
@@ -115,7 +116,7 @@ def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
 
 
 def how_rotated(capture: Capture) -> Finding | None:
-    """Return the finding on images that their EXIF tag rotates; None without such a tag."""
+    """Return the finding that the images were rotated by their EXIF tag; None if no image was rotated."""
     if capture.orientation == 1:
         return None
     tag, rotated = float(capture.orientation), ROTATED[capture.orientation]

@@ -1,4 +1,4 @@
-"""Conventions in which robots and their controllers write poses: rows of numbers to transforms and back."""
+"""Pose conventions of robots and their controllers: conversion between rows of numbers and transforms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,43 +13,43 @@ from jcr.errors import InputError
 from jcr.geometry import HUGE, require_rigid, transform
 
 QUATERNION_TOLERANCE = 1e-2
-"""Largest difference of a quaternion's length from 1: three printed digits are within it."""
+"""Largest accepted difference of a quaternion's length from 1; rounding to three digits stays below it."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres in each unit of length."""
 RADIANS_LIMIT = 2 * np.pi + 0.01
-"""Largest angle in radians; the angles of a wrist in degrees are larger."""
+"""Largest plausible angle of a pose in radians; larger numbers are taken for degrees."""
 LEAST_REACH = 0.25
-"""Smallest reach of an arm with a camera, m."""
+"""Smallest reach (m) of an arm with a camera; positions that stay below it if read as mm are taken for cm."""
 METRES_LIMIT = 10.0
-"""Largest distance of a gripper from its base in metres; in millimetres no gripper stays that near."""
+"""Largest plausible distance of a gripper from its base, m; larger numbers are not in metres."""
 QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
-"""Notations of quaternions, and where x, y, z, w stand in each."""
+"""Orders in which a quaternion is written, and the indices of x, y, z, w in each."""
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Notation and units of the poses of one kind of controller."""
+    """Notation and units in which one kind of controller writes a pose."""
 
     columns: tuple[str, ...]
-    """Names of its numbers, in order: position first, unless it is a whole matrix."""
+    """Names of a pose's numbers, in the order in which they are written. The position is first, except in a matrix."""
     rotation: str
-    """Notation after the position: one of QUATERNIONS, `rotvec`, or SciPy's order of Euler angles, lower case about
-    fixed axes, upper case about moving ones; `matrix` of a whole matrix."""
+    """Notation of the rotation: a key of QUATERNIONS, `rotvec`, `matrix`, or SciPy's sequence of Euler angles (lower
+    case: about fixed axes, upper case: about moving axes)."""
     length: str = "m"
     angle: str = "rad"
 
     @property
     def has_angles(self) -> bool:
-        """Presence of angles, which have a unit."""
+        """Presence of numbers with a unit of angle; False for quaternions and matrices."""
         return self.rotation not in (*QUATERNIONS, "matrix")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Return the names of the units of positions and angles, the convention's own or the given: ("mm", "deg")."""
+        """Return the units of positions and angles, such as ("mm", "deg"): `asked`, or for auto the convention's."""
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
     def scales(self, asked: UnitsName) -> tuple[float, float]:
-        """Return metres per unit of position, radians per unit of angle."""
+        """Return metres per unit of position and radians per unit of angle, for the units of `units(asked)`."""
         length, angle = self.units(asked)
         return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
@@ -84,11 +84,11 @@ OF_ARM = (
     | dict.fromkeys(("xarm6", "xarm7"), "xarm")
     | {"z1": "unitree"}
 )
-"""Convention of the controller of each arm of estimation.arms.ROBOT_NAMES."""
+"""Name in CONVENTIONS of each arm's controller; the arms are those of estimation.arms.ROBOT_NAMES."""
 
 
 def units_of(convention: str) -> str:
-    """Return the units of a convention's numbers as text: "m, rad", "mm, °", or "m" without angles."""
+    """Return the units of a convention as text: "m, rad", "mm, °", or "m" if it has no angles."""
     form = CONVENTIONS[convention]
     return f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
 
@@ -96,7 +96,7 @@ def units_of(convention: str) -> str:
 def numbers_from_poses(
     base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
 ) -> Float[ndarray, "n k"]:
-    """Return rows in a convention's columns, the inverse of `poses_from_numbers`."""
+    """Write poses as rows of numbers in a convention's columns; the inverse of `poses_from_numbers`."""
     form = CONVENTIONS[convention]
     position_unit, angle_unit = form.scales(units)
     position = base_from_gripper[:, :3, 3] / position_unit
@@ -114,7 +114,7 @@ def numbers_from_poses(
 def poses_from_numbers(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> Float[ndarray, "n 4 4"]:
-    """Return base_from_gripper (n,4,4) of rows as `checked_rows`; raise InputError where a row is no pose."""
+    """Convert rows of numbers in a convention's columns to base_from_gripper; raise InputError if a row is no pose."""
     poses, faults = checked_rows(numbers, convention, units, where)
     if faults:
         raise InputError(faults[min(faults)])
@@ -124,10 +124,10 @@ def poses_from_numbers(
 def checked_rows(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
-    """Return base_from_gripper (n,4,4) of rows in a convention's columns, and the messages of rows that are no pose.
+    """Convert rows of numbers in a convention's columns to base_from_gripper; return also the faults of the rows.
 
-    The pose of such a row is NaN. `units` other than auto override the convention's own. Raises InputError on units
-    that cannot be meant.
+    The faults map the index of each row that is no pose to a message; its pose is NaN. `units` other than auto replace
+    the convention's units. Raises InputError if the size of the numbers contradicts the units.
     """
     form = CONVENTIONS[convention]
     per_m, per_rad = form.scales(units)
@@ -166,12 +166,12 @@ def checked_rows(
 
 
 def tolerated(count: int) -> int:
-    """Return how many of a number of frames may be left out as faulty; more of them have a common cause."""
+    """Return how many faulty frames of `count` may be left out; a larger number indicates a common cause."""
     return max(1, count // 4)
 
 
 def far_faults(position: Float[ndarray, "n 3"], where: str, names: Sequence[str]) -> dict[int, str]:
-    """Return the messages of single rows too far from the base for metres; raise InputError where many are."""
+    """Return a message for each row whose position is over METRES_LIMIT from the base; raise InputError if many are."""
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
     if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
@@ -194,7 +194,7 @@ def _require_units(
     units: UnitsName,
     where: str,
 ) -> None:
-    """Raise InputError on units that cannot be meant, by positions (m) and the numbers of the rotations."""
+    """Raise InputError if positions (m) or the numbers of rotations (`rest`) are too large or small for the units."""
     per_m, per_rad = form.scales(units)
     farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0)) / per_m
     largest = float(np.abs(rest).max(initial=0.0)) if form.has_angles else 0.0

@@ -15,38 +15,39 @@ from jcr.files import require_file
 from jcr.records.capture_json import other_size
 
 MAX_PIXELS = 64_000_000
-"""Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
+"""Largest number of pixels of an image; no wrist camera has more, and larger files may be decompression bombs."""
 BLURRED = 0.25
-"""Share of the usual sharpness below which an image is called blurred."""
+"""Sharpness below which an image is blurred, as a share of the median sharpness of the capture's images."""
 ORIENTATION = 0x0112
-"""EXIF tag of the orientation."""
+"""EXIF tag that holds an image's orientation."""
 DEFECTIVE = 10_000
-"""Number of pixels of which one may be defective."""
+"""Number of pixels of which one may be defective and have any value."""
 BLURRED_EDGE = 1 / 80
-"""Width of the strongest edges of a sharp image, as a share of the long side or of EDGES_AT: those of images of eleven
-real arms took 1/300 to 1/98."""
+"""Largest `edge_width` of a sharp image; images of eleven real arms have 1/300 to 1/98."""
 EDGES_AT = 640
-"""Pixels of the long side at which edges are measured; a smaller image is measured as it is."""
+"""Long side (px) to which images are reduced before edges are measured; smaller images are measured as they are."""
 LEAST_CONTRAST = 20
-"""Grey levels that the strongest edges climb, or there is none to judge by."""
+"""Smallest rise of grey levels across the strongest edges from which their width is measured."""
 ONE_VIEW = 0.25
-"""Share of the sum of the squared details of two images: below 0.1 for images of one place with noise of 6 levels, 0.35
-where the robot holds a board that fills a third of them, above 0.75 between places (fourteen real captures)."""
+"""Largest ratio, in images of one view, of the mean squared difference of details to the sum of both mean squares. On
+fourteen real captures the ratio is below 0.1 for images of one place with noise of 6 levels, 0.35 where the robot holds
+a board that fills a third of them, and above 0.75 between places."""
 USUAL_GREY = 2.0
-"""Least contrast (grey levels) of a detail that is no noise: noise of 4 levels has 0.6 after the filter (Gaussian)."""
+"""Smallest contrast (grey levels) by which details are normalised. Gaussian noise of 4 levels has 0.6 after the
+filter."""
 DEPTH = "depth"
-"""Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where there is none."""
+"""Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
 DARK, BRIGHT = 12, 243
-"""Mean grey levels of 255 beyond which an image shows nothing."""
+"""Mean grey levels (0 to 255) below and above which an image is too dark or too bright to be used."""
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read RGB (h,w,3) uint8, rotated upright by its EXIF tag; raise InputError where the file is no readable image."""
+    """Read an image as RGB, rotated upright by its EXIF tag; raise InputError if the file is not a readable image."""
     return read_oriented(path)[0]
 
 
 def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
-    """Read an image as `read_image`, and the EXIF orientation of its file: 1 as the sensor has it."""
+    """Read an image as `read_image` does; return also the EXIF orientation of its file, 1 if it needs no rotation."""
     require_file(path)
     try:
         with warnings.catch_warnings():
@@ -59,7 +60,7 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
-                # Pillow's mode of coloured 16-bit images does not tell, and it keeps 8 of their bits.
+                # Pillow reads coloured 16-bit images with a mode of 8 bits; only the tile names the 16 bits.
                 is_deep = ";16" in str(opened.tile) or opened.mode[0] in "IF"
                 opened.load()
                 orientation = opened.getexif().get(ORIENTATION, 1)
@@ -74,16 +75,17 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
         raise
     except Image.DecompressionBombError:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
-    except Exception as error:  # decoders raise whatever a damaged file makes them
+    except Exception as error:  # decoders raise errors of many types for a damaged file
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
     return pixels, orientation if orientation in range(1, 9) else 1
 
 
 def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
-    """Read the upper eight bits in use of a 16-bit image: sensors of 8, 10, 12 or 14 bits fill the lower ones.
+    """Read a 16-bit image and return the upper eight of the bits that its pixel values use.
 
-    Single defective pixels, which may have any value, do not count. Raises InputError for fractions and for more than
-    16 bits: which values are black and white is not in the file.
+    Sensors of 8, 10, 12 or 14 bits fill only the lower bits of a 16-bit file. Single defective pixels, which may have
+    any value, are ignored. Raises InputError for pixels that are fractions or have more than 16 bits, because such a
+    file does not state its black and white level.
     """
     deep = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if deep is None or deep.dtype != np.uint16:
@@ -98,9 +100,9 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Read the depth along the optical axis (m) at the pixels of images of `size`; 0 where none was measured.
+    """Read the depth along the optical axis (m) at each pixel of a depth image; 0 where none was measured.
 
-    Raises InputError where the file is no 16-bit grey image of that size.
+    Raises InputError if the file is not a 16-bit grey image of `size` (width, height).
     """
     require_file(path)
     if not path.is_file():
@@ -115,7 +117,7 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 
 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
-    """Return the size (px) that all named images have; raise InputError where one has another."""
+    """Return the size (width, height in px) that all images share; raise InputError if one has another size."""
     (first, size), *others = sizes.items()
     if other := [one for one in others if one[1] != size]:
         raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
@@ -123,16 +125,16 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Return the mean grey level, and the variance of the Laplacian, which falls when an image is blurred."""
+    """Return the mean grey level (0 to 255), and the variance of the Laplacian, which falls as blur increases."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
 def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the width of the strongest edges along the axis that is blurred most, as a share of the long side.
+    """Return the width of an image's strongest edges as a share of its long side, along the axis with more blur.
 
-    The width follows from their rise within 2 pixels and within 16: from 1/320 of sharp edges to 1/40; 0 without edges.
-    An image smaller than EDGES_AT counts as of that size.
+    The width follows from the rise of grey levels within 2 pixels and within 16: 1/320 for sharp edges up to 1/40; 0
+    without edges. An image smaller than EDGES_AT counts as an image of that size.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(EDGES_AT / max(grey.shape), 1.0)
@@ -146,18 +148,19 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:
-    """Return whether two images differ by less than their detail, as those of a camera at rest do.
+    """Test whether two images show the same view, as from a camera at rest: their details differ little.
 
-    After a motion by a few pixels the details of some pixels' size have nothing in common.
+    After a motion by a few pixels, the details (structures of a few pixels) of two images have nothing in common.
     """
     one, two = (_detail(image) for image in (first, other))
     return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
 
 
 def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
-    """Return the details of some pixels' size, of which strong ones count as much as those of usual contrast.
+    """Return the band-pass filtered grey image, normalised so that strong details count as much as usual ones.
 
-    Noise is smaller and shading larger. A printed board before the camera must not outweigh the scene behind it.
+    The filter suppresses noise, which is finer, and shading, which is coarser. The normalisation keeps a printed board
+    in front of the camera from outweighing the scene behind it.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
@@ -166,20 +169,20 @@ def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
 
 
 def exposure_fault(brightness: float) -> str | None:
-    """Return what is wrong with an image of that mean grey level; None where it shows something."""
+    """Return "nearly black" or "nearly white" by the mean grey level (0 to 255) of an image; None if exposed well."""
     if DARK < brightness < BRIGHT:
         return None
     return "nearly black" if brightness <= DARK else "nearly white"
 
 
 def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
-    """Return the lossless PNG of grey (h,w) or RGB (h,w,3) pixels."""
+    """Encode grey (h,w) or RGB (h,w,3) pixels as PNG, without loss."""
     bgr = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
     return cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
 
 
 def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
-    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 where it cannot be decoded."""
+    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 if the file cannot be decoded."""
     if not isinstance(image, bytes):
         return brightness_and_sharpness(image)[1]
     bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)

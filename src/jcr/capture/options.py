@@ -9,7 +9,7 @@ import tyro
 MIN_FRAMES = 3
 """Smallest number of frames that can be calibrated."""
 MAX_FRAMES = 1000
-"""Largest number of frames: every image is compared with others, and every pose's errors with all others."""
+"""Largest number of frames; images are compared with each other, and so are the errors of all poses."""
 
 FormatName = Literal[
     "auto", "capture", "table", "samples", "colmap", "bag", "lerobot",

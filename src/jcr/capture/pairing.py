@@ -19,27 +19,31 @@ from jcr.errors import InputError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _LATEST_NS = np.iinfo(np.int64).max
-"""The last nanosecond that fits 64 bits, in the year 2262."""
+"""Largest time stamp (ns) that fits 64 bits, in the year 2262."""
 Paired = tuple[list[str], Float[ndarray, "n 4 4"], Mapping[int, str], tuple[str, ...]]
-"""Images relative to the folder, their base_from_gripper, messages of the rows without one, and notes."""
+"""Image paths relative to the folder, their base_from_gripper, messages by index for images without a usable pose, and
+notes for the user."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTable:
-    """Rows of a file of gripper poses."""
+    """Gripper poses of a file, one row each, with the image name or time stamp of each row where the file has them."""
 
     base_from_gripper: Float[ndarray, "n 4 4"]
     images: tuple[str, ...] | None
-    """Names as they stand in the file."""
+    """Image names as written in the file; None if the file has no such column."""
     stamp_ns: Int[ndarray, " n"] | None
     convention: str
-    """A name of CONVENTIONS."""
+    """Pose convention of the file, a name of CONVENTIONS."""
     faults: Mapping[int, str]
-    """Messages of the rows that hold no pose; their poses are NaN."""
+    """Messages by index for the rows that hold no pose; their poses are NaN."""
 
 
 def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOptions) -> Paired:
-    """Pair the rows of a file of poses with the images of a folder; InputError where they cannot be paired."""
+    """Pair the rows of a pose file with a folder's images by name, else by time stamp, else by order.
+
+    Raises InputError if they cannot be paired.
+    """
     if table.images is not None:
         return _paired_by_name(folder, file, table)
     taken = image_names(folder)
@@ -60,9 +64,10 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
 def paired_by_name(
     names: Sequence[str], poses: Float[ndarray, "n 4 4"]
 ) -> dict[bool, Float[ndarray, "n 4 4"]]:
-    """Return the poses as if listed in the order of the names as numbers (True) or as text (False).
+    """Return the poses as paired if the pose file had listed the images in the order of their names.
 
-    `names` and `poses` are in order; an order that pairs the same rows is left out.
+    Key True: names sorted by the numbers in them; key False: names sorted as text. `names` and `poses` are paired row
+    by row. An order that changes no pair is left out.
     """
     found = {}
     for by_number in (True, False):
@@ -74,23 +79,23 @@ def paired_by_name(
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts names as numbers: img2 before img10."""
+    """Return a sort key that orders names by the numbers in them: img2 before img10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the images of a folder, or of its images/, in the order of their names as numbers."""
+    """Return the paths of the images in a folder or its subfolder images/, relative to the folder, in natural order."""
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     return sorted((str(file.relative_to(folder)) for file in files), key=natural)
 
 
 def stamp_ns(text: str, where: str) -> int:
-    """Return a time stamp in nanoseconds; seconds, milli-, micro- and nanoseconds are distinguished by their size.
+    """Convert the text of a time stamp to nanoseconds; its size distinguishes s, ms, µs and ns.
 
-    Exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
+    The result is exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
     """
-    with suppress(ArithmeticError, ValueError):  # of Decimal each has its own name
+    with suppress(ArithmeticError, ValueError):  # errors of Decimal and int
         value = Decimal(text)
         if (size := abs(value)) < 10**20:
             unit_ns = 10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1
@@ -100,7 +105,7 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
-    """Pair rows with the images that they name, of tools that write other folders, slashes and endings."""
+    """Pair rows with the images that they name, also if folder, slashes, case or file ending of the name differ."""
     assert table.images is not None
     own: dict[str, list[str]] = {}
     for image in image_names(folder):
@@ -108,7 +113,7 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
             own.setdefault(key, []).append(image)
     located = []
     for name in table.images:
-        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
+        plain = PureWindowsPath(name).name  # splits at both kinds of slashes
         like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
         places = (name, f"images/{name}", *(like if len(like) == 1 else ()))
         located.append(next((place for place in places if (folder / place).is_file()), name))
@@ -131,7 +136,7 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
 def _paired_by_time(
     folder: Path, file: Path, table: PoseTable, taken: list[str], options: ReadOptions
 ) -> Paired | None:
-    """Interpolate the poses at images that are named by their time stamps; None where they are not."""
+    """Interpolate the poses at the time stamps in the image names; None if the names are no stamps of that time."""
     assert table.stamp_ns is not None
     try:
         stamps = np.array([stamp_ns(Path(name).stem, str(folder / name)) for name in taken])

@@ -1,4 +1,4 @@
-"""Reading of text, YAML, JSON and arrays from untrusted files: plain data inside the folder, or an InputError."""
+"""Reading of text, YAML, JSON and arrays from untrusted files: plain data, or an InputError."""
 
 import csv
 import json
@@ -16,16 +16,16 @@ from jcr.errors import InputError, first_fault, shown
 from jcr.files import read_bytes, require_file
 
 LONGEST = 255
-"""Bytes of the longest file name that file systems take."""
+"""Largest length of a file name in bytes that file systems accept."""
 MAX_YAML, MAX_JSON = 4_000_000, 32_000_000
-"""Characters of the longest files: a longer one takes long to read, and is no capture."""
+"""Largest number of characters of a YAML and a JSON file; a capture needs fewer."""
 NAMED = 10
-"""Names that a message lists; of more it gives the number."""
+"""Largest number of names that a message lists; the others are counted."""
 _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 def read_text(file: Path, most: int = MAX_JSON) -> str:
-    """Read the text of a file; InputError when it is missing, too long, binary, compressed or not UTF-8."""
+    """Read the text of a file; raise InputError if it is missing, too long, binary, compressed or not UTF-8."""
     try:
         data = read_bytes(file)
     except OSError as error:
@@ -44,21 +44,21 @@ def read_text(file: Path, most: int = MAX_JSON) -> str:
 
 
 def read_lines(file: Path) -> tuple[list[str], list[str]]:
-    """Read the lines of a text, and its comments without their marks; blank lines are left out."""
+    """Read a text file; return its lines, and its comment lines without the leading #. Blank lines are left out."""
     lines = [line.strip() for line in read_text(file).splitlines() if line.strip()]
     comments = [line.lstrip("# ") for line in lines if line.startswith("#")]
     return [line for line in lines if not line.startswith("#")], comments
 
 
 def split_cells(lines: Sequence[str], file: Path) -> tuple[list[str] | None, list[list[str]]]:
-    """Return the header of a table, None where no line is one, and the cells of its rows."""
+    """Split lines of a table into cells; return the header (None without one) and the rows of cells."""
     separator = next((mark for mark in "\t;," if lines and mark in lines[0]), " ")
     try:
         rows = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for line in lines]
     except csv.Error as error:
         raise InputError(f"{file}: not a table ({error}); save it as CSV") from None
     rows = [[cell.strip().strip('"') for cell in row] for row in rows]
-    if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
+    if separator != ",":  # in some countries spreadsheets write a decimal comma
         rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
     if rows and all(number_of(cell) is None for cell in rows[0]):
         return rows[0], rows[1:]
@@ -66,7 +66,7 @@ def split_cells(lines: Sequence[str], file: Path) -> tuple[list[str] | None, lis
 
 
 def number_of(cell: Any) -> float | None:
-    """Return a cell as a number, as Python's own floats are written; None where it is none."""
+    """Return a cell as a float; None if it is not a number in Python's notation."""
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
@@ -74,7 +74,7 @@ def number_of(cell: Any) -> float | None:
 
 
 def read_yaml(file: Path) -> Any:
-    """Read the plain data of a YAML file, a list of several documents; InputError when it is none."""
+    """Read the plain data of a YAML file; several documents become a list. Raise InputError if it is not YAML."""
     import yaml
 
     text = read_text(file, MAX_YAML)
@@ -86,7 +86,7 @@ def read_yaml(file: Path) -> Any:
         ]
         return documents[0] if len(documents) == 1 else documents or None
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        # Besides what is no YAML: dates and characters that are none, thousands of digits or brackets.
+        # Invalid dates and characters, and thousands of digits or brackets, raise other errors than YAMLError.
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or error
@@ -94,7 +94,7 @@ def read_yaml(file: Path) -> Any:
 
 
 def read_json(file: Path) -> Any:
-    """Read the content of a JSON file; InputError on bytes that are not UTF-8 JSON or keys that appear twice."""
+    """Read a JSON file; raise InputError if it is not UTF-8 JSON or has a key twice in one object."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         content = dict(pairs)
@@ -118,13 +118,13 @@ def read_json(file: Path) -> Any:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
+    """Return the first NAMED names as text, separated by commas, and the number of the remaining ones."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
-    """Return the content of a file as its schema has it; raise InputError, begun with `where`, for another one."""
+    """Return a file's content converted by its schema; raise InputError, begun with `where`, if it does not fit."""
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:
         return validate(content)
@@ -133,19 +133,19 @@ def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where
 
 
 def read_npy(file: Path) -> ndarray:
-    """Read the array that numpy.save wrote, never objects; InputError for any other file."""
+    """Read an array that numpy.save wrote; raise InputError for other files and for arrays of Python objects."""
     try:
         require_file(file)
         with file.open("rb") as stream:
             return np.lib.format.read_array(stream, allow_pickle=False)
     except InputError:
         raise
-    except Exception as error:  # NumPy reads a header with Python's own parser, which has errors of its own
+    except Exception as error:  # NumPy parses the header as Python, with errors of many types
         raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
 
 
 def contained(folder: Path, name: str, where: str) -> Path:
-    """Return `folder/name`; InputError when the name is absolute, no file's name, or leads out of the folder."""
+    """Return `folder/name`; raise InputError if the name is absolute, invalid, or leads out of the folder."""
     try:
         longest = max(len(part.encode()) for part in Path(name).parts)
     except ValueError:  # an empty name, or half of a surrogate pair
@@ -161,6 +161,6 @@ def contained(folder: Path, name: str, where: str) -> Path:
         raise InputError(f"{where}: {name!r} is a link that leads back to itself; put a file there") from None
     if not inside:
         raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")
-    if target.exists() and not target.is_file():  # to open a pipe would be to wait for ever
+    if target.exists() and not target.is_file():  # opening a pipe would block for ever
         raise InputError(f"{where}: {name!r} is a folder, a pipe or a device; name the image's file")
     return target

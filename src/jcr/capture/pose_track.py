@@ -1,4 +1,4 @@
-"""Poses of a moving frame at the stamps of images: interpolation of samples, and the tree of ROS's tf."""
+"""Poses of a moving frame at the time stamps of images: interpolated samples, and ROS's tree of tf frames."""
 
 from array import array
 from collections.abc import Callable
@@ -15,22 +15,27 @@ from jcr.geometry import inverse, motion_length, transform
 
 Stamps = Int[ndarray, " n"]
 PosesAt = Callable[[Stamps], tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]]
-"""Poses at stamps (ns), and the distance (ns) of the samples around each; NEVER outside of the recording."""
+"""Function from time stamps (ns) to poses and gaps. A gap is the time (ns) between the two samples around a stamp: 0 at
+a sample, NEVER outside of the recording."""
 
 NEVER = np.iinfo(np.int64).max
 SPEED_OVER_NS = 50_000_000
-"""Time to either side over which speed is measured, ns: long for an encoder's last digit, short for a stop."""
+"""Half of the time (ns) over which speed is measured: long against the resolution of an encoder, short against a
+stop."""
 
 
 class PoseTrack:
-    """Samples of a_from_b in ascending time; the first of those with the same stamp stays."""
+    """Sampled poses a_from_b in ascending time; of samples with the same stamp, the first one is kept."""
 
     def __init__(self, stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> None:
         self.stamp_ns, rows = np.unique(stamp_ns, return_index=True)
         self.a_from_b = a_from_b[rows]
 
     def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return poses at stamps (ns), linear in position and by slerp in rotation, and the gaps (ns) around each."""
+        """Return interpolated poses at time stamps (ns), and the time (ns) between the two samples around each.
+
+        Positions are interpolated linearly and rotations by slerp.
+        """
         before, share, gap = bracket(self.stamp_ns, stamp_ns)
         if len(self.stamp_ns) == 1:
             return np.repeat(self.a_from_b, len(stamp_ns), axis=0), gap
@@ -44,7 +49,10 @@ class PoseTrack:
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Return the row of the sample before each stamp, the share of the way to the next, and their distance in ns."""
+    """Return the row of the sample before each stamp, the fraction of the time to the next sample, and the gap in ns.
+
+    The gap is the time between the two samples around the stamp: 0 at a sample, NEVER outside of the samples.
+    """
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
     width = sample_ns[np.minimum(before + 1, last)] - sample_ns[before]
@@ -55,23 +63,26 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """Return the speed (m/s) of the frame, rotation counted at ARM; at the ends of the recording from one side."""
+    """Return the speed (m/s) of the frame at time stamps (ns); rotation counts as in jcr.geometry.motion_length.
+
+    It is measured over SPEED_OVER_NS before and after each stamp, at the ends of the recording on one side only.
+    """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
 
 
 class TfTree:
-    """Transforms of /tf and /tf_static in plain arrays: an hour of a robot has a few million."""
+    """Transforms of the topics /tf and /tf_static, in plain arrays, because an hour of recording has a few million."""
 
     def __init__(self) -> None:
-        """Start without frames."""
+        """Create a tree without frames."""
         self._parent: dict[str, str] = {}
         self._static: set[str] = set()
         self._samples: dict[str, tuple[array[int], array[float]]] = {}
-        """Stamps (ns), and x, y, z, qx, qy, qz, qw of parent_from_child, of each child."""
+        """Samples of parent_from_child by the child frame: time stamps (ns), and x, y, z, qx, qy, qz, qw of each."""
 
     def add(self, transforms: list[Any], static: bool) -> None:
-        """Add the transforms of one message; a frame has one parent, the last that was given."""
+        """Add the transforms of one message; a new parent of a frame replaces its former parent and samples."""
         for stamped in transforms:
             child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             if self._parent.get(child) != parent:
@@ -84,7 +95,7 @@ class TfTree:
                 self._static.add(child)
 
     def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
-        """Return a function from stamps to gripper poses in the base; InputError where no transforms join the two."""
+        """Return a function from time stamps to base_from_gripper; raise InputError if no transforms join the two."""
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
             if frame is None or frame not in frames:
@@ -119,7 +130,7 @@ class TfTree:
         return poses_at
 
     def _edge(self, child: str, source: Path) -> tuple[PoseTrack, bool]:
-        """Return the samples of parent_from_child of a frame, and whether it is static."""
+        """Return the samples of parent_from_child for a child frame, and whether its transform is static."""
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():

@@ -1,4 +1,4 @@
-"""Reading of captures: the format is recognised by its files, and each format has its own reader."""
+"""Reading of captures: the files show the format, and each format has its own reader."""
 
 import hashlib
 import json
@@ -26,9 +26,9 @@ FORMATS: dict[str, Any] = {
     "colmap": colmap,
     "table": table,
 }
-"""Modules of the formats by name, in the order in which files are tested."""
+"""Reader module of each format, in the order in which the formats are tested."""
 RECORDINGS = ("bag", "lerobot")
-"""Formats whose images are inside a file."""
+"""Formats whose images are stored inside a file and are extracted on reading."""
 
 
 def read_capture(
@@ -39,11 +39,11 @@ def read_capture(
     progress: Progress | None = None,
     at_least: int = MIN_FRAMES,
 ) -> Capture:
-    """Read the capture at a path, in any format of the page `captures`.
+    """Read the capture at a path, in any format of the manual's page `captures`.
 
     The images of a recording (bag, LeRobot) are extracted to the new folder `into`, itself a capture folder. A few
-    frames that cannot be used are left out, each with a note. Raises InputError with the file, the fault and its
-    remedy for any other fault, and where fewer than `at_least` frames remain.
+    frames that cannot be used are left out, each with a note. Raises InputError with the file, the fault and its remedy
+    for any other fault, and if fewer than `at_least` frames remain.
     """
     found = read_source(path, options, into=into, progress=progress, at_least=at_least)
     if isinstance(found, PosePairs):
@@ -61,7 +61,7 @@ def read_source(
     progress: Progress | None = None,
     at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
-    """Read a capture as `read_capture`, or camera poses without images where the file holds these."""
+    """Read a capture as `read_capture` does; return PosePairs if the file has camera poses but no images."""
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
         raise InputError(
@@ -87,7 +87,7 @@ def read_source(
 
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name of the format that the files at a path show; raise InputError when they show none."""
+    """Return the name in FORMATS of the format of the files at a path; raise InputError if they match none."""
     has_poses = options is not None and options.poses is not None
     for name, form in FORMATS.items():
         if form.recognises(path) or (name == "table" and has_poses):
@@ -111,14 +111,14 @@ def format_of(path: Path, options: ReadOptions | None = None) -> str:
 
 
 def _inverted(found: Any, options: ReadOptions) -> Any:
-    """Return the capture with its poses inverted, where the options say so."""
+    """Return the capture with inverted poses if `options.pose_inverted` is set, otherwise unchanged."""
     if not options.pose_inverted:
         return found
     return replace(found, base_from_gripper=inverse(found.base_from_gripper))
 
 
 def _extracted(path: Path, options: ReadOptions, into: Path, form: Any, progress: Progress) -> Capture:
-    """Return the capture of a recording in the folder `into`; read again where its files or the options changed."""
+    """Return the capture of a recording, extracted to `into`; extract again only if its files or options changed."""
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]
     states = [

@@ -1,4 +1,4 @@
-"""Extraction of the best frames of a recording: the arm at rest, sharp images, the least uncertain calibration."""
+"""Extraction of a recording's best frames: arm at rest, sharp image, smallest uncertainty of the calibration."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,23 +22,28 @@ from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
 
 STILL = 0.005
-"""Speed of an arm at rest, m/s, rotation counted at ARM: a tenth of a pixel in 20 ms, half a metre away."""
+"""Speed below which the arm is at rest, m/s, as motion_length counts rotation: in 20 ms a tenth of a pixel at half a
+metre."""
 LOOKS = 5
-"""Number of frames of one stop that are compared for sharpness."""
+"""Number of frames of one stop whose sharpness is compared."""
 SAME_VIEW = 0.005
-"""Smallest distance between two views, m, rotation counted at ARM; the sharpest of nearer frames is kept."""
+"""Smallest distance between two views, m, as motion_length counts rotation; of closer frames only the sharpest is
+kept."""
 WEAK = 1e-6
-"""Information (1/m², 1/rad²) about each unknown before any view, which keeps its covariance finite."""
+"""Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
 BESIDE_ALL_POSES_NS = 1e15
-"""Gap (ns) beyond which the frame is before the first pose or after the last."""
+"""Gap (ns) that is longer than any recording: the frame is before the first pose or after the last."""
 Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
-"""Row of a frame, its encoded file's bytes or RGB pixels, and the file's ending."""
+"""Image of a frame: the frame's row, the bytes of the encoded file or RGB pixels, and the file's ending."""
 Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
 
 
 def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
-    """Return the topic or key that an option asks for, or the only usual one; raise InputError that lists all names."""
+    """Return the topic or key that the user chose, or the only `usual` one; raise InputError that lists all names.
+
+    `what` and `option` name the choice and its command-line option in the message.
+    """
     if asked in names:
         return str(asked)
     if asked is None and len(usual) == 1:
@@ -49,31 +54,32 @@ def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], w
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """Frames of a recording, a row each, whose images are read on demand."""
+    """Frames of a recording, one row each, with gripper poses; images are read on demand."""
 
     source: Path
     options: ReadOptions
     names: Sequence[str]
-    """Names of the frames' files, without their endings."""
+    """File names of the frames, without endings."""
     base_from_gripper: Poses
     speed: Float[ndarray, " n"]
     """Speed of the gripper, m/s, rotation counted as in jcr.geometry.motion_length."""
     gap_ns: Int[ndarray, " n"]
-    """Time between the two poses around each frame; 0 where none is interpolated."""
+    """Time (ns) between the two pose samples around each frame; 0 where the pose is not interpolated."""
     images_of_rows: Callable[[Rows], Iterator[Picture]]
-    """Images of ascending rows, one by one."""
+    """Function that yields the images of the given rows, which are ascending."""
     intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None] = lambda _: None
-    """Intrinsics of images of a size (width, height), where the options name no file with them."""
+    """Function from an image size (width, height) to the recorded intrinsics; used without `options.camera_info`."""
     joints: Float[ndarray, "n j"] | None = None
-    """Joint angles (rad) of the arm in `options.urdf`, where they are known."""
+    """Joint angles (rad) of the arm in `options.urdf`; None if they are unknown."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
-    """Depth (mm) aligned with the frame of a row."""
+    """Function from a row to the depth image (mm) aligned with its frame; None without depth."""
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
-    """Extract the best frames of a recording into the folder `into`.
+    """Write the best frames of a recording to the folder `into`; return them as a capture.
 
-    Raises InputError when the poses of all frames are stale, or when too few frames are still and sharp.
+    Raises InputError if the poses of all frames are stale, if images are missing, or if too few frames are still and
+    sharp.
     """
     options, gap_ns = recording.options, recording.gap_ns
     fresh, limit = gap_ns <= 1e6 * options.max_gap_ms, f"{options.max_gap_ms:.0f} ms"
@@ -133,11 +139,11 @@ def best_frames(
     sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
     count: int,
 ) -> tuple[Rows, tuple[str, ...]]:
-    """Return the rows of the best `count` frames in order of time, and remarks on the choice.
+    """Return the rows of the best `count` frames in order of time, and remarks on the choice for the user.
 
-    `speed` is in m/s with rotation counted at ARM; `sharpness_of` is called once, with ascending rows. A stop gives one
-    frame at most; where there are too few stops, the slowest frames between them are added. Raises InputError when
-    fewer than three frames are left.
+    `speed` is in m/s (rotation as in motion_length). `usable` marks the frames with a valid pose. `sharpness_of` is
+    called once, with ascending rows. A stop gives at most one frame; if there are too few stops, the slowest frames
+    between them are added. Raises InputError if fewer than three frames are left.
     """
     moments = [
         run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]
@@ -187,6 +193,6 @@ def best_frames(
 
 
 def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
-    """Return the unbroken runs of rows where `mask` holds."""
+    """Return the runs of consecutive rows at which `mask` is True."""
     rows = np.flatnonzero(mask)
     return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]

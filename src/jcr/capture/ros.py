@@ -1,4 +1,4 @@
-"""Intrinsics, images and depth of ROS: messages of bags (rosbags) and nodes (rclpy), and camera_info YAML."""
+"""Intrinsics, images and depth from messages of ROS bags (rosbags) and nodes (rclpy), and from camera_info YAML."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,11 +22,12 @@ _ROS_MODELS: dict[str, DistortionModel] = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
-"""Distortion models by their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write fisheye)."""
+"""Distortion models of jcr by their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write
+fisheye)."""
 _Numbers = Annotated[
     list[float], BeforeValidator(lambda array: list(array) if hasattr(array, "__iter__") else array)
 ]
-"""Array of a message."""
+"""Numbers of an array in a message, as a list."""
 
 
 class CameraInfo(BaseModel):
@@ -42,17 +43,18 @@ class CameraInfo(BaseModel):
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """Read the intrinsics of a camera_info YAML for images of `size`; None of a camera that is not calibrated."""
+    """Read a camera_info YAML as the intrinsics of images of `size`; None if the camera was never calibrated."""
     return intrinsics_of_ros(read_yaml(file), size, str(file))
 
 
 def intrinsics_of_ros(
     content: Any, size: tuple[int, int], where: str, is_rectified: bool = False
 ) -> Intrinsics | None:
-    """Return the intrinsics of images of `size`; None for the zeros of a camera that was never calibrated.
+    """Return the intrinsics of images of `size` (width, height); None if all are 0: never calibrated.
 
-    `content` is a CameraInfo message or the content of a YAML. Raises InputError, begun with `where`, for a distortion
-    that jcr does not know, or intrinsics of another resolution.
+    `content` is a CameraInfo message or the content of a YAML file. Rectified images have the intrinsics P and no
+    distortion. Raises InputError, begun with `where`, for an unknown distortion model, or intrinsics of another
+    resolution.
     """
     info: CameraInfo = validated_content(CameraInfo, content, where)
     matrix, model, coefficients = info.k, info.distortion_model, info.d
@@ -93,11 +95,11 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2RGB_UYVY)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2)),
 }
-"""Channels of each encoding of colours, and OpenCV's code of its conversion to RGB; None for RGB itself."""
+"""Channels of each colour encoding of ROS, and OpenCV's code for the conversion to RGB; None if it is RGB already."""
 
 
 def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
-    """Return the RGB image of a sensor_msgs/Image or CompressedImage; raise InputError for what is no colour image."""
+    """Return the RGB image of a sensor_msgs/Image or CompressedImage; raise InputError if it is not a colour image."""
     pixels, _ = image_of(message, "image")
     if isinstance(pixels, bytes):
         decoded = cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -106,14 +108,14 @@ def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
 
 
 def read_ros_camera_info(message: Any) -> Intrinsics | None:
-    """Return the intrinsics of a sensor_msgs/CameraInfo; None of a camera that was never calibrated."""
+    """Return the intrinsics of a sensor_msgs/CameraInfo; None if the camera was never calibrated."""
     return intrinsics_of_ros(message, (message.width, message.height), "camera_info")
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
-    """Return the bytes of an encoded file, or RGB pixels, and the ending of the file.
+    """Return the image of a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    Raises InputError for encodings that are no image (depth) or that jcr does not know.
+    Raises InputError for depth and for encodings that jcr does not read.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)
@@ -133,9 +135,9 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
 
 
 def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
-    """Return the depth (mm) of a sensor_msgs/Image or CompressedImage, 0 where there is none.
+    """Return the depth (mm) of a sensor_msgs/Image or CompressedImage; 0 where none was measured.
 
-    Raises InputError, begun with `where`, for a message that is no depth image.
+    Raises InputError, begun with `where`, if the message is not a depth image.
     """
     if hasattr(message, "format"):
         # compressed_depth_image_transport writes its quantisation before the PNG.
@@ -158,7 +160,7 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return the `used` bytes of each row, which may be padded to `step`; raise InputError where some are missing."""
+    """Return the first `used` bytes of each row, without padding to `step`; raise InputError if some are missing."""
     data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
     if message.step < used or data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")

@@ -1,4 +1,4 @@
-"""Arms in URDF files: chains of rotating joints as the estimation's `Arm`, and gripper poses of recorded joints."""
+"""Arms in URDF files: their kinematic chain as an `Arm`, and gripper poses from recorded joint positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 
 ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 JointSamples = Sequence[tuple[Int[ndarray, " _"], Float[ndarray, " _"]]]
-"""Stamps (ns), ascending, and recorded positions of each joint."""
+"""Time stamps (ns, ascending) and recorded positions of each joint, one pair of arrays per joint."""
 
 
 def load_urdf(file: Path) -> "yourdfpy.URDF":
     """Read the robot of a URDF file, without its meshes.
 
-    Raises InputError where the file is no URDF, or where a joint is not finite and rigid or its joints form a loop.
+    Raises InputError if the file is no URDF, if a joint's origin is not rigid or its axis or limits are invalid, and if
+    joints form a loop.
     """
     import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy
@@ -49,12 +50,12 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
         return yourdfpy.URDF(plain.robot, load_meshes=False, build_collision_scene_graph=False)
     except InputError:
         raise
-    except Exception as error:  # the parser raises whatever its XML library does
+    except Exception as error:  # the XML library raises errors of many types
         raise InputError(f"{file}: not a readable URDF ({error}); expand xacro first") from None
 
 
 def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
-    """Return the joints from the root of a URDF to a link; raise InputError where they lead back to it."""
+    """Return the joints from the root of a URDF to a link, root first; raise InputError if they form a loop."""
     by_child = {joint.child: joint for joint in urdf.robot.joints}
     chain = []
     while link in by_child:
@@ -66,17 +67,17 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
 
 
 def read_chain(file: Path, dof: int) -> Arm:
-    """Read the arm of `dof` joints in a URDF file, as `chain_of`."""
+    """Read the arm of `dof` rotating joints from a URDF file, as `chain_of` does."""
     return chain_of(load_urdf(file), dof, str(file))
 
 
 def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
-    """Return the arm of `dof` joints in a URDF; its gripper frame is the link behind the last joint.
+    """Return the arm of `dof` rotating joints in a URDF; its gripper frame is the link after the last joint.
 
-    Raises InputError, begun with `where`, where there is no such chain or several, or a joint does not rotate.
+    Raises InputError, begun with `where`, if there is no such chain or several, or if a joint does not rotate.
     """
     chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
-    # A chain ends with its last moving joint: links that are fixed behind it belong to the gripper.
+    # A chain ends with its last moving joint: links that are fixed to it belong to the gripper.
     chains = {
         link: chain
         for link, chain in chains.items()
@@ -108,7 +109,7 @@ def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
 
 
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
-    """Return the limits (rad) of a joint, a turn to either side where it has none."""
+    """Return the lower and upper limit (rad) of a joint; ±2π if the URDF states no limits."""
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return ANY_ANGLE
@@ -117,7 +118,7 @@ def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedArm:
-    """Arm of a URDF, its base and gripper frames, and the units in which its joints are recorded."""
+    """Arm of a URDF with its base and gripper links, and the units of its recorded joint positions."""
 
     urdf: "yourdfpy.URDF"
     base: str
@@ -125,12 +126,12 @@ class RecordedArm:
     joints: tuple[str, ...]
     """Names of the joints that move the gripper, in the order of the chain."""
     unit: Float[ndarray, " j"]
-    """Radians or metres per recorded unit of each joint."""
+    """Factor from each joint's recorded unit to radians or, for a sliding joint, metres."""
     turn: Float[ndarray, " j"]
-    """Recorded units of a full turn of each joint; 0 for a sliding joint."""
+    """Full turn of each joint in recorded units; 0 for a sliding joint."""
 
     def columns(self, names: Sequence[str], where: str) -> list[int]:
-        """Return the indices of the arm's joints in recorded `names`; raise InputError where some are missing."""
+        """Return the indices in `names` (recorded joints) of the arm's joints; raise InputError if one is missing."""
         missing = [joint for joint in self.joints if joint not in names]
         if missing:
             raise InputError(
@@ -140,7 +141,7 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Return joint angles (rad) of recorded positions; None where the URDF has no single such chain."""
+        """Convert recorded positions to joint angles (rad); None if the URDF has no such chain of rotating joints."""
         try:
             chain_of(self.urdf, len(self.joints), "the URDF")
         except InputError:
@@ -148,7 +149,7 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Return base_from_gripper (n,4,4) of recorded positions; raise InputError on degrees read as radians."""
+        """Compute base_from_gripper from recorded positions; raise InputError if degrees were taken for radians."""
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(
@@ -163,16 +164,17 @@ class RecordedArm:
     def poses_at(
         self, samples: JointSamples, stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return base_from_gripper at stamps, and the widest gap (ns) of the joints around each."""
+        """Return base_from_gripper at time stamps (ns), and the largest gap (ns) between joint samples around each."""
         recorded, gap = self.interpolated(samples, stamp_ns)
         return self.poses(recorded), gap
 
     def interpolated(
         self, samples: JointSamples, stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
-        """Return recorded positions at stamps, linear between each joint's samples, and the widest gap (ns) around each.
+        """Return recorded positions at time stamps (ns), and the largest gap (ns) between joint samples around each.
 
-        A joint turns the shorter way, also across ±π; each joint may be published by itself.
+        Positions are linear between the samples of each joint, which may be published separately. A joint turns the
+        shorter way, also across ±π.
         """
         rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
         for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):
@@ -186,7 +188,7 @@ class RecordedArm:
 
 
 def read_arm(options: ReadOptions) -> RecordedArm:
-    """Read the arm between the frames of the options; raise InputError where the URDF has no such arm."""
+    """Read the arm between the base and gripper links of the options; raise InputError if the URDF has no such arm."""
     file = options.urdf
     assert file is not None
     urdf = load_urdf(file)

@@ -25,21 +25,21 @@ INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SUFFIXES = (".bag", ".mcap", ".db3")
 ALIGNED = "aligned_depth"
-"""Part of the names of topics whose depth has the pixels of the colour image (realsense2_camera)."""
+"""Part of the topic names of depth images whose pixels coincide with those of the colour image (realsense2_camera)."""
 SAME_MOMENT_NS = 20_000_000
-"""Largest difference between the stamps of the colour and the depth image of one exposure, ns."""
+"""Largest difference (ns) between the time stamps of the colour and the depth image of one exposure."""
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a path is a bag: a folder with a metadata.yaml, or a file."""
+    """Test whether a path is a bag: a folder with a metadata.yaml, or a file with one of SUFFIXES."""
     return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Read the best frames of a bag into the folder `into`; the bag is streamed and never in memory whole.
+    """Read the best frames of a bag into the folder `into`; the bag is streamed, never held in memory as a whole.
 
-    Raises InputError that lists the existing topics or frames where the options name others, and for images whose
-    poses are stale.
+    Raises InputError that lists the existing topics or frames if the options name others, and if the poses of all
+    images are stale.
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
@@ -72,20 +72,20 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
 
 class _Bag:
-    """Open bag, and the content of one pass over its messages other than images."""
+    """Open bag, and the content of all its messages except the images, collected in one pass."""
 
     def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
-        """Read transforms, joint states, CameraInfo and the stamps of the images."""
+        """Read the transforms, joint states, CameraInfo and the time stamps of the images."""
         self.reader, self.path, self.tree = reader, path, TfTree()
         self.stamp_ns, self.log_ns = list[int](), list[int]()
-        """Stamps of the images, and the times at which they were recorded."""
+        """Time stamps (ns) of the images, and the times (ns) at which the images were recorded."""
         self.joints = dict[str, dict[int, float]]()
-        """Positions of each joint by their stamps (ns)."""
+        """Positions of each joint: from the joint's name to a dictionary from time stamp (ns) to position."""
         self.camera_info: Any = None
         self.topic = topic = _camera_topic(reader, options, path)
         self.images = [c for c in reader.connections if c.topic == topic]
         self.depth = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
-        """Connections of depth that has the pixels of the images."""
+        """Connections of the depth images whose pixels coincide with those of the colour images."""
         infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
         info = [c for name in infos for c in reader.connections if c.topic == name and c.msgtype == INFO][:1]
         span = max(reader.end_time - reader.start_time, 1)
@@ -111,7 +111,7 @@ class _Bag:
             raise InputError(f"{path}: topic {topic} has no images; choose another with --camera-topic")
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
-        """Yield connection, time of recording (ns) and content of messages; raise InputError where one is damaged."""
+        """Yield connection, time of recording (ns) and content of messages; raise InputError if one is damaged."""
         try:
             for connection, at, raw in self.reader.messages(connections, **span):
                 yield connection, at, self.reader.deserialize(raw, connection.msgtype)
@@ -123,7 +123,7 @@ class _Bag:
     def pictures(
         self, rows: Int[ndarray, " k"], stamps: Int[ndarray, " n"], log_ns: Int[ndarray, " n"]
     ) -> Iterator[Picture]:
-        """Yield the images of some rows of the recording."""
+        """Yield the images of the given rows; `stamps` and `log_ns` have each row's time stamp and recording time."""
         for row in rows.tolist():
             at = int(log_ns[row])
             for _, _, message in self.messages(self.images, start=at, stop=at + 1):
@@ -132,7 +132,10 @@ class _Bag:
                     break
 
     def depth_near(self, stamp: int, logged: int) -> UInt16[ndarray, "h w"] | None:
-        """Return the depth (mm) of the exposure nearest to a stamp; None where no depth was taken with it."""
+        """Return the depth (mm) of the exposure nearest to a time stamp (ns); None if none is of the same moment.
+
+        The depth images are searched around the recording time `logged` (ns) of the image.
+        """
         span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
         near = [
             (abs(_stamp(message, at) - stamp), connection.topic, message)
@@ -142,7 +145,7 @@ class _Bag:
         return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
-        """Return the intrinsics of CameraInfo; of rectified images P."""
+        """Return the intrinsics of CameraInfo for images of `size`, for rectified images from P; None if unknown."""
         if (info := self.camera_info) is None:
             return None
         where = f"{self.path}: camera_info of {self.topic}"
@@ -151,11 +154,11 @@ class _Bag:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a bag; raise InputError where it is none, or damaged."""
+    """Open a bag and yield its reader; raise InputError if the path is no bag or the bag is damaged."""
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:
-        # Older sqlite3 bags hold no message definitions; those of the standard messages never changed since.
+        # Older sqlite3 bags hold no message definitions; the standard messages have not changed since.
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=standard)
         reader.open()
@@ -172,9 +175,9 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
-    """Return the topic of --camera-topic, or the only one with colour images."""
+    """Return the topic of --camera-topic, or without that option the only topic with colour images."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
-    # A topic /compressed beside its raw topic has the same images once more.
+    # A topic /compressed repeats the images of its raw topic.
     colour = [
         topic
         for topic in topics
@@ -186,7 +189,7 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
 
 
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
-    """Return the connections that carry the robot: tf, or joint states where a URDF is given."""
+    """Return the connections with the robot's poses: tf, or joint states if a URDF is given."""
     if options.urdf is None:
         found = [c for c in reader.connections if c.msgtype in TF]
         if not found:
@@ -198,6 +201,6 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
 
 
 def _stamp(message: Any, log_ns: int) -> int:
-    """Return the stamp (ns) of a message; the time of its recording for drivers that leave the stamp empty."""
+    """Return the time stamp (ns) of a message; the time of its recording if the driver left the stamp empty."""
     stamp = message.header.stamp
     return stamp.sec * 10**9 + stamp.nanosec or log_ns

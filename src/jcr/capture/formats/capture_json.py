@@ -1,4 +1,4 @@
-"""The capture folder: `capture.json` and the images that it names."""
+"""Capture folder: `capture.json` and the images that it names."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ _CAMERAS = TypeAdapter(CameraEntries)
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a path is a folder with a capture.json, or a JSON file with frames."""
+    """Test whether a path is a folder with a capture.json, or a JSON file with the key "frames"."""
     if path.name == FILE or path.suffix.lower() != ".json" or not path.is_file():
         return (path if path.name == FILE else path / FILE).is_file()
     content = read_json(path)
@@ -39,7 +39,7 @@ def recognises(path: Path) -> bool:
 
 
 def read_capture_json(file: Path) -> CaptureFile:
-    """Read a capture.json; raise InputError where the file is none."""
+    """Read a capture.json; raise InputError if the file is missing or does not fit the schema."""
     if not file.is_file():
         raise InputError(f"{file.parent}: holds no capture.json; name a capture folder")
     content = read_json(file)
@@ -49,7 +49,7 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 
 def read_intrinsics(file: Path) -> IntrinsicsEntry:
-    """Read intrinsics from a JSON file that is their entry, or that holds one as "intrinsics"."""
+    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics"."""
     content = read_json(file)
     if isinstance(content, dict):
         content = content.get("intrinsics", content)
@@ -59,13 +59,13 @@ def read_intrinsics(file: Path) -> IntrinsicsEntry:
 
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
-    """Return a frame of a capture.json; raise InputError that names its image where the frame cannot be used."""
+    """Return frame `row` of a capture.json; raise InputError that names its image if the frame cannot be used."""
     where = f"{file}: frame {row} ({_image_name(content, row, file)})"
     return validated_content(FrameEntry, content.frames[row], where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
-    """Read the capture in a folder, or named by its capture.json; no option changes how."""
+    """Read the capture in a folder, or the one of a capture.json; the options have no effect."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     content = read_capture_json(file)
     count = len(content.frames)
@@ -100,7 +100,10 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
 def stated_fields(
     content: CaptureFile, frames: Sequence[FrameEntry], size: tuple[int, int], file: Path
 ) -> dict[str, Any]:
-    """Return the fields of the Capture of some frames that a capture.json states, other cameras apart."""
+    """Return the fields of Capture that a capture.json states for the given frames, without further cameras.
+
+    `size` is the width and height of the images (px); `frames` are those that can be used.
+    """
     angles = [frame.joints for frame in frames if frame.joints is not None]
     joints = np.array(angles) if angles and len(angles) == len(frames) else None
     robot, notes, convention = content.robot, (), content.pose_convention
@@ -122,9 +125,10 @@ def stated_fields(
 
 
 def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool] | None = None) -> Capture:
-    """Return the capture with the cameras of "cameras"; raise InputError, begun with `where`, where they cannot be.
+    """Return the capture with the further cameras of the entry "cameras"; raise InputError if the entry is invalid.
 
-    `used` tells for each frame of the file whether the capture has it, all by default.
+    `used` tells for each frame of the file whether the capture contains it; by default it contains all. Messages begin
+    with `where`.
     """
     entries: dict[str, CameraEntry] = validated_content(_CAMERAS, cameras, f"{where}: cameras")
     own = next((name for name, entry in entries.items() if entry.is_own), None)
@@ -142,7 +146,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
 
 def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
-    """Return a further camera with its images, all of one size."""
+    """Return a further camera from its entry in capture.json; its images must all have one size."""
     poses, frame = None, None
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:
@@ -177,7 +181,7 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
 def _stated_intrinsics(
     stated: CaptureFile | CameraEntry, size: tuple[int, int], where: str
 ) -> dict[str, Any]:
-    """Return the fields `intrinsics` and `intrinsics_std` of a record of images of `size`."""
+    """Return the fields `intrinsics` and `intrinsics_std` of the Capture or CellCamera with images of `size`."""
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
     if std is None:
@@ -194,7 +198,7 @@ def _stated_intrinsics(
 
 
 def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
-    """Return the entries of the intrinsics of a record, the inverse of `_stated_intrinsics`."""
+    """Return the JSON entries of a record's intrinsics and standard deviations; inverse of `_stated_intrinsics`."""
     given, std = record.intrinsics, record.intrinsics_std
     entries: dict[str, Any] = {"intrinsics": None if given is None else IntrinsicsEntry.of(given)}
     if std is not None:
@@ -204,7 +208,7 @@ def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
 
 
 def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
-    """Return the "cameras" of a capture.json; empty where there is only the wrist camera."""
+    """Return the entry "cameras" of a capture.json; empty if the wrist camera is the only one."""
     if not capture.others and capture.mount == "gripper":
         return {}
     entries = {capture.camera_name: CameraEntry(mount=capture.mount)}
@@ -223,7 +227,7 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
-    """Write capture.json for images that lie in `folder` already; `remarks` are keys that readers ignore."""
+    """Write the capture.json of a capture whose images are in `folder` already; readers ignore the `remarks`."""
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}
@@ -245,7 +249,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
 
 
 def origin(folder: Path) -> Path:
-    """Return the table or recording whose frames were copied into a capture folder, or the folder itself."""
+    """Return the table or recording from which a capture folder was made; otherwise the folder itself."""
     try:
         return Path(read_json(folder / FILE)["made_from"][0])
     except (InputError, KeyError, IndexError, TypeError):
@@ -253,9 +257,10 @@ def origin(folder: Path) -> Path:
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
-    """Copy the capture into a folder of its own with a capture.json, unless it has one where it lies.
+    """Copy a capture of another format into `folder` with a capture.json, and return the copy.
 
-    A run whose capture was read from another format can then go on without that format's options.
+    A capture that was read from a capture.json is returned unchanged. A run with the copy can be resumed without the
+    options of the other format.
     """
     if capture.source is None:
         return capture
@@ -267,14 +272,14 @@ def kept(capture: Capture, folder: Path) -> Capture:
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
-    """Return a file of the folder; raise InputError where the folder has no such file."""
+    """Return the path of a file in the folder; raise InputError if the folder has no such file."""
     if not (file := contained(folder, name, where)).is_file():
         raise InputError(f"{where}: {name} is not there; add it, or remove the key")
     return file
 
 
 def _image_name(content: CaptureFile, row: int, file: Path) -> str:
-    """Return the image of a frame; raise InputError where it names none."""
+    """Return the image path of frame `row`; raise InputError if the frame names no image."""
     frame = content.frames[row]
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
         raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')

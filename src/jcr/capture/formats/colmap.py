@@ -1,6 +1,6 @@
-"""COLMAP models with their images, beside a table of gripper poses.
+"""COLMAP models with their images, and a table of gripper poses.
 
-COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from world.
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5) and stores camera_from_world.
 """
 
 from collections.abc import Collection
@@ -26,29 +26,29 @@ if TYPE_CHECKING:
 
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
 _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-"""Camera models of COLMAP whose distortion is one of jcr's."""
+"""Camera models of COLMAP that a distortion model of jcr can represent."""
 
 
 def find_model(path: Path) -> Path | None:
-    """Return the folder of a COLMAP model in or at a folder; None where there is none."""
+    """Return the folder of the COLMAP model at a path or in its usual subfolders; None if there is none."""
     files = (path / place / f"cameras.{end}" for place in _PLACES for end in ("bin", "txt"))
     return next((file.parent for file in files if file.is_file()), None)
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a path is or holds a COLMAP model."""
+    """Test whether a path is the folder of a COLMAP model or contains one."""
     return find_model(path) is not None
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """Read the images that a COLMAP model and a table of gripper poses both know."""
+    """Read the images that have both a camera pose in a COLMAP model and a gripper pose in a table."""
     folder = find_model(path)
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
     names, _ = read_registered_cameras(folder)
     name_of = dict[str, str]()
-    """Names in the model of the images' files."""
+    """Names of the images in the model, by the paths of their files."""
     for name in names:
         beside = f"images/{name}"
         name_of[beside if contained(root, beside, str(folder)).is_file() else name] = name
@@ -72,14 +72,14 @@ def read(path: Path, options: ReadOptions) -> Capture:
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
-    """Read a model; raise InputError where it cannot be read."""
+    """Read a COLMAP model; raise InputError if it cannot be read."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
         return pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises whatever its C++ threw
+    except Exception as error:  # pycolmap passes on C++ exceptions of many types
         reason = str(error).strip().splitlines()[-1:] or ["damaged"]
         raise InputError(f"{folder}: not a readable COLMAP model ({reason[0]}); export it again") from None
     finally:
@@ -87,7 +87,7 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
 
 
 def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
-    """Read the names of the registered images, in order, and their recon_from_camera (n,4,4)."""
+    """Read the names of the registered images, sorted, and recon_from_camera (n,4,4) of each."""
     model = read_model(folder)
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
     if not images:
@@ -98,9 +98,10 @@ def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 
 
 
 def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] | None = None) -> Intrinsics:
-    """Read the intrinsics that the registered images (of these names) of a size (px) share.
+    """Read the intrinsics that all registered images share, or all of those with `names`.
 
-    Raises InputError where they differ, are of another size, or of a model that jcr does not know.
+    Raises InputError if intrinsics differ, are for images of another size than `size` (width, height), or have a
+    distortion model that jcr does not support.
     """
     model = read_model(folder)
     images = [model.image(k) for k in model.reg_image_ids()]

@@ -1,4 +1,4 @@
-"""LeRobot data sets v2.1 and v3.0: videos or images of a wrist camera, with poses or joint angles frame by frame."""
+"""LeRobot data sets v2.1 and v3.0: images or video of a wrist camera, with a pose or joint angles for each frame."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -24,19 +24,19 @@ from jcr.records import Capture
 
 INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
-"""Key of DROID: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
+"""Key of the gripper pose in DROID: x, y, z (m), roll, pitch, yaw (rad) in the robot's base frame."""
 STATE = "observation.state"
 
 
 class Feature(BaseModel):
-    """Kind of number or image that the set records."""
+    """Entry of meta/info.json for one recorded quantity: its type and the names of its numbers."""
 
     dtype: str = ""
     names: Any = None
-    """A list of texts, or one below {"motors": …} or {"axes": …}."""
+    """Names of the numbers: a list of texts, or such a list inside {"motors": …} or {"axes": …}."""
 
     def numbers(self) -> list[str]:
-        """Return the names of the feature's numbers, in lower case; empty where it has none."""
+        """Return the names of the feature's numbers, in lower case; empty if it names none."""
         names = self.names
         while isinstance(names, dict):
             names = next(iter(names.values()), None)
@@ -59,29 +59,29 @@ class Info(BaseModel):
 
 @dataclass(frozen=True)
 class Episode:
-    """Rows of one recording of the set, and the files of its images."""
+    """One recording (episode) of the data set: times and robot states of its frames, and the files of its images."""
 
     index: int
     frame: Int[ndarray, " n"]
-    """Number of each row in the table."""
+    """Value of frame_index of each row in the table."""
     time_s: Float[ndarray, " n"]
-    """Time from the episode's start."""
+    """Time (s) of each frame since the start of the episode."""
     state: Float[ndarray, "n k"]
     table: Path
     video: Path | None
-    """None where the images are in the table."""
+    """Video file of the images; None if the images are stored in the table."""
     video_start_s: float
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a folder is a LeRobot data set."""
+    """Test whether a folder is a LeRobot data set, which has a meta/info.json."""
     return (path / INFO).is_file()
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Read the best frames of the chosen episodes into the folder `into`.
 
-    Raises InputError that lists the existing cameras, states or episodes where the options name others.
+    Raises InputError that lists the existing cameras, states or episodes if the options name others.
     """
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
@@ -115,7 +115,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
 
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """Read episode `index` with the state of `key`; raise InputError when it is not there or damaged."""
+    """Read episode `index` with the robot state `key`; raise InputError if the episode is missing or damaged."""
     has_video = info.features[camera].dtype == "video"
     fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}
     video_fields, start_s = fields, 0.0
@@ -150,7 +150,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 def _read_table(
     path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
-    """Return columns of one episode, of some of its frames where `rows` are given; other rows are never loaded."""
+    """Return the columns of one episode from Parquet, only its frames `rows` if given; nothing else is loaded."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
@@ -163,10 +163,10 @@ def _read_table(
 
 
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
-    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet."""
+    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`."""
 
     def filled(field: re.Match[str]) -> str:
-        """Return the value of a field, with zeros in front where its width says so."""
+        """Return the value of a field, padded with zeros to the width in the template."""
         return str(fields.get(field[1], field[0])).zfill(int(field[2] or 0))
 
     name = re.sub(r"\{(\w+)(?::0?(\d?\d)d)?\}", filled, template)
@@ -176,7 +176,11 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 def _images(
     episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
 ) -> Iterator[Picture]:
-    """Yield the images of the wanted rows among the frames of all episodes, out of their videos or tables."""
+    """Yield the images of the `wanted` rows from the videos or tables of the episodes.
+
+    `rows` are the rows of each episode, counted over all episodes; `wanted` is ascending. `fps` is the frame rate of
+    the videos.
+    """
     for episode, part in zip(episodes, rows, strict=True):
         mine = wanted[np.isin(wanted, part)]
         if len(mine) == 0:
@@ -203,7 +207,7 @@ def _images(
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield the RGB frames at ascending times; raise InputError where there is none within the tolerance."""
+    """Yield the RGB frames at ascending times (s); raise InputError if a time has no frame within the tolerance (s)."""
     av = extra("av", "lerobot", "a video")
     due = time_s.tolist()
     try:
@@ -228,7 +232,10 @@ def _video_frames(
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Return gripper poses from poses or joint angles, and the joint angles (rad) of a chain of rotating joints."""
+    """Return gripper poses from recorded poses or joint angles, and the joint angles (rad), None if unknown.
+
+    Joint angles are known only for a URDF whose gripper is moved by rotating joints.
+    """
     where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:
         arm = read_arm(options)

@@ -1,4 +1,4 @@
-"""YAML and JSON lists of poses as rows of named cells, and the samples of marker-based hand-eye tools.
+"""YAML and JSON lists of poses, and samples of marker-based hand-eye tools, read as rows of named cells.
 
 A list entry is a pose in any of these forms: geometry_msgs/Pose, PoseStamped, Transform and TransformStamped as ROS
 prints them, translation with quaternion, rotation vector or angles, a 3x3 rotation with a translation, a 4x4 matrix
@@ -16,7 +16,7 @@ from jcr.errors import InputError
 
 SUFFIXES = (".yaml", ".yml", ".json", ".samples")
 PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
-"""Keys of a sample's gripper pose and marker pose: MoveIt Calibration, easy_handeye2."""
+"""Keys of the gripper pose and the marker pose in a sample of MoveIt Calibration and of easy_handeye2."""
 _XYZW, _WXYZ = ("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")
 _CELLS_OF_ROTATION = (
     dict.fromkeys(("orientation", "rotation", "quaternion", "quat", "q", "quat_xyzw"), _XYZW)
@@ -24,26 +24,26 @@ _CELLS_OF_ROTATION = (
     | dict.fromkeys(("rpy", "euler", "roll_pitch_yaw"), ("roll", "pitch", "yaw"))
     | {"quat_wxyz": _WXYZ}
 )
-"""Names of a rotation's cells by the name of its key."""
+"""Names of a rotation's cells, by the key of the rotation in the file."""
 Entry = dict[str, Any] | list[Any]
-"""Cells of one pose, texts or numbers: by the names of a table's columns, or in order."""
+"""Cells (texts or numbers) of one pose: a dictionary by the column names of a table, or a list without names."""
 
 
 def read_yaml_or_json(file: Path) -> Any:
-    """Read a YAML or JSON file; several YAML documents (as `ros2 topic echo` prints) are a list."""
+    """Read a YAML or JSON file; several YAML documents (as `ros2 topic echo` prints) become a list."""
     return read_json(file) if file.suffix.lower() == ".json" else read_yaml(file)
 
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
-    """Return the keys of the two poses of each sample; None where a file's content is no list of samples."""
+    """Return the keys of the gripper and the marker pose in a list of samples; None if the content is no such list."""
     first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
 
 def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[str] | None, list[list[Any]]]:
-    """Return the header, None where there is none, and the cells of every pose of a list, as of a table's rows.
+    """Return the header (None without names) and the cells of every pose of a list, like the rows of a table.
 
-    `key` is that of the pose in each entry, where the entry holds several. A cell that an entry lacks is empty.
+    `key` names the pose in each entry if an entry holds several poses. A missing cell is empty.
     """
     entries = _entries(content)
     if not entries:
@@ -72,7 +72,7 @@ def _entries(content: Any) -> list[Any]:
 
 
 def _entry(entry: Any, where: str) -> Entry:
-    """Return the cells of one entry; raise InputError where it holds no pose."""
+    """Return the cells of one entry; raise InputError if it holds no pose, or two values for one cell."""
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
         return entry
     cells = dict[str, Any]()
@@ -88,7 +88,7 @@ def _entry(entry: Any, where: str) -> Entry:
 
 
 def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield names and cells of a pose and of its parts; `key` is the key of the value."""
+    """Yield name and value of each cell of a pose, nested parts included; `key` is the key of `value` in the file."""
     names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}
@@ -113,7 +113,7 @@ def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
-    """Yield the cells of a matrix, of a rotation whose cells have these names, or of a position."""
+    """Yield the cells of a matrix, a rotation or a position; `names` are the cells of a rotation, None without one."""
     rows = [row if isinstance(row, list) else [row] for row in value]
     flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}
     width = {9: 3, 12: 4, 16: 4}.get(len(flat), 0)
@@ -129,5 +129,5 @@ def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[
 
 
 def _is_plain(value: Any) -> bool:
-    """Return whether a value is text or a number."""
+    """Test whether a value is a text or a number, not a truth value."""
     return isinstance(value, str | int | float) and not isinstance(value, bool)

@@ -1,6 +1,7 @@
-"""Samples of marker-based hand-eye tools: gripper and marker poses of the same instants, without images.
+"""Samples of marker-based hand-eye tools: pairs of gripper pose and marker pose, without images.
 
-A marker that stands still is a reconstruction's frame: recon_from_camera is the inverse of camera_from_marker.
+The frame of a marker that does not move serves as the frame of a reconstruction: recon_from_camera is the inverse of
+camera_from_marker.
 """
 
 from pathlib import Path
@@ -23,7 +24,7 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> PosePairs:
     """Read samples of MoveIt Calibration (effector_wrt_world, object_wrt_sensor) or easy_handeye2 (robot, tracking).
 
-    Raises InputError for eye_on_base, where the camera stands beside the robot and `robot` is inverted.
+    Raises InputError for eye_on_base, where the camera does not move with the robot and `robot` is inverted.
     """
     content = read_yaml_or_json(path)
     keys = pair_keys(content)

@@ -1,4 +1,4 @@
-"""Images and a file of gripper poses: CSV and other tables, NumPy arrays, UR's p[…], YAML and JSON lists."""
+"""Images with a file of gripper poses: CSV and other tables, NumPy arrays, UR's p[…], YAML and JSON lists."""
 
 import re
 from collections import Counter
@@ -28,28 +28,29 @@ _IMAGE = (
 )  # fmt: skip
 _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
-"""Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
+"""Conventions that column names identify. Columns rx, ry, rz are not among them: a rotation vector or angles."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 _ALIASES = {
     re.compile(r"(?:[tp]_?|pos_|position_|translation_)([xyz])"): r"\1",
     re.compile(r"(?:q|quat|quaternion|orientation|rotation)_([xyzw])"): r"q\1",
     re.compile(r"(?:rvec|rotvec|r|ur)_([xyz])"): r"r\1",
 }
-"""Usual names of the columns of a position, a quaternion and a rotation vector."""
+"""Patterns of other column names for position, quaternion and rotation vector, and the name that replaces them."""
 _EXPLICIT: dict[str, ConventionName] = {
     "ur_x": "ur", "rvec_x": "rotation-vector", "rotvec_x": "rotation-vector",
 }  # fmt: skip
-"""Conventions of columns whose names alone tell what rx, ry, rz are; `ur_` is what UR's p[…] is read into."""
+"""Conventions that the first rotation column identifies; `ur_x` is the name that is given to the columns of UR's
+p[…]."""
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 
 
 class OpenConventionError(InputError):
-    """Error of poses in columns rx, ry, rz, which are written in one of several conventions."""
+    """Error for poses in columns rx, ry, rz, whose convention is ambiguous."""
 
 
 def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
-    """Return the options that columns rx, ry, rz may need: for each convention those of each unit, first by size."""
+    """Return the options to try for columns rx, ry, rz: one list per convention, with one entry per pair of units."""
     units = [options.pose_units]
     if options.pose_units == "auto":
         units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
@@ -60,12 +61,12 @@ def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a path is or holds a table or list of gripper poses."""
+    """Test whether a path is a file of gripper poses or a folder with one."""
     return (file := find_table(path)) is not None and file.suffix.lower() in SUFFIXES
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """Read a file of poses, or a folder that holds one; the images are in the same folder or in images/."""
+    """Read a file of gripper poses, or a folder that holds one; the images are in the same folder or in images/."""
     file = options.poses or find_table(path)
     if file is None:
         raise InputError(f"{path}: holds no table of poses ({', '.join(TABLES[:4])}); name it with --poses")
@@ -88,14 +89,14 @@ def read(path: Path, options: ReadOptions) -> Capture:
 
 
 def find_table(path: Path) -> Path | None:
-    """Return the file of poses that a path is or holds; None where there is none."""
+    """Return the pose file at a path, or the one in the folder at the path; None if there is none."""
     if path.is_file():
         return path
     return next((path / name for name in TABLES if (path / name).is_file()), None)
 
 
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
-    """Read the poses of a file; InputError naming the column at fault, or the option that it needs."""
+    """Read the poses of a file; raise InputError that names the faulty column or the option to add."""
     if file.suffix in pose_lists.SUFFIXES:
         header, rows = pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     else:
@@ -106,9 +107,9 @@ def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
 def pose_table(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> PoseTable:
-    """Return the poses of rows of cells, NaN for a few rows that hold none; raise InputError where more hold none.
+    """Convert rows of cells to poses, NaN for a few rows without a pose; raise InputError if more rows have none.
 
-    `header` has the names of the columns, None where there are none.
+    `header` has the names of the columns; None if the table has no header.
     """
     if not rows or not rows[0]:
         raise InputError(f"{where}: holds no poses; expected one row per image")
@@ -155,7 +156,7 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the convention that the names of columns show."""
+    """Return the pose convention that column names identify; raise InputError if they identify none."""
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
@@ -171,7 +172,7 @@ def _convention_of(names: Collection[str], where: str) -> ConventionName:
 
 
 def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> UnitsName:
-    """Return the units of a table: those of the options, else those in the names of columns, else auto."""
+    """Return the units of a table: those of the options, else those in its column names (`named`), else auto."""
     if options.pose_units != "auto" or not named:
         return options.pose_units
     length, angle = CONVENTIONS[convention].units()
@@ -183,9 +184,9 @@ def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> 
 def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> tuple[dict[str, tuple[Any, ...]], set[str], ConventionName]:
-    """Return cells by the usual names of their columns, the units in the names, and the convention that is certain.
+    """Return the cells by usual column name, the units in the column names, and the convention, auto if unknown.
 
-    Without a header an image's name or a stamp comes first, then the columns of the convention.
+    Without a header, an image name or time stamp is expected first, then the columns of the convention.
     """
     columns, convention = [tuple(column) for column in zip(*rows, strict=True)], options.pose_convention
     if header is not None:
@@ -221,7 +222,7 @@ def _named_columns(
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
-    """Read the header, None where there is none, and the cells of every row."""
+    """Read the header of a pose file (None without one) and the cells of every row."""
     if file.suffix == ".npy":
         array = read_npy(file)
         if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
@@ -243,7 +244,7 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
 
 
 def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
-    """Return the cells of poses as URScript writes them, p[x, y, z, rx, ry, rz], and of the name or stamp before."""
+    """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp."""
     rows = list[list[str]]()
     for number, line in enumerate(lines, start=1):
         match = _UR_POSE.search(line)
@@ -260,7 +261,7 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name of a column in its usual form, and the unit that follows it."""
+    """Return the usual name of a column and the unit after it: "Pos_X (mm)" gives "x" and "mm"."""
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
