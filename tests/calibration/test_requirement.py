@@ -112,7 +112,8 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
             assert status == 0 and is_shown and "(95 %)" in said.out
             assert (
                 said.out.startswith("ACCEPTED (limit 5 mm, 1°). ")
-                and "\nNext        jcr export out ros2" in said.out
+                and "\nNext        jcr export out ros2  # frames: --parent-frame tool0, --to-root camera_link"
+                in said.out
             )
         else:
             assert status == 3 and not is_shown

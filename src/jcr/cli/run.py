@@ -275,9 +275,9 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     facts = content.as_json()
     if cameras is not None:
         facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
-    following = (
-        f"jcr export {shlex.quote(str(out))} ros2" if content.converged else "jcr docs troubleshooting"
-    )
+    # A driver often publishes the optical frame below a root link of the camera.
+    export = f"jcr export {shlex.quote(str(out))} ros2  # frames: --parent-frame tool0, --to-root camera_link"
+    following = export if content.converged else "jcr docs troubleshooting"
     lines = [line for camera in placed for line in labelled("Camera", _camera_in_words(camera))]
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
