@@ -1,1 +1,1 @@
-"""Captures taken at the robot and calibrated image by image."""
+"""Captures that are taken at the robot and calibrated again after every image."""

@@ -35,20 +35,21 @@ if TYPE_CHECKING:
     from jcr.result import RunResult
 
 OBSERVATIONS = 300, 8000
-"""Observations per image and in all that are used while images are taken; the calibration at the end uses all."""
+"""Largest mean number of observations per image, and largest total, while images are taken; `finish` uses all."""
 FEW = 5
-"""Number of images from which on a missing calibration is a finding."""
+"""Smallest number of images with which a missing calibration is a finding that rejects."""
 MOST_POINTS = 3000
 """Largest number of points in `Progress.points_in_base`."""
 
 
 class LiveCalibration:
-    """Calibration that grows with its capture.
+    """Calibration that is computed again whenever an image is added to its capture or removed from it.
 
     `folder` is the folder of the capture, or its LiveFolder; a capture that was begun there is continued. `intrinsics`
-    are those of the images; None: they are estimated. `robot` names the arm (jcr capture --robot list). `reach` (2,3) is
-    the box (m, base frame) in which gripper poses are proposed. Images and poses are written into the folder when they
-    are added, and jcr.read_capture reads it at any time. Methods may be called from several threads.
+    belong to all images; None: they are estimated. `robot` names the arm (`jcr capture --robot list` shows the names).
+    `reach` (2,3): lower and upper corner of the box (m, base frame) in which gripper positions are proposed. Images and
+    poses are written into the folder when they are added, so that jcr.read_capture can read the capture at any time.
+    Methods may be called from several threads.
     """
 
     def __init__(
@@ -61,9 +62,9 @@ class LiveCalibration:
         reach: ArrayLike | None = None,
         exclusive: bool = False,
     ) -> None:
-        """Open or begin a capture; raise InputError where it cannot be continued, or an option is wrong.
+        """Open or begin a capture; raise InputError if the capture cannot be continued or an option is wrong.
 
-        `exclusive`: raise InputError where another process writes into the folder, and keep others out until `close`.
+        `exclusive`: lock the folder against other processes until `close`; InputError if another one holds the lock.
         """
         self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):
@@ -75,19 +76,19 @@ class LiveCalibration:
             folder = LiveFolder(Path(folder), given, robot)
         self.live = folder
         self._lock = threading.RLock()
-        """Held while the capture, the map or the progress is changed."""
+        """Lock that is held while the capture, the map or `progress` is changed."""
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
         name = self._options.robot or folder.robot
         self.arm = None if name is None else arm_named(name)
         self._box = None if reach is None else np.reshape(np.asarray(reach, np.float64), (2, 3))
-        """Arm that the user or the capture named, and the box of the gripper positions."""
+        """Box (2,3) of the gripper positions that may be proposed (m, base frame); None: unlimited."""
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
         self._refused: list[Float[ndarray, "4 4"]] = []
         self._propose: Callable[[], dict[str, Any]] = dict
-        """Function that returns the next pose, by the last calibration and the gripper poses refused since."""
+        """Function that returns the next pose, from the last calibration and `_refused`, as fields of Progress."""
         self.progress = Progress(images=tuple(folder.names))
 
     def add(
@@ -100,20 +101,20 @@ class LiveCalibration:
         *,
         color: Channels = "rgb",
     ) -> Progress:
-        """Keep an image (h,w,3) uint8 and the gripper pose (4,4) at it, and calibrate with it.
+        """Add an image (h,w,3) uint8 and its gripper pose (4,4) to the capture, and calibrate all images again.
 
-        `joints` are the angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) the image of a
-        depth camera, `color` the order of channels ("bgr" for OpenCV); grey images are converted. Raises InputError
-        that names the image, and leaves the capture as it was, for arrays that are no image or no rigid pose, a pose in
-        another unit than metres, another size than that of the others, and an image that repeats another. Threads may
-        add at once: one of them waits for the other.
+        `joints` are the joint angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) is the image
+        of a depth camera, and `color` is the order of the channels ("bgr" for OpenCV); grey images are converted.
+        Raises InputError for an array that is no image or no rigid pose, a pose that is not in metres, an image of
+        another size than the others, and an image that repeats another. The capture is then unchanged. Several threads
+        may call this at the same time; the calls are served one after the other.
         """
         with self._lock:
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
     def remove(self, index: int) -> Progress:
-        """Remove the image at `index` from the capture, and calibrate without it."""
+        """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image."""
         with self._lock:
             names = self.live.names
             if not -len(names) <= index < len(names):
@@ -122,7 +123,7 @@ class LiveCalibration:
             return self.update()
 
     def undo(self) -> Progress:
-        """Take back the last change since the capture was begun or resumed."""
+        """Undo the last addition or removal of an image since this object was made, and calibrate again."""
         with self._lock:
             self.live.undo()
             return self.update()
@@ -141,7 +142,7 @@ class LiveCalibration:
 
     @one_blas_thread
     def update(self) -> Progress:
-        """Calibrate the images that the folder holds, after some were added or removed there."""
+        """Calibrate the images of the folder again, after `live` was changed, and return the new state."""
         with self._lock:
             capture, before = self.live.capture(), self._mapped
             self._mapped = () if capture is None else capture.images
@@ -163,20 +164,20 @@ class LiveCalibration:
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with a next pose away from a gripper pose at which no image could be kept."""
+        """Return the state with a new proposed pose, distant from a gripper pose at which no image could be kept."""
         with self._lock:
             self._refused.append(base_from_gripper)
             self.progress = replace(self.progress, **self._propose())
             return self.progress
 
     def close(self) -> None:
-        """Remove the files of images that were removed from the capture."""
+        """Delete the files of images that were removed from the capture, and unlock the folder."""
         with self._lock:
             self.live.close()
             self._opened.close()
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
-        """Return the state of the mapped images, calibrated where enough of them registered."""
+        """Return the state of the images in the map, with a calibration if three or more of them are registered."""
         names, self._propose = self._mapped, dict
         state = Progress(images=names, added=added)
         if capture is None or self._map is None:
@@ -194,12 +195,12 @@ class LiveCalibration:
             some = replace(made, tracks=_longest(made.tracks, most))
             with suppress(RejectedError):
                 case = calibrate_case(capture, some, self._options, robot.of(rows))
-        # A model that contradicts the poses gives wrong joint angles.
+        # Joint angles of a kinematic model that contradicts the gripper poses would be wrong.
         arm = self.arm if robot.unused is None else None
         found = None if case is None else case.hand_eye
 
         def propose_next() -> dict[str, Any]:
-            """Return the next pose away from the gripper poses refused until now."""
+            """Return the next pose, distant from all gripper poses in `_refused`, as fields of Progress."""
             return propose(capture, rows, found, case, arm=arm, box=self._box, refused=self._refused)
 
         self._propose = propose_next
@@ -228,10 +229,10 @@ class LiveCalibration:
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
-    """Return the points with the most images, until there are `most` observations.
+    """Return the tracks of all points on a board and of the points with the most observations, up to `most` in sum.
 
-    Among points with equally many images the fraction of a pixel decides: as good as chance, and independent of the
-    order in which the map was grown.
+    Points with equally many observations are ordered by the fractional part of a pixel coordinate: this is as good as a
+    random order, and does not depend on the order of the images.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     fraction = np.ones(len(count))
@@ -243,7 +244,7 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
 
 
 def _points(case: Case) -> Float[ndarray, "p 3"]:
-    """Return points of the scene that three or more images see (m, base frame)."""
+    """Return points (p,3) of the scene that three or more images observe, at most about MOST_POINTS (m, base frame)."""
     tracks, hand_eye = case.reconstruction.tracks, case.hand_eye
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]

@@ -1,4 +1,4 @@
-"""Cameras while a capture is taken: V4L2 devices, streams, RealSense cameras, and video files in their place."""
+"""Cameras of a live capture: V4L2 devices, network streams, RealSense cameras, and video files as a substitute."""
 
 import os
 import threading
@@ -22,15 +22,17 @@ from jcr.extras import extra
 from jcr.records.capture_json import IntrinsicsEntry
 
 TIMEOUT_S = 10.0
-"""Time without an image after which a camera counts as lost."""
+"""Time without an image (s) after which a camera counts as lost."""
 V4L2_MANUAL_EXPOSURE = 1
+"""Value of V4L2's control exposure_auto that selects manual exposure."""
 REALSENSE = "realsense"
-"""Name for `--camera`, followed by `:SERIAL` or `:FILE` where needed."""
+"""Prefix of a RealSense camera in `--camera`; `:SERIAL` or the file of a recording, `:FILE`, may follow."""
 SIZE = (1280, 720)
-"""Default resolution of a RealSense, px, which every D400 gives."""
+"""Default width and height (px) of a RealSense's colour image, available on every D400."""
 DEPTH_LIMIT_MM = 65_535
+"""Largest depth (mm) that a uint16 depth image can store."""
 FITTED_PX = 0.05
-"""Largest difference (px) between OpenCV's coefficients and the maker's distortion."""
+"""Largest accepted difference (px) between OpenCV's distortion, with fitted coefficients, and the maker's model."""
 
 
 @dataclass(frozen=True)
@@ -52,28 +54,31 @@ class Frame:
     image: UInt8[ndarray, "h w 3"]
     """RGB."""
     time_s: float
-    """Time on the camera's own clock."""
+    """Time (s) by this machine's monotonic clock; in a recording, by its frame rate or its time stamps."""
     depth_mm: UInt16[ndarray, "h w"] | None = None
-    """Depth aligned with the image, 0 where there is none; None where the camera measures no depth."""
+    """Depth (mm) at each pixel of the image, 0 where it is unknown; None if the camera measures no depth."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera that is open."""
+    """Open camera: its frames, a function for the newest frame, and the intrinsics that the camera stores."""
 
     frames: Iterable[Frame]
-    """Frames of a device or stream taken after they are requested, never from a buffer; InputError when it is lost."""
+    """Frames; a device or stream takes each one after the request for it. Raises InputError if the camera is lost."""
     latest: Callable[[], Frame | None]
-    """Function that returns the newest frame."""
+    """Function that returns the newest frame, without waiting; None before the first one."""
     intrinsics: IntrinsicsEntry | None = None
-    """Intrinsics, where the camera's maker stored them in it."""
+    """Intrinsics that the maker stored in the camera; None if it stores none that OpenCV's model can express."""
 
 
 class Frames:
-    """Frames of a device or stream, read by a thread that empties the driver's buffer, or of a recording in order."""
+    """Iterator of frames. A thread reads devices and streams, so that their buffers stay empty; recordings need none."""
 
     def __init__(self, read: Callable[[], Frame | None], name: str | None) -> None:
-        """Read by `read`, which waits for the next frame and returns None at the end; `name`: None for a recording."""
+        """Start the thread of a device or stream called `name`; None: a recording, which is read without a thread.
+
+        `read` waits for the next frame and returns it; it returns None at the end.
+        """
         self._read, self._name, self._is_open = read, name, True
         self._arrived, self._frame = threading.Condition(), None
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -81,11 +86,11 @@ class Frames:
             self._thread.start()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame of a device or stream, or the one of a recording that was read last."""
+        """Return the last frame that was read; None before the first one."""
         return self._frame
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames; raise InputError when a device or stream falls silent."""
+        """Yield frames taken after each request; raise InputError if a device or stream gives none for TIMEOUT_S."""
         if self._name is None:
             for frame in iter(self._read, None):
                 self._frame = frame
@@ -107,13 +112,13 @@ class Frames:
             yield frame
 
     def close(self) -> None:
-        """Stop reading."""
+        """Stop reading and wait for the thread to end."""
         self._is_open = False
         if self._name is not None:
             self._thread.join(TIMEOUT_S)
 
     def _watch(self) -> None:
-        """Read frames until the source ends."""
+        """Read frames in the thread, and keep the newest, until the source ends or `close` is called."""
         while self._is_open and (frame := self._read()) is not None:
             with self._arrived:
                 self._frame = frame
@@ -124,9 +129,10 @@ class Frames:
 
 @contextmanager
 def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[Camera]:
-    """Open a camera: a V4L2 device (number), a stream (with ://), `realsense[:SERIAL]`, or else a video file.
+    """Open a camera: a V4L2 device (number), a stream (address with ://), `realsense[:SERIAL]`, or else a video file.
 
-    Raises InputError when it cannot be opened or does not follow the options.
+    Raises InputError if the camera cannot be opened or does not accept the options. The camera is closed at the end of
+    the `with` statement.
     """
     options = options or CameraOptions()
     if source.partition(":")[0] == REALSENSE:
@@ -163,7 +169,10 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
         rate, numbers = video.get(cv2.CAP_PROP_FPS) or 30.0, count()
 
         def read() -> Frame | None:
-            """Return the next frame, stamped when reading began, of a file by its frame rate; None at the end."""
+            """Return the next frame; None at the end.
+
+            Its time is the moment when reading began; in a file it is the frame's number divided by the frame rate.
+            """
             time_s = next(numbers) / rate if is_file else time.monotonic()
             good, pixels = video.read()
             return Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), time_s) if good else None
@@ -174,9 +183,10 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
 
 
 def apply_options(video: Any, options: CameraOptions, source: str) -> None:
-    """Fix size, exposure and focus of a cv2.VideoCapture; raise InputError where the camera does not follow.
+    """Set and fix size, exposure and focus of a cv2.VideoCapture; raise InputError if the camera keeps another value.
 
-    A driver may take a value and not follow it, so each is read back (videoio's page on VideoCaptureProperties).
+    Each value is read back, because a driver may accept a value without applying it (OpenCV, VideoCaptureProperties).
+    `source` is the camera's name in messages.
     """
     if options.camera_size is not None:
         wanted = options.camera_size
@@ -188,7 +198,7 @@ def apply_options(video: Any, options: CameraOptions, source: str) -> None:
                 f"--camera-size {wanted[0]} {wanted[1]}: camera {source} gives {size[0]}x{size[1]}; choose a size that "
                 "v4l2-ctl --list-formats-ext lists"
             )
-    # With the focus the intrinsics change. Not all cameras have a setting for it.
+    # Autofocus is switched off because the focus changes the intrinsics. Some cameras have no such setting.
     video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
     if options.exposure is not None:
         video.set(cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_MANUAL_EXPOSURE)
@@ -206,14 +216,14 @@ def apply_options(video: Any, options: CameraOptions, source: str) -> None:
             )
 
 
-# Intel RealSense cameras with pyrealsense2: images, aligned depth, and the intrinsics stored by the maker.
+# Intel RealSense cameras are read with pyrealsense2: images, aligned depth, and the intrinsics that the maker stored.
 
 
 @contextmanager
 def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
-    """Open the camera with a serial number, the first one where it is empty, or a recording (.bag).
+    """Open a RealSense: `serial` is a serial number, empty for the first camera, or a recording (.bag, .db3).
 
-    Raises InputError when the package or the camera is missing, or the camera does not follow the options.
+    Raises InputError if the package or the camera is missing, or the camera does not accept the options.
     """
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
@@ -238,7 +248,7 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
 
         @stack.callback
         def stop() -> None:
-            """Stop the pipeline, unless it stopped at the end of its recording."""
+            """Stop the RealSense pipeline; ignore the error if it stopped already at the end of its recording."""
             with suppress(RuntimeError):
                 pipeline.stop()
 
@@ -255,14 +265,17 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
 def _realsense_reader(
     rs: ModuleType, pipeline: Any, profile: Any, is_file: bool
 ) -> Callable[[], Frame | None]:
-    """Return a function that reads the next frame, with depth where the camera measures it; None at the end."""
+    """Return a function that reads the next frame, with depth if the camera measures it, and returns None at the end.
+
+    `rs` is the module pyrealsense2; `pipeline` and `profile` are its objects for the opened camera.
+    """
     aligned, has_depth = rs.align(rs.stream.color), False
     with suppress(RuntimeError):
         has_depth = bool(profile.get_stream(rs.stream.depth))
     unit_mm = 1e3 * profile.get_device().first_depth_sensor().get_depth_scale() if has_depth else 1.0
 
     def read() -> Frame | None:
-        """Return the next frame."""
+        """Return the next frame; None if none arrives in time."""
         began = time.monotonic()
         try:
             frames = pipeline.wait_for_frames(int(1e3 * TIMEOUT_S if not is_file else 1e3))
@@ -284,7 +297,7 @@ def _realsense_reader(
 
 
 def _apply_realsense_options(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
-    """Fix exposure and focus; raise InputError where the camera has no such setting or range."""
+    """Set exposure and focus; raise InputError if the camera has no such setting or the value is out of its range."""
     sensor = profile.get_device().first_color_sensor()
     wanted = [
         (rs.option.exposure, options.exposure, "--exposure"),
@@ -302,10 +315,10 @@ def _apply_realsense_options(rs: ModuleType, profile: Any, options: CameraOption
 
 
 def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None:
-    """Return intrinsics for capture.json; None where OpenCV's coefficients differ from the maker's by FITTED_PX.
+    """Return the stored intrinsics for capture.json; None if OpenCV's distortion model misses them by FITTED_PX or more.
 
-    librealsense has distortions of its own ("Projection in Intel RealSense SDK 2.0"), among them an inverse one. Its
-    own deprojection gives the ray of each pixel, and the coefficients are linear in where rays go.
+    librealsense has distortion models of its own ("Projection in Intel RealSense SDK 2.0"). OpenCV's coefficients
+    k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for a grid of pixels.
     """
     intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):
@@ -324,14 +337,15 @@ def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None
     return fitted if off_px < FITTED_PX else None
 
 
-# Choice of an image that can be kept: at rest, sharp, exposed, and different from the images taken elsewhere.
+# An image can be kept if it is at rest, sharp, well exposed, and different from the images at other gripper poses.
 
 REST_S = 0.2
-"""Time between two images that are compared for motion."""
+"""Time (s) between two images that are compared for motion."""
 STILL = 2.5
-"""Mean grey levels by which images at rest differ on a 160 px wide grid: pixel noise of sigma 10 gives 1.9,
-a shift of one pixel in 640 of a textured tabletop 3."""
+"""Largest mean difference (grey levels) of two images at rest, compared at a width of GRID_PX: pixel noise of 10 levels
+gives 1.9, and a shift of a textured tabletop by one pixel in 640 gives 3."""
 GRID_PX = 160
+"""Width (px) to which images are reduced for comparison."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,8 +353,9 @@ class ImageSummary:
     """Coarse grey levels and sharpness of an image, with which later images are compared."""
 
     grid: Float32[ndarray, "gh gw"]
-    """Grey levels without their mean, coarse enough for a sensor's noise to vanish."""
+    """Grey levels of the image reduced to GRID_PX, minus their mean."""
     sharpness: float
+    """Variance of the Laplacian."""
 
     @staticmethod
     def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":
@@ -351,22 +366,22 @@ class ImageSummary:
         return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images show the same view but for noise."""
+        """Test whether two images have the same size and differ by noise only."""
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 
 def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patience_s: float) -> Frame | str:
-    """Return the first frame at rest that can be kept, or after `patience_s` the reason why none could.
+    """Return the first frame at rest that can be kept; after `patience_s` seconds, the reason why none can be kept.
 
-    The images `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
-    file.
+    `kept` are the images taken at other gripper poses, from which the frame must differ. Raises StopIteration at the
+    end of a video file.
     """
     earlier = next(frames)
     end = earlier.time_s + patience_s
     while True:
         frame = next(frames)
         if frame.time_s < earlier.time_s:
-            # The clock was set back: time is counted from here.
+            # The clock was set back, so the patience is counted from this frame.
             earlier, end = frame, frame.time_s + patience_s
         if frame.time_s - earlier.time_s < REST_S:
             continue
@@ -379,7 +394,7 @@ def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patienc
 
 
 def _fault(earlier: Frame, frame: Frame, kept: Sequence[ImageSummary]) -> str | None:
-    """Return the reason why a frame cannot be kept; None where it can be."""
+    """Return the reason why a frame cannot be kept; None if it can. `earlier` is a frame REST_S or more before it."""
     if earlier.image.shape != frame.image.shape:
         return "the size of the camera's images changes; fix it with --camera-size"
     now = ImageSummary.of(frame.image)
@@ -390,7 +405,7 @@ def _fault(earlier: Frame, frame: Frame, kept: Sequence[ImageSummary]) -> str | 
         return f"the image is {fault}; change light or exposure"
     if now.sharpness < BLURRED * usual:
         return f"the image is blurred ({100 * now.sharpness / usual:.0f} % of the usual sharpness)"
-    # Images of another size are refused where they are kept.
+    # LiveFolder.add refuses images whose size differs from the kept ones.
     if any(now.is_like(one) for one in kept):
         return (
             "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"

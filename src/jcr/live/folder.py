@@ -1,4 +1,4 @@
-"""Capture folder that grows image by image and is complete after every change, so that stopping loses nothing."""
+"""Capture folder to which images are added one by one; its files are a complete capture after every change."""
 
 import re
 from pathlib import Path
@@ -24,20 +24,23 @@ from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, o
 
 IMAGES = "images"
 Channels = Literal["rgb", "bgr"]
-"""Order of the channels of an image."""
+"""Order of the colour channels of an image."""
 
 
 class LiveFolder:
-    """Capture folder whose images are added and removed; images that it holds already are kept.
+    """Capture folder to which images are added and from which they are removed; an existing capture is continued.
 
-    Its owner changes it in one thread at a time; others may read at any time. The files of removed images stay until
-    `close`, so that a change can be undone.
+    Only one thread at a time may change it, but any thread may read it at any time. The files of removed images are
+    deleted by `close`, so that a removal can be undone before.
     """
 
     def __init__(
         self, folder: Path, intrinsics: IntrinsicsEntry | None = None, robot: str | None = None
     ) -> None:
-        """Open or begin a capture; raise InputError where the folder or its capture.json cannot be used."""
+        """Open or begin a capture; raise InputError if the folder or its capture.json cannot be used.
+
+        `intrinsics` and `robot` (name of the arm) replace those of an existing capture.json; None: they are kept.
+        """
         self.folder, file = folder, folder / FILE
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; name a folder for the capture")
@@ -53,10 +56,10 @@ class LiveFolder:
         self.size = size_of_all(sizes, str(file)) if sizes else None
         remove_unfinished(folder / IMAGES)
         self._earlier: list[tuple[FrameEntry, ...]] = []
-        """Images before each change since the folder was opened."""
+        """Entries of the images before each change since the folder was opened, the newest change last."""
         self._summaries: dict[str, ImageSummary] = {}
         self._ever = {one.image: one for one in self.images}
-        # Above the numbers of all image files, files that no capture.json names included.
+        # The next number is above those of all image files, including files that capture.json does not name.
         files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
         numbers = [int(match[1]) for name in files if (match := re.match(r"images/(\d+)\.", name))]
         self._next_number = max(numbers, default=-1) + 1
@@ -68,16 +71,16 @@ class LiveFolder:
 
     @property
     def robot(self) -> str | None:
-        """Name of the arm; None where it is not known."""
+        """Name of the arm in capture.json; None if none is given or jcr does not know the name."""
         return self._content.robot if self._content.robot in ROBOT_NAMES else None
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is a change since the folder was opened that is not undone."""
+        """Whether `undo` has a change to undo, made since the folder was opened."""
         return len(self._earlier) > 0
 
     def summary(self, name: str) -> ImageSummary:
-        """Return the summary of an image of the folder."""
+        """Return grey levels and sharpness of an image of the folder, computed once."""
         if name not in self._summaries:
             self._summaries[name] = ImageSummary.of(read_image(self.folder / name))
         return self._summaries[name]
@@ -91,10 +94,10 @@ class LiveFolder:
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         color: Channels = "rgb",
     ) -> str:
-        """Check and write an image with its pose and return its name; capture.json is complete again after that.
+        """Check an image and its gripper pose, write both, and return the name of the image.
 
-        The arguments are those of `LiveCalibration.add`; `joints` are written when all images have them. Raises
-        InputError where the frame cannot be part of this capture, and OSError where a file cannot be written; the
+        The arguments are those of `LiveCalibration.add`; `joints` are written only if all images have them. Raises
+        InputError if the image or the pose does not fit the capture, and OSError if a file cannot be written. The
         capture is then unchanged.
         """
         number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
@@ -132,11 +135,11 @@ class LiveFolder:
         return new.image
 
     def remove(self, name: str) -> None:
-        """Remove an image from the capture."""
+        """Remove the image of this name from capture.json; its files stay until `close`."""
         self._change(tuple(one for one in self.images if one.image != name))
 
     def undo(self) -> bool:
-        """Take back the last change since the folder was opened; return whether there was one."""
+        """Undo the last addition or removal since the folder was opened; return whether there was one."""
         if not self._earlier:
             return False
         self._write(self._earlier[-1])
@@ -144,7 +147,7 @@ class LiveFolder:
         return True
 
     def close(self) -> None:
-        """Delete the files of images that were removed; no change can be undone after that."""
+        """Delete the files of the removed images; earlier changes can no longer be undone."""
         for name in self._ever.keys() - set(self.names):
             self._delete(self._ever.pop(name))
         self._earlier.clear()
@@ -155,7 +158,7 @@ class LiveFolder:
         return None if not images or self.size is None else self._capture_of(images, self.size)
 
     def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
-        """Raise InputError where an image shows what another shows."""
+        """Raise InputError if a new image looks like an image of the folder; `number` is its name in the message."""
         for one in self.images:
             if not new.is_like(self.summary(one.image)):
                 continue
@@ -170,7 +173,7 @@ class LiveFolder:
             )
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
-        """Return images as a capture; raise InputError where capture.json contradicts them."""
+        """Return a capture of images of `size` (width, height) px; raise InputError if capture.json contradicts them."""
         return Capture(
             folder=self.folder,
             images=tuple(one.image for one in images),
@@ -180,25 +183,28 @@ class LiveFolder:
         )
 
     def _change(self, images: tuple[FrameEntry, ...]) -> None:
-        """Write capture.json with these images, and remember the present ones for `undo`."""
+        """Replace the images of capture.json by these; keep the previous ones for `undo`."""
         self._write(images)
         self._earlier.append(self.images)
         self.images = images
 
     def _write(self, images: tuple[FrameEntry, ...]) -> None:
-        """Write capture.json with these images."""
+        """Write capture.json with these images; joint angles are left out unless all images have them."""
         some_joints = None if all(one.joints is not None for one in images) else {"joints"}
         frames = [one.model_dump(mode="json", exclude_none=True, exclude=some_joints) for one in images]
         write_text(self.folder / FILE, self._content.model_copy(update={"frames": frames}).as_text())
 
     def _delete(self, one: FrameEntry) -> None:
-        """Delete the files of an image."""
+        """Delete the files of an image: colour and depth."""
         for file in filter(None, (one.image, one.depth)):
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
 
 def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
-    """Return an image as RGB (h,w,3) uint8, grey ones converted; raise InputError, begun with `number`, for others."""
+    """Return an image in RGB, (h,w,3) uint8; grey images (h,w) or (h,w,1) are converted.
+
+    Raises InputError for any other array; its message starts with `number`, the image's name for the user.
+    """
     if isinstance(image, str | Path):
         raise InputError(
             f"{number}: {image} is a path; give the pixels, numpy.array(PIL.Image.open(path).convert('RGB'))"

@@ -1,4 +1,4 @@
-"""Gripper pose that improves the calibration most, within reach and with an image that is likely to register."""
+"""Next gripper pose of a live capture: it reduces the uncertainty most, is within reach, and is likely to register."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,14 +20,14 @@ from jcr.geometry import inverse, rotation_angle
 from jcr.records import Capture
 
 PROPOSALS = 12
-"""Number of poses that are compared; the first that the arm reaches is proposed."""
+"""Number of poses, best first, of which the first that the arm can reach is proposed."""
 ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
-"""Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
-of its camera from where an image did not register or was refused."""
+"""Largest angle (rad) between the optical axes of a proposed image and the closest registered one, and least distance
+(m) of its camera from the cameras of images that did not register or were refused."""
 AIMED = 0.1, np.radians(5.0)
-"""Largest standard deviations (m, rad) of a rejected calibration by which cameras can still be aimed at the scene."""
+"""Largest standard deviations (m, rad) of a rejected gripper_from_camera with which poses are still proposed."""
 APART = np.radians(15.0)
-"""Least rotation between a proposed gripper pose and those of the images, while the rotation limits the accuracy."""
+"""Least rotation (rad) of a proposed gripper pose from that of every image, while the rotation limits the accuracy."""
 Poses = Float[ndarray, "k 4 4"]
 
 
@@ -41,11 +41,12 @@ def propose(
     box: Float[ndarray, "2 3"] | None = None,
     refused: Sequence[Float[ndarray, "4 4"]] = (),
 ) -> dict[str, Any]:
-    """Return the next pose as fields of Progress; empty below two images.
+    """Return the fields `next_pose` and, with an arm, `next_joints` of Progress; empty for fewer than two images.
 
-    `registered` are the rows of the capture whose images registered; with fewer than two, all count as such. With a
-    sound calibration `case` the errors that it found are expected, else a usual robot and usual images. The pose is
-    within the joint limits of `arm` and in the `box` (m, base frame), and away from gripper poses that were `refused`.
+    `registered` are the rows of the capture whose images registered; with fewer than two, all rows are used. The errors
+    expected of robot and images are those of a sound calibration `case`, else typical ones. `hand_eye` is the last
+    calibration, which may be rejected. The pose is within the joint limits of `arm` and in the `box` (m, base frame),
+    and distant from the gripper poses `refused`, at which no image could be kept.
     """
     if len(capture) < 2:
         return {}
@@ -62,11 +63,11 @@ def propose(
     failed = np.concatenate([poses[~has_camera], np.reshape(refused, (-1, 4, 4))])
 
     def wanted(added: Poses, *, or_likely: bool = False) -> Bool[ndarray, " k"]:
-        """Test at which poses an image is likely to register and, where that limits the accuracy, rotated enough.
+        """Test, for each added pose, whether its image is likely to register and it is rotated enough to be useful.
 
-        The camera looks along nearly the same line as in an image that registered, and is not where an image did not;
-        after one that did not, `x` may be wrong, and the rotation of the gripper is compared. `or_likely`: where there
-        are none, return where an image is likely to register.
+        An image is likely to register if its optical axis is within ALIKE of a registered image's, and its camera not
+        near a failed one. If the last image failed, `x` may be wrong, and rotations of the gripper are compared instead
+        of axes. `or_likely`: if no pose passes both tests, return the result of the first one.
         """
         cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
         angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
@@ -93,9 +94,10 @@ def propose(
 
 
 def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibration | None) -> Assumptions:
-    """Return a usual robot and camera at the gripper poses of the registered images.
+    """Return a typical robot and camera at `poses`, the gripper poses of the registered images.
 
-    The camera is where a rejected calibration puts it, if that is exact enough to aim by, else at the gripper.
+    gripper_from_camera is that of a rejected calibration if its standard deviations are below AIMED, else a guess from
+    the gripper poses.
     """
     camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
     assumptions = assumed(poses, camera)
@@ -107,7 +109,7 @@ def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibra
 
 
 def _least_rotation(added: Poses, known: Float[ndarray, "n 4 4"]) -> Float[ndarray, " k"]:
-    """Return the smallest rotation (rad) between each added pose and the known ones."""
+    """Return for each added pose (k,4,4) the angle (rad) to the known pose of the most similar rotation."""
     relative = np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3]
     return np.asarray(rotation_angle(relative)).min(1)
 
@@ -118,10 +120,10 @@ def joints_at(
     joints: Float[ndarray, "n dof"] | None,
     goal: Float[ndarray, "4 4"],
 ) -> Float[ndarray, " dof"] | None:
-    """Return joint angles (rad) within the limits that reach `goal`; None where none do.
+    """Return joint angles (rad) within the limits that move the gripper to `goal`; None if there are none.
 
-    `base_from_gripper` and `joints` (rad, None where not recorded) are those of the images. With recorded angles the
-    tool follows from them and their pose, and the answer is of the branch that the arm is in.
+    `base_from_gripper` (n,4,4) and `joints` (n,dof) rad are those of the images; None: not recorded. From recorded
+    angles the tool is computed, and the result keeps the arm's present configuration (elbow up or down, and so on).
     """
     if joints is not None:
         now = joints[-1:]

@@ -1,4 +1,4 @@
-"""Content of the live page: one record of a session's state, which templates draw."""
+"""Content of the live page: the state of a session as plain values, from which templates make HTML."""
 
 import json
 from functools import lru_cache
@@ -32,7 +32,7 @@ from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
 PARTS = ("head", "next", "images")
-"""Templates of the parts that change, each in an element of this name."""
+"""Names of the templates of the parts that change; each part is the content of the HTML element of that name."""
 LAYERS = {
     "cameras": "cameras",
     "grippers": "grippers",
@@ -40,17 +40,17 @@ LAYERS = {
     "next": "next pose (green)",
     "tracks": "points of the scene (red)",
 }
-"""Parts of the 3D view and their labels."""
+"""Parts of the 3D view that can be hidden, and the labels of their check boxes."""
 ANY_CAMERA = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
-"""Camera that is drawn where no intrinsics are known."""
+"""Camera that is drawn while the intrinsics are unknown."""
 NOW_PX, CARD_PX = 640, 330
-"""Width of the camera's image and of the images in the list."""
+"""Widths (px) of the camera's live image and of the images in the list."""
 FEW_FEATURES = 150
-"""Number of SIFT features in an image of NOW_PX below which registration is at risk."""
+"""Number of SIFT features, in an image NOW_PX wide, below which an image may not register."""
 
 
 def whole_page(session: LiveSession) -> str:
-    """Return the page as a browser loads it; its script requests the parts after that."""
+    """Return the HTML page that a browser loads first; its script then requests `page_parts` again and again."""
     checks = [(name, label, True) for name, label in LAYERS.items()]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
     content = {"folder": str(session.folder.folder), "scene": view}
@@ -58,7 +58,10 @@ def whole_page(session: LiveSession) -> str:
 
 
 def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> dict[str, Any]:
-    """Return the parts of the page as HTML and the data of the 3D view."""
+    """Return the parts of the page as HTML, the data of the 3D view, and the flags that the page's script needs.
+
+    `has_report`: the report of the final calibration can be opened.
+    """
     required = session.options.require or GRASPING
     content = page_content(state, required, session.notation, has_report)
     return {
@@ -75,10 +78,10 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 def page_content(
     state: SessionState, required: tuple[float, float], notation: Notation, has_report: bool = False
 ) -> dict[str, Any]:
-    """Return everything that the templates draw of a state; `required` are mm and degrees.
+    """Return the values of a state that the templates show; `required` is the required accuracy (mm, degrees).
 
-    "kind" is the colour of the headline ("good", "fair", "bad" or empty), "images" the cards of the list, the newest
-    first.
+    "kind" selects the colour of the headline ("good", "fair", "bad" or empty). "images" are the cards of the list, the
+    newest first.
     """
     progress, has_next = state.progress, _is_proposed(state)
     kind, *lines = _verdict(state)
@@ -98,13 +101,13 @@ def page_content(
 
 
 def _is_proposed(state: SessionState) -> bool:
-    """Test whether a next pose is shown."""
+    """Test whether the page proposes a next pose: the capture goes on, and its requirement is not met yet."""
     progress = state.progress
     return progress.next_pose is not None and not state.is_over and not progress.requirement_met
 
 
 def _cards(state: SessionState) -> list[dict[str, Any]]:
-    """Return the images of the list: number in commands, file, finding about it, and whether it is registered."""
+    """Return a card for each image: its number in commands, file name, the finding about it, and registration state."""
     progress, against = state.progress, dict[str, str]()
     for one in progress.findings[::-1]:
         if len(one.images) == 1 and one.severity != "informs":
@@ -118,7 +121,7 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
 
 
 def _verdict(state: SessionState) -> list[str]:
-    """Return the kind of the verdict, its headline and the lines below it."""
+    """Return the kind of the headline (see `page_content`), the headline, and the lines below it."""
     progress, result, count = state.progress, state.result, len(state.images)
     wrong = faults(progress)
     if result is not None:
@@ -153,7 +156,10 @@ def _verdict(state: SessionState) -> list[str]:
 
 
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
-    """Return the accuracies beside what is required, at the end those of all images, and the registered images."""
+    """Return tiles of reached and required accuracy, number of registered images, and leave-one-out error.
+
+    The accuracy is that of the final calibration if there is one.
+    """
     if not state.images:
         return []
     tiles, reached = list[Tile](), state.progress.reached or ()
@@ -170,7 +176,7 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
-    """Return the data of the 3D view: points, images, the next pose, and cameras where a calibration places them."""
+    """Return the data of the 3D view: points, images, next pose, and cameras of registered images once calibrated."""
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
     faults_of = {one["name"]: one["fault"] for one in _cards(state)}
@@ -193,12 +199,12 @@ def _scene(state: SessionState) -> dict[str, Any]:
 
 @lru_cache(maxsize=128)
 def image_card(file: Path) -> bytes:
-    """Return a small copy of an image, JPEG."""
+    """Return an image file as a JPEG that is CARD_PX wide."""
     return _jpeg(_small(read_image(file), CARD_PX))
 
 
 def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
-    """Return the image NOW_PX wide with a ring at each SIFT feature, JPEG, and a sentence on their number."""
+    """Return the image as a JPEG, NOW_PX wide with a ring at each SIFT feature, and a sentence on their number."""
     small = _small(image, NOW_PX)
     found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
     for feature in found:
@@ -209,7 +215,7 @@ def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
 
 
 def _small(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
-    """Return a copy of an image of another width."""
+    """Return a copy of an image that is scaled to a width (px)."""
     size = width, max(1, round(width * image.shape[0] / image.shape[1]))
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 

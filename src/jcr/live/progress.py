@@ -1,4 +1,4 @@
-"""State of a calibration after each image of its capture, as a record, as text and as an answer for a program."""
+"""State of a live calibration after each image: as a record, as lines of the terminal, and as JSON for a program."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,52 +17,53 @@ from jcr.records import LeaveOneOut, NextPose
 from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
-"""Least number of used images with which the leave-one-out error can confirm an accuracy."""
+"""Least number of used images with which the leave-one-out error is reported and can confirm the accuracy."""
 REQUIREMENT_MET = "requirement met: finish, or go on"
 FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
 @dataclass(frozen=True)
 class Notation:
-    """Convention, units and arm with which poses are written."""
+    """Notation in which proposed gripper poses are shown: pose convention, units, and the arm for joint angles."""
 
     convention: ConventionName = "auto"
     """Pose convention; auto: quat-xyzw."""
     units: UnitsName = "auto"
+    """Units of lengths and angles; auto: those of the convention."""
     arm: Arm | None = None
-    """Arm whose joint angles are written too; None where it is not known."""
+    """Arm whose joint angles are shown with the pose; None: the arm is not known, and none are shown."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """State of a calibration that grows by an image at a time."""
+    """State of a live calibration: its images, findings, calibration, and the proposed next pose."""
 
     images: tuple[str, ...]
-    """Names of all images that are kept, in the order in which they were taken."""
+    """Names of all images of the capture, in the order in which they were taken."""
     added: str | None = None
-    """Image whose addition led to this state; None where none was added."""
+    """Name of the image whose addition led to this state; None if no image was added."""
     registered: tuple[str, ...] = ()
-    """Images whose cameras are known."""
+    """Names of the images whose camera pose is known from the reconstruction."""
     findings: tuple[Finding, ...] = ()
     """Findings about single images and about the calibration, strongest first."""
     hand_eye: Calibration | None = None
-    """Calibration; None while fewer than three images are registered."""
+    """Calibration, which may be rejected; None while fewer than three images are registered."""
     next_pose: NextPose | None = None
-    """Gripper pose that improves the calibration most; None below two images."""
+    """Gripper pose that improves the calibration most; None with fewer than two images."""
     next_joints: Float[ndarray, " dof"] | None = None
-    """Joint angles (rad) of `next_pose`; None where the arm is not known, or does not reach it."""
+    """Joint angles (rad) of `next_pose`; None if the arm is not known or cannot reach the pose."""
     points_in_base: Float[ndarray, "p 3"] | None = None
-    """Reconstructed points of the scene (m); None without a calibration."""
+    """Reconstructed points of the scene (m, base frame); None without a calibration."""
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Bounds of 95 % of the errors (mm, degrees) of the point that `Requirement.at` names; None without any."""
+        """Bounds of 95 % of the errors (mm, degrees), at the point that `Requirement.at` names; None without one."""
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
     @property
     def leave_one_out(self) -> LeaveOneOut | None:
-        """Mean error of each image's gripper pose predicted by the others; None where too few images are used."""
+        """Leave-one-out error of the calibration; None with fewer than CONFIRMING_IMAGES used images."""
         found = self.hand_eye
         if found is None or found.inliers.sum() < CONFIRMING_IMAGES:
             return None
@@ -70,7 +71,7 @@ class Progress:
 
     @property
     def requirement_met(self) -> bool:
-        """Whether the calibration is accepted, estimated as exact as required, and its leave-one-out error agrees."""
+        """Whether the calibration is accepted, and estimated accuracy and leave-one-out error meet the requirement."""
         found, error = self.hand_eye, self.leave_one_out
         if found is None or not found.converged or found.requirement is None or error is None:
             return False
@@ -81,7 +82,7 @@ class Progress:
         return required.met and is_within
 
     def __str__(self) -> str:
-        """Return two lines: the accuracy beside what is required, and what to do next."""
+        """Return two lines: the reached and required accuracy, and the next action."""
         advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_sentence(self)}"
         if wrong := faults(self):
             advice = sentence(wrong[0])
@@ -90,7 +91,7 @@ class Progress:
         return f"{accuracy_line(self)}\n{advice}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the state for a program, as values of JSON."""
+        """Return the state as values of JSON: poses and joints in m and rad, accuracies in mm and degrees."""
         pose, error = self.next_pose, self.leave_one_out
         mm, deg = self.reached or (None, None)
         return {
@@ -113,7 +114,7 @@ class Progress:
 
 
 def faults(state: Progress) -> list[Finding]:
-    """Return the findings that reject or warn, those of the last image first, but not that more images are needed."""
+    """Return the findings that reject or warn, those on the added image first; without the need for more images."""
     more_images = FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES
     acting = (one for one in without_consequences(state.findings) if one.severity != "informs")
     found = [one for one in acting if one.kind not in more_images]
@@ -121,7 +122,7 @@ def faults(state: Progress) -> list[Finding]:
 
 
 def finding_lines(state: Progress) -> list[str]:
-    """Return each fault in a sentence, with the commands for its image; these count images from 1."""
+    """Return each of `faults` as a sentence, with the commands that retake or remove its image; images count from 1."""
     retake = {name: f" (retake {k}, or remove {k})" for k, name in enumerate(state.images, start=1)}
     return [
         sentence(one) + (retake.get(one.images[0], "") if len(one.images) == 1 else "")
@@ -130,7 +131,7 @@ def finding_lines(state: Progress) -> list[str]:
 
 
 def progress_lines(state: Progress, notation: Notation) -> list[str]:
-    """Return the state as lines of the terminal, the next pose in the notation of the arm."""
+    """Return the state as lines of the terminal: accuracy, faults, and the next pose in this notation."""
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
     below = finding_lines(state)
@@ -145,7 +146,7 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
 
 
 def next_sentence(state: Progress) -> str:
-    """Return the place of the next pose and the accuracy that is expected with it."""
+    """Return a phrase on the next pose: its distance from the closest image's pose, and the expected accuracy."""
     pose = state.next_pose
     assert pose is not None
     moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
@@ -154,7 +155,7 @@ def next_sentence(state: Progress) -> str:
 
 
 def next_lines(state: Progress, notation: Notation) -> list[str]:
-    """Return the next pose and its joint angles in the notation of the arm, as `pose_lines`."""
+    """Return the lines of `pose_lines` for the next pose, and a line if the arm cannot reach it."""
     assert state.next_pose is not None
     lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
     is_used = all(one.kind is not FindingKind.ROBOT_UNUSED for one in state.findings)
@@ -164,7 +165,7 @@ def next_lines(state: Progress, notation: Notation) -> list[str]:
 
 
 def accuracy_line(state: Progress) -> str:
-    """Return the number of registered images, and the accuracy beside what is required."""
+    """Return a line with the number of registered images and the reached and required accuracy."""
     images = f"{len(state.registered)} of {len(state.images)} images registered"
     if state.reached is None or state.hand_eye is None:
         return f"{images}: no calibration yet"
@@ -184,10 +185,10 @@ def accuracy_line(state: Progress) -> str:
 def pose_lines(
     pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
 ) -> list[str]:
-    """Return the pose as the arm's pendant writes it, of a UR also as URScript, and its joint angles where known."""
+    """Return lines with a gripper pose in a notation, for a UR also as URScript, and with joint angles (rad) if given."""
 
     def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
-        """Return numbers with so many decimals, separated by commas."""
+        """Return numbers with `digits` decimals, separated by commas."""
         return ", ".join(f"{value:.{digits}f}" for value in numbers)
 
     convention = "quat-xyzw" if notation.convention == "auto" else notation.convention

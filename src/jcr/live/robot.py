@@ -1,7 +1,7 @@
 """States of a robot arm from its controller, detection of rest, gripper poses from plain numbers, and typed lines.
 
-Universal Robots, Franka and UFACTORY arms are read. Nothing is commanded, so an arm may be guided by hand. Readers raise
-InputError when the package is missing, or the robot cannot be reached or hangs up.
+Universal Robots, Franka and UFACTORY arms are read. No motion is commanded, so an arm may be guided by hand. The readers
+raise InputError if a package is missing, the robot cannot be reached, or the connection ends.
 """
 
 import contextlib
@@ -26,26 +26,31 @@ from jcr.geometry import inverse, rotation_angle
 from jcr.records.capture_json import MOST_ROTATION, read_rigid
 
 REST_S = 0.5
+"""Time (s) without motion after which an arm is at rest."""
 REST = (2e-4, np.radians(0.03))
-"""m, rad: an arm that stays within this for REST_S is at rest."""
+"""Largest motion (m, rad) of an arm at rest."""
 MOVED_ON = (0.01, np.radians(3.0))
-"""m, rad: least distance of a rest from the last image at which the next image is taken."""
+"""Least motion (m, rad) from the last image's gripper pose to the pose at rest where the next image is taken."""
 TRY_AGAIN = (1e-3, np.radians(0.2))
-"""m, rad: the same distance after an image that was refused."""
+"""Least motion (m, rad), in place of MOVED_ON, after an image that was refused."""
 BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
-"""Convention of so many numbers, where none was given."""
+"""Pose convention by the number of numbers, used if the convention is "auto"."""
 KINDS: tuple[ConventionName, ...] = ("ur", "franka", "xarm")
-"""Kinds of arms whose controllers are read, called as the convention in which they show poses."""
+"""Kinds of arms whose controllers can be read; each is named like the pose convention of its pendant."""
 UR_PORT = 30003
+"""Default port: the real-time interface of UR controllers."""
 UR_TIMEOUT_S = 5.0
+"""Time (s) without data after which the connection to a UR fails."""
 FRANKA_POLL_S, XARM_POLL_S = 0.008, 0.02
+"""Time (s) between two reads of the state of a Franka and of a UFACTORY arm."""
 UR_TOOL_SINCE_3_0, UR_TOOL_BEFORE = 444, 588
-"""Byte at which x, y, z (m) and rx, ry, rz (rotation vector, rad) of the tool centre point begin."""
+"""First byte of x, y, z (m) and rx, ry, rz (rotation vector, rad) of the tool centre point: since 3.0, and before."""
 UR_BEFORE_3_0 = (764, 812)
+"""Lengths (bytes) of the packets of UR software before 3.0."""
 UR_SINCE_3_0 = range(1044, 4096)
-"""Lengths of packets; each release since 3.0 (1044 bytes) appended to the one before."""
+"""Possible lengths (bytes) of packets since 3.0, where 1044 is the length; later releases append fields."""
 UR_JOINTS = 252
-"""Byte at which the six actual joint angles (rad) begin, in every version."""
+"""First byte of the six actual joint angles (rad), in every version."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +58,22 @@ class RobotState:
     """Gripper pose and joint angles of an arm at one time."""
 
     time_s: float
-    """Time on the controller's clock."""
+    """Time (s) by the clock of the controller, or of this machine if the controller sends no time."""
     base_from_gripper: Float[ndarray, "4 4"]
+    """Gripper pose (m)."""
     joints: Float[ndarray, " dof"] | None = None
-    """Joint angles (rad); None where the source does not send them."""
+    """Joint angles (rad); None if the source does not send them."""
 
 
 States = Callable[[], Iterator[RobotState]]
-"""Function that opens a connection and yields states from then on; closing the iterator closes the connection."""
+"""Function that connects to an arm and returns an iterator of its states; closing the iterator ends the connection."""
 
 
 def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[float, float]) -> RobotState:
-    """Return the state in which the arm rests next, farther than `limit` (m, rad) from the pose `last`."""
+    """Wait until the arm rests at a pose that differs from `last` by more than `limit` (m, rad); return its state.
+
+    `last` None: any pose at rest is returned.
+    """
     recent: deque[RobotState] = deque()
     for state in states():
         if recent and state.time_s < recent[-1].time_s:
@@ -81,7 +90,7 @@ def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[f
 
 
 def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[float, float]) -> bool:
-    """Test whether two poses are more than `limit` (m, rad) apart."""
+    """Test whether two poses differ by more than `limit`, in translation (m) or in rotation (rad)."""
     motion = inverse(a) @ b
     return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
 
@@ -89,9 +98,9 @@ def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[
 def pose_of_numbers(
     numbers: list[float], where: str, convention: ConventionName = "auto", units: UnitsName = "auto"
 ) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper of the numbers of one pose; raise InputError for others.
+    """Return base_from_gripper (4,4) from the numbers of one pose; raise InputError, begun with `where`, for others.
 
-    `convention` auto: x y z and a rotation vector, as UR shows, x y z qx qy qz qw, or a matrix by rows.
+    `convention` "auto": 6 numbers are x y z and a rotation vector, 7 are x y z qx qy qz qw, 16 are a matrix by rows.
     """
     named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
     if named is None or len(numbers) != len(CONVENTIONS[named].columns):
@@ -110,7 +119,7 @@ def pose_columns(convention: ConventionName, units: UnitsName) -> str:
 
 
 def states_of(source: str) -> States | None:
-    """Return the states of the arm that `--poses` names (ur:HOST[:PORT], franka:HOST, xarm:HOST); None of no arm."""
+    """Return the state reader of an arm, named ur:HOST[:PORT], franka:HOST or xarm:HOST; None for other sources."""
     kind, _, address = source.partition(":")
     if kind not in KINDS or not address:
         return None
@@ -122,7 +131,7 @@ def states_of(source: str) -> States | None:
 
 
 def address_of(text: str, port: int, option: str) -> tuple[str, int]:
-    """Return host and port of HOST[:PORT]; raise InputError that begins with `option`."""
+    """Return host and port from HOST[:PORT]; `port` is the default. Raises InputError that begins with `option`."""
     host, _, number = text.rpartition(":") if ":" in text else (text, "", str(port))
     if not host or not number.isdigit() or not int(number) < 65536:
         raise InputError(f"{option}{text}: no address; write HOST:PORT such as 127.0.0.1:{port}")
@@ -130,12 +139,12 @@ def address_of(text: str, port: int, option: str) -> tuple[str, int]:
 
 
 def ur_states(host: str, port: int) -> Iterator[RobotState]:
-    """Yield the states of a UR arm from its real-time interface, 125 or 500 times a second.
+    """Yield the states of a UR arm from its real-time interface (port 30003, or 30013 read-only), at 125 or 500 Hz.
 
-    Port 30003, or 30013 read-only. Layout: "Remote control via TCP/IP", Universal Robots article 16496, and the page
-    RealTime5.10 of the Client Interfaces manual: a big-endian int32 with the length of the packet, the controller's time
-    as a double, then groups of doubles. From software 3.0 (CB3, e-Series) nine groups of six precede the actual tool
-    vector; before (CB2) the target and actual joints, the tool's accelerometer, fifteen unused and the force.
+    A packet has a big-endian int32 with its length, the controller's time as a double, and then groups of doubles
+    ("Remote control via TCP/IP", Universal Robots article 16496; Client Interfaces manual, page RealTime5.10). Since
+    software 3.0 (CB3, e-Series) the actual tool vector follows nine groups of six. Before 3.0 (CB2) it follows target
+    and actual joints, the tool's accelerometer, fifteen unused numbers and the force.
     """
     where = f"--poses ur:{host}:{port}"
     try:
@@ -154,7 +163,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
                 offset = UR_TOOL_BEFORE if length in UR_BEFORE_3_0 else UR_TOOL_SINCE_3_0
                 tool = struct.unpack_from("!6d", packet, offset)
                 joints = np.array(struct.unpack_from("!6d", packet, UR_JOINTS))
-                # A last joint without limits may have turned more often than a capture.json allows.
+                # A last joint without limits may have an angle beyond the largest that capture.json allows.
                 plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
                 yield RobotState(time_s, pose_of_numbers(list(tool), where), plausible)
     except TimeoutError:
@@ -167,14 +176,14 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
 
 
 def franka_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a Franka arm (FER, FR3) by its control interface, with the package franky-control.
+    """Yield the states of a Franka arm (FER, FR3), read from its control interface by the package franky-control.
 
-    The pose is O_T_EE, of the end effector set in Desk.
+    base_from_gripper is O_T_EE: the pose of the end effector that is set in Franka Desk.
     """
     where = f"--poses franka:{host}"
     franky = extra("franky", "franka", where)
     try:
-        # Reading the state needs no real-time kernel.
+        # A real-time kernel is not needed to read the state.
         robot = franky.Robot(host, realtime_config=franky.RealtimeConfig.Ignore)
         while True:
             state = robot.state
@@ -189,13 +198,13 @@ def franka_states(host: str) -> Iterator[RobotState]:
 
 
 def xarm_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a UFACTORY arm (xArm, Lite 6, 850), with the package xarm-python-sdk.
+    """Yield the states of a UFACTORY arm (xArm, Lite 6, 850), read by the package xarm-python-sdk.
 
-    The pose is that of the tool centre point set in UFACTORY Studio.
+    base_from_gripper is the pose of the tool centre point that is set in UFACTORY Studio.
     """
     where = f"--poses xarm:{host}"
     timeout = socket.getdefaulttimeout()
-    # The package prints its version and its errors, which our one line replaces, and sets a default for all sockets.
+    # The package prints its version and errors, which the InputError replaces, and changes the timeout of all sockets.
     with contextlib.redirect_stdout(io.StringIO()):
         api = extra("xarm.wrapper", "xarm", where).XArmAPI
         try:
@@ -221,7 +230,7 @@ def xarm_states(host: str) -> Iterator[RobotState]:
         arm.disconnect()
 
 
-# Lines that a person types while a capture is taken: commands, and gripper poses read off the pendant.
+# A person types lines while a capture is taken: commands, and gripper poses that the pendant shows.
 
 Action = Literal["take", "retake", "remove", "undo", "finish"]
 WITH_NUMBER: tuple[Action, ...] = ("retake", "remove")
@@ -229,7 +238,10 @@ HELP = "type take, retake [NUMBER], remove [NUMBER], undo or finish, and Enter; 
 
 
 def command_of(line: str) -> tuple[Action, int | None] | None:
-    """Return action and image number of a command, of which three letters suffice; None of any other line."""
+    """Return action and image number (None: not given) of a typed command; None if the line is no command.
+
+    The first three letters of an action are enough.
+    """
     first, *rest = line.split() or [""]
     found = [action for action in get_args(Action) if len(first) >= 3 and action.startswith(first.lower())]
     if len(found) != 1 or len(rest) > (found[0] in WITH_NUMBER) or not all(w.isdecimal() for w in rest):
@@ -238,7 +250,7 @@ def command_of(line: str) -> tuple[Action, int | None] | None:
 
 
 def without_commands(lines: Iterable[str], press: Callable[[Action, int | None], None]) -> Iterator[str]:
-    """Yield the lines that are no commands; hand commands to `press`."""
+    """Yield the lines that are no commands; call `press` with action and image number of each command."""
     for line in lines:
         command = command_of(line)
         if command is None:
@@ -253,7 +265,10 @@ def typed_poses(
     convention: ConventionName = "auto",
     units: UnitsName = "auto",
 ) -> Iterator[Float[ndarray, "4 4"]]:
-    """Yield base_from_gripper of each typed line, until an empty one or the end of the input."""
+    """Yield base_from_gripper (4,4) of each typed line, until an empty line or the end of the input.
+
+    `show` prints the prompt, and the reason why a line is refused.
+    """
     while True:
         show(f"pose at rest ({pose_columns(convention, units)}; empty line ends):")
         line = next(lines, "").strip().strip("[]p")

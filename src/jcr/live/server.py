@@ -1,8 +1,8 @@
 """HTTP server of a capture: the live page with its commands, and gripper poses from a program (`POST /sample`).
 
 Every request needs the session key, in the path of the page or in the header `Authorization` of a sample. The header
-`Host` must name this server (DNS rebinding), and a browser's `Origin` must be the page's own: no other web site can
-read the capture, command it or add a pose.
+`Host` must name this server (protection against DNS rebinding), and the header `Origin` of a browser must be that of the
+page. Other web sites can therefore not read the capture, send commands or add a pose.
 """
 
 import hmac
@@ -30,11 +30,12 @@ from jcr.live.session import LiveSession
 
 LOOPBACK = "127.0.0.1"
 TIMEOUT_S = 10.0
-"""Longest time in which a request must be complete."""
+"""Time (s) within which a request must be complete."""
 MAX_COMMAND, MAX_SAMPLE = 1000, 65_536
-"""Largest body in bytes."""
+"""Largest bodies (bytes) of a command and of a sample."""
 OPEN_S, LAST_S = 4.0, 30.0
-"""Time since its last request in which a page counts as open, and longest time in which it can fetch the result."""
+"""Time (s) after its last request for which a page counts as open, and longest time (s) that the server waits at the
+end until an open page has the last state."""
 HTML = "text/html; charset=utf-8"
 POLICY = (
     "default-src 'none'; img-src 'self' blob: data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
@@ -51,7 +52,7 @@ HEADERS = {
 
 
 class _Command(BaseModel):
-    """Command of the page."""
+    """Command that the page sends: an action, and the number of its image, counted from 1 (None: the last)."""
 
     model_config = ConfigDict(strict=True)
     action: Action
@@ -59,7 +60,7 @@ class _Command(BaseModel):
 
 
 class LiveServer(ThreadingHTTPServer):
-    """HTTP server of a session while it is entered; closing waits for requests that are being answered."""
+    """HTTP server of a session, which serves inside its `with` statement; leaving waits for requests in progress."""
 
     daemon_threads = False
 
@@ -71,10 +72,10 @@ class LiveServer(ThreadingHTTPServer):
         token: str | None = None,
         takes_samples: bool = False,
     ) -> None:
-        """Bind the address; raise InputError where that fails, or the address would be open to others.
+        """Bind the address; raise InputError if that fails, or if another machine could connect without a token.
 
-        `host` is loopback, or the one host name that is answered, which needs a `token`, the key of the session; None:
-        a random one. `port` 0 is any free one. `takes_samples`: programs post gripper poses.
+        `host` is loopback, or the one host name that requests may use; that needs a `token`. `token` is the key of the
+        session; None: a random key. `port` 0: any free port. `takes_samples`: programs may post gripper poses.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError(
@@ -91,9 +92,9 @@ class LiveServer(ThreadingHTTPServer):
         self.session, self.key, self.host = session, token or secrets.token_urlsafe(16), host
         self.takes_samples = takes_samples
         self.sampled_s = time.monotonic()
-        """Time of the last sample; infinite while one is answered."""
+        """Time (s, monotonic clock) of the last sample; infinite while a sample is being answered."""
         self._page_version, self._page_s = -1, -np.inf
-        """Version of the state that the page has, and the time of its last request."""
+        """Version of the state that the page shows, and time (s, monotonic clock) of the page's last request."""
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -102,17 +103,17 @@ class LiveServer(ThreadingHTTPServer):
         self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
         """Accepted values of the header Host."""
         self.address = f"http://{self.hosts[0]}/{self.key}/"
-        """Address of the page, key included."""
+        """URL of the page, which includes the key."""
 
     @property
     def report(self) -> Path | None:
-        """Report of the calibration at the end; None while there is none."""
+        """File of the report on the final calibration; None if it does not exist."""
         result = self.session.state.result
         file = None if result is None else result.out / "report.html"
         return file if file is not None and file.is_file() else None
 
     def await_samples(self, timeout_s: float) -> None:
-        """Return when the session is over; raise InputError after `timeout_s` without a sample."""
+        """Wait until the session is over; raise InputError after `timeout_s` seconds without a sample."""
         while not self.session.state.is_over:
             if time.monotonic() - self.sampled_s > timeout_s:
                 raise InputError(
@@ -122,16 +123,16 @@ class LiveServer(ThreadingHTTPServer):
             time.sleep(0.1)
 
     def page_has(self, version: int) -> None:
-        """Note the version of the state that the page has."""
+        """Record that the page requested its state now, and the version of the state that it shows."""
         self._page_version, self._page_s = max(self._page_version, version), time.monotonic()
 
     def __enter__(self) -> "LiveServer":
-        """Serve in a thread."""
+        """Start to serve requests in a thread."""
         threading.Thread(target=self.serve_forever, daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Let an open page fetch the last state and send the last answers, then stop."""
+        """Wait, for LAST_S at most, until an open page has the last state; then stop the server."""
         end = time.monotonic() + LAST_S
         while time.monotonic() < end and (
             time.monotonic() - self._page_s < OPEN_S and self._page_version < self.session.state.version
@@ -141,20 +142,20 @@ class LiveServer(ThreadingHTTPServer):
         self.server_close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore connections that the client closed; report anything else."""
+        """Ignore errors of connections that the client closed; report all others."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)  # pyright: ignore[reportArgumentType]
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Handler of one request."""
+    """Handler of one HTTP request to a LiveServer."""
 
     timeout = TIMEOUT_S
     server_version, sys_version = "jcr", ""
     server: LiveServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
-        """Answer a request of the page."""
+        """Answer a GET request of the page: page, state, camera image, images of the list, or report."""
         if (path := self._path()) is None:
             return
         path, _, query = path.partition("?")
@@ -163,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "":
             self._send(whole_page(session).encode(), HTML)
         elif path == "state":
-            # Only the version where the page has the state.
+            # A page that has the newest state gets its version alone.
             has_it = query.removeprefix("version=") == str(state.version)
             server.page_has(state.version if has_it else -1)
             has_report = server.report is not None
@@ -181,7 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(status=404)
 
     def do_POST(self) -> None:
-        """Obey a command of the page, or take a sample."""
+        """Execute a command of the page, or take an image at the gripper pose of a posted sample."""
         if self.path == "/sample":
             self._send_json(*self._sampled())
         elif (path := self._path()) is not None:
@@ -196,7 +197,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(status=400 if is_own else 403)
 
     def _sampled(self) -> tuple[dict[str, Any], int]:
-        """Take an image at the pose in the body; return the answer and the status."""
+        """Take an image at the gripper pose in the request's body; return the answer and the HTTP status."""
         server, why, status = self.server, None, 400
         key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
         if self.headers.get("Host") not in server.hosts or not self._is_key(key):
@@ -219,16 +220,16 @@ class _Handler(BaseHTTPRequestHandler):
                 server.sampled_s = np.inf
                 answer = server.session.take(RobotState(time.monotonic(), pose), waits=True)
                 server.sampled_s = time.monotonic()
-                # The status tells whether the image is kept, for programs that read a line only.
+                # Programs that do not parse the body see from the status whether the image is kept.
                 return answer, 200 if answer["accepted"] else 422
         return {"accepted": False, "reason": why}, status
 
     def _is_own_origin(self) -> bool:
-        """Test whether a browser's request comes from the page."""
+        """Test whether the header `Origin` is that of this server's page."""
         return self.headers.get("Origin") in [f"http://{host}" for host in self.server.hosts]
 
     def _path(self) -> str | None:
-        """Return the path behind the key; None, after an answer, where host or key are wrong."""
+        """Return the request's path after the key; None if host or key are wrong, after an error was sent."""
         key, slash, path = self.path.removeprefix("/").partition("/")
         if self.headers.get("Host") not in self.server.hosts:
             self._send(status=403)
@@ -239,20 +240,23 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _is_key(self, given: str) -> bool:
-        """Compare a key in constant time."""
+        """Test whether a key is that of the session, in constant time."""
         return hmac.compare_digest(given.encode(), self.server.key.encode())
 
     def _body(self, most: int) -> bytes | None:
-        """Return the body; None where its length is not stated or above `most`."""
+        """Return the request's body; None if its length is not stated or exceeds `most` bytes."""
         length = self.headers.get("Content-Length", "")
         return self.rfile.read(int(length)) if length.isdecimal() and int(length) <= most else None
 
     def _send_json(self, content: dict[str, Any], status: int = 200) -> None:
-        """Send a response of JSON."""
+        """Send a response with JSON content."""
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
     def _send(self, body: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> None:
-        """Send a response with the headers that keep other sites out."""
+        """Send a response of MIME type `kind`, with HEADERS, which protect it from other web sites.
+
+        An underscore in the name of a keyword argument becomes a hyphen in the header.
+        """
         self.send_response(status)
         own = {"Content-Type": kind, "Content-Length": str(len(body))} | headers
         for name, value in (own | HEADERS).items():
@@ -261,13 +265,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Log nothing: the terminal shows the capture."""
+        """Log nothing, because the terminal shows the progress of the capture."""
 
 
 def sample_pose(body: bytes) -> Float[ndarray, "4 4"] | None:
-    """Return base_from_gripper of a sample, None where the client is done; raise InputError where there is neither.
+    """Return base_from_gripper (4,4) from the body of a sample; None if the client ends the capture.
 
-    A sample is `{"base_from_gripper": …}`, `{"done": true}`, or the 6, 7 or 16 numbers of the pose alone.
+    The body is JSON: `{"base_from_gripper": …}`, or the 6, 7 or 16 numbers of the pose alone, or `{"done": true}`.
+    Raises InputError for anything else.
     """
     try:
         message = json.loads(body)

@@ -1,6 +1,6 @@
-"""Session of a capture: images on request, commands of a person, and the calibration in a thread of its own.
+"""Session of a live capture: images on request, commands of a person, and the calibration in a separate thread.
 
-Requests and commands may come from any thread (HTTP server, terminal, arm) and are served one after the other.
+Requests and commands may come from any thread (HTTP server, terminal, arm) and are executed one after the other.
 """
 
 import threading
@@ -26,15 +26,16 @@ if TYPE_CHECKING:
     from jcr.result import RunResult
 
 SAME_PLACE = (0.005, np.radians(1.0))
-"""m, rad: a second image from within this adds nothing."""
+"""Smallest difference (m, rad) between the gripper poses of two images; a closer image would add no information."""
 ENOUGH_IMAGES, MOST_IMAGES = 12, 40
-"""Default number of images of a capture, and of one that ends when it is accurate enough."""
+"""Default largest number of images: of a capture, and of one with --until-accurate."""
 LEAST_IMAGES = 3
 """Least number of images of a calibration."""
 LONGEST_S, INTERRUPTED_S = 60.0, 10.0
-"""Longest time that the end of a capture, or its interruption, waits for the calibration of the last images."""
+"""Longest wait (s) for the calibration of the last images: at the end of a capture, and after an interruption."""
 
 Answer = dict[str, Any]
+"""Answer to a request or command, as values of JSON: whether it is accepted, the reason, and so on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class SessionOptions:
 
     @property
     def most(self) -> int:
-        """Number of images with which the capture ends in any case."""
+        """Number of images at which the capture ends, even if it is not accurate enough."""
         return self.images or (MOST_IMAGES if self.until_accurate else ENOUGH_IMAGES)
 
 
@@ -69,32 +70,34 @@ class SessionState:
     version: int = 0
     """Number that grows with every change."""
     event: str = ""
-    """Last event in words; empty where the rest of the state shows it."""
+    """Last event in words; empty if the other fields show it."""
     is_refusal: bool = False
-    """Whether the event is the reason why an image was not kept."""
+    """Whether the event is the reason why a request or command was refused."""
     images: tuple[FrameEntry, ...] = ()
+    """Entries of the images in capture.json."""
     can_undo: bool = False
-    """Whether there is a change that can be taken back."""
+    """Whether a change can be undone."""
     progress: Progress = Progress(images=())
-    """Last state of the calibration, which may have fewer images."""
+    """Last state of the calibration; the newest images may be missing in it."""
     is_over: bool = False
-    """Whether no more images are taken."""
+    """Whether the capture has ended: no more images are taken."""
     is_done: bool = False
-    """Whether the session has its last state."""
+    """Whether this is the last state of the session."""
     result: "RunResult | None" = None
-    """Calibration of all images, at the end."""
+    """Final calibration of all images; None before the end, or if it failed."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the images."""
+        """Names of the images, in the order in which they were taken."""
         return tuple(one.image for one in self.images)
 
 
 class LiveSession:
-    """Capture that is taken with a camera, image by image, and calibrated meanwhile.
+    """Live capture: takes images with a camera on request, and calibrates them in a thread meanwhile.
 
-    `tell` receives each answer and each state of the calibration, with the lines that a person reads. `gripper` reads
-    the present state of the arm, for an image on command and after each image; None where poses are typed or posted.
+    `tell` is called with each answer and each state of the calibration, as JSON and as lines for a person. `gripper`
+    returns the present state of the arm. It is called for an image on command, and after each image to detect motion;
+    None: poses are typed or posted.
     """
 
     def __init__(
@@ -106,32 +109,32 @@ class LiveSession:
         notation: Notation | None = None,
         gripper: Callable[[], RobotState] | None = None,
     ) -> None:
-        """Prepare a session; `run` starts it."""
+        """Prepare a session that adds images to `calibration`; `run` starts the session."""
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
         self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)
         self._tell, self._gripper = tell, gripper
         self._frames = iter(camera.frames)
         self._lock = threading.RLock()
-        """Held while an image is taken or a command is obeyed."""
+        """Lock that is held while an image is taken or a command is executed."""
         self._changed = threading.Condition()
-        """Notified when the state changes."""
+        """Condition that is notified when `state` changes."""
         self.state = SessionState(images=self.folder.images)
         self._calibrated: tuple[str, ...] | None = None
         self._error: Exception | None = None
         self._worker = ThreadPoolExecutor(1)
-        """Thread of the calibration, which follows each change."""
+        """Thread that calibrates after each change of the images."""
         self._following: Future[None] = Future()
-        """Last calibration that was asked for."""
+        """Last calibration that was requested from the worker."""
 
     def run(self, source: Callable[[], None] | None = None) -> None:
-        """Take images until there are enough, the source or the video ends, or the requirement ends the capture.
+        """Run the session until there are enough images, `source` or the video ends, or the requirement is met.
 
-        `source` calls `take` in a thread of its own; None where requests come from elsewhere. Raises the error of the
-        source or the camera.
+        `source` is a function that calls `take` for each image; it runs in a separate thread. None: other threads call
+        `take`. Raises the error with which the source or the camera ended.
         """
 
         def request() -> None:
-            """Run the source; its end is the end of the capture."""
+            """Run `source`, then end the capture, with the error of the source if there is one."""
             error = None
             try:
                 source()  # pyright: ignore[reportOptionalCall]
@@ -149,7 +152,7 @@ class LiveSession:
                 self._changed.wait_for(lambda: self.state.is_over)
             longest_s, abandon = LONGEST_S, self._error is not None
         finally:
-            # Wait until all images are calibrated, or where the capture was abandoned the present ones.
+            # Wait until all images are calibrated; after an interruption or error, for the running calibration only.
             self.end()
             self._worker.shutdown(wait=False, cancel_futures=abandon)
             wait([self._following], longest_s)
@@ -157,24 +160,24 @@ class LiveSession:
             raise self._error
 
     def end(self, error: Exception | None = None) -> None:
-        """Take no more images; `error` is raised by `run`."""
+        """End the capture: no more images are taken. `run` then raises `error`, if there is one."""
         if not self.state.is_over:
             self._error = error
         self._show(self.state.event, is_over=True)
 
     def watch(self, states: States) -> None:
-        """Take an image whenever the arm rests in a new place, until the session is over."""
+        """Take an image whenever the arm comes to rest at a new pose, until the capture has ended."""
         last, limit = None, MOVED_ON
         while not self.state.is_over:
             state = next_rest(states, last, limit)
-            # The connection is closed meanwhile: states that wait would be old.
+            # The connection is closed while an image is taken, because buffered states would be out of date.
             answer = self.take(state)
             last, limit = state.base_from_gripper, MOVED_ON if answer["accepted"] else TRY_AGAIN
 
     def take(self, state: RobotState, waits: bool = False) -> Answer:
-        """Take an image where the arm rests, let its calibration follow, and return whether it is kept.
+        """Take an image at the state of an arm at rest, start its calibration, and return whether the image is kept.
 
-        With `waits` the answer has the calibration with that image and the next pose, seconds later.
+        `waits`: wait some seconds for the calibration, and add it and the next pose to the answer.
         """
         with self._lock:
             if self.state.is_over:
@@ -203,7 +206,7 @@ class LiveSession:
         return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
-        """Obey a command; `number` counts images from 1, None: the last one."""
+        """Execute a command of a person; `number` is the image, counted from 1; None: the last one."""
         with self._lock:
             names = self.folder.names
             number = len(names) if number is None else number
@@ -233,7 +236,7 @@ class LiveSession:
                         self._refuse(f"refused: {error}")
 
     def finish(self) -> "RunResult | None":
-        """Return the calibration of all images; None, with a line that says why, where there is none."""
+        """Calibrate all images and return the result; None with fewer than three images, or if it failed."""
         if self.state.result is None and len(self.folder.names) >= LEAST_IMAGES:
             self._show(f"calibrating all {len(self.folder.names)} images", is_over=True)
             try:
@@ -244,7 +247,7 @@ class LiveSession:
         return self.state.result
 
     def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
-        """Return a frame at rest; raise InputError with the reason why none is kept."""
+        """Return a frame at rest at a gripper pose (4,4); raise InputError with the reason if there is none to keep."""
         images = self.folder.images
         for one in images:
             if not is_farther(one.base_from_gripper, base_from_gripper, SAME_PLACE):
@@ -269,16 +272,19 @@ class LiveSession:
         return found
 
     def _refuse(self, event: str) -> None:
-        """Show and tell why something was not done."""
+        """Publish an event as a refusal: the reason why a request or command was not executed."""
         self._say(event, {"accepted": False, "reason": event.removeprefix("refused: ")})
 
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
-        """Let the worker calibrate the images where they changed, and propose a pose away from a refused one."""
-        with suppress(RuntimeError):  # The worker has ended, with the session.
+        """Request `_calibrate` from the worker thread; `refused` is a gripper pose at which no image could be kept."""
+        with suppress(RuntimeError):  # After the end of the session the worker accepts no requests.
             self._following = self._worker.submit(self._calibrate, refused)
 
     def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
-        """Calibrate the images where they changed, and propose another pose, in the worker's thread."""
+        """Calibrate the images if they changed; then propose a pose distant from `refused`, unless that is None.
+
+        With --until-accurate, end the capture if the calibration of all images meets the requirement.
+        """
         try:
             if tuple(self.folder.names) != self._calibrated:
                 progress = self.calibration.update()
@@ -299,7 +305,7 @@ class LiveSession:
             self.end(error)
 
     def _report(self, progress: Progress) -> None:
-        """Show and tell a state of the calibration."""
+        """Publish a new state of the calibration, on the page and through `tell`."""
         with self._changed:
             state = self.state
             is_shown = not state.is_refusal and progress.images == state.names
@@ -307,12 +313,12 @@ class LiveSession:
         self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
-        """Show and tell an event; an answer that accepts nothing is a refusal."""
+        """Publish an event, on the page and through `tell`; `changes` are other fields of SessionState."""
         self._show(event, is_refusal=not answer.get("accepted", True), **changes)
         self._tell(answer, [event])
 
     def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
-        """Replace the state by one with an event and other fields."""
+        """Replace `state` by one with this event and these fields, and notify waiting threads."""
         with self._changed:
             changes["is_over"] = self.state.is_over or changes.get("is_over", False)
             self.state = replace(
