@@ -185,7 +185,7 @@ def accuracy_line(state: Progress) -> str:
 def pose_lines(
     pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
 ) -> list[str]:
-    """Return lines with a gripper pose in a notation, for a UR also as URScript, and with joint angles (rad) if given."""
+    """Return lines with a gripper pose in a notation, for a UR also as URScript, and with the joint angles (rad)."""
 
     def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
         """Return numbers with `digits` decimals, separated by commas."""

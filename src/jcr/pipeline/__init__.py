@@ -1,1 +1,1 @@
-"""Pipeline from a capture to a run folder: stages, their files, and the commands that run them."""
+"""Pipeline from a capture to a run folder: its stages, the files that they write, and functions that run them."""

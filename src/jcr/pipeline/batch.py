@@ -1,4 +1,4 @@
-"""Runs of many captures, over processes of this machine or a Ray cluster, and a table that ranks them."""
+"""Runs of many captures, in processes of this machine or on a Ray cluster, and a table that ranks their results."""
 
 import csv
 import io
@@ -30,40 +30,50 @@ from jcr.report.render import render
 from jcr.result import CAPTURE, RunOptions, load_run
 
 RETRIES = 3
-"""Number of times a task is started again whose Ray node died."""
+"""Number of times that Ray starts a task again after its node failed."""
 MIN_EPISODES = 3
-"""Smallest number of accepted episodes of which most can agree."""
+"""Smallest number of accepted episodes of a data set whose cameras are compared with each other."""
 MOVED_P = 1e-3
-"""Chance of a difference between two episodes below which the camera moved; the false-alarm rate of `jcr verify`."""
+"""p-value of the difference between two episodes' cameras below which the camera moved, as in `jcr verify`."""
 THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
-"""Variables from which numerical libraries read their number of threads when a process starts."""
+"""Environment variables from which numerical libraries read their number of threads when a process starts."""
 
 Task = tuple[Path, Path, RunOptions, ReadOptions]
-"""Capture, run folder and options: the arguments of `run_one`."""
+"""Path of a capture, its run folder, and the options to run and to read it: the arguments of `run_one`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRow:
-    """Row of the table: one capture."""
+    """Row of the table of a batch: capture, status, accuracy, and the reason of a problem."""
 
     capture: str
+    """Path of the capture."""
     out: str
+    """Run folder."""
     status: Verdict | Literal["failed"]
+    """Verdict on the calibration; "failed": there is none because of an error."""
     backend: str = ""
     images: int = 0
+    """Number of images of the capture."""
     used: int = 0
+    """Number of images that the calibration uses."""
     offset_std_mm: float | None = None
-    """One sigma of the camera's translation along its worst axis; `turn_std_deg` is that of its rotation."""
+    """Standard deviation of the camera's translation along the worst axis; None without a calibration."""
     turn_std_deg: float | None = None
+    """Standard deviation of the camera's rotation about the worst axis; None without a calibration."""
     scale_std_percent: float | None = None
     held_out_mm: float | None = None
+    """Translation of the leave-one-out error."""
     held_out_deg: float | None = None
+    """Rotation of the leave-one-out error."""
     moved_mm: float | None = None
-    """Translation from the camera that most episodes of the data set agree on; `moved_deg` is the rotation."""
+    """Distance of the camera from its pose in most episodes of the data set; None with fewer than MIN_EPISODES."""
     moved_deg: float | None = None
+    """Rotation angle of the camera from its pose in most episodes."""
     seconds: float = 0.0
+    """Duration of the run."""
     reason: str = ""
-    """Why it failed or is rejected, a camera that moved between episodes, or its first warning."""
+    """Reason of a failure or rejection, or that the camera moved between episodes, or else the first warning."""
 
     @property
     def is_accepted(self) -> bool:
@@ -79,11 +89,11 @@ def batch(
     progress: Progress | None = None,
     read: ReadOptions | None = None,
 ) -> list[BatchRow]:
-    """Run every capture into a folder of its own in `out`; summary.csv and summary.html rank them, best first.
+    """Run every capture into its own folder inside `out`; write summary.csv and summary.html, best calibration first.
 
-    A capture that fails fails alone. One that was finished from the same inputs and options is not run again. Each
-    episode that `read` names is a capture of its own, and its camera is compared with that of the other episodes.
-    Raises InputError for options that mean nothing.
+    A capture that fails does not stop the others. A capture that was finished with the same inputs and options is not
+    run again. Each episode that `read` names is run as a separate capture, and the cameras of the episodes are compared.
+    Raises InputError for invalid options.
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")
@@ -111,7 +121,7 @@ def batch(
 
 
 def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
-    """Run one capture, unless it is finished, and return its row; an error is in the row."""
+    """Run one capture, unless its folder has the finished run, and return its row; errors are reported in the row."""
     start, reason = time.perf_counter(), ""
     row = BatchRow(capture=str(capture), out=str(out), status="failed")
     try:
@@ -123,7 +133,7 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
             content, reason = load_run(out).calibration, str(error)
     except InputError as error:
         return replace(row, reason=str(error))
-    except Exception as error:  # a bug shows in its row, and does not take the other captures with it
+    except Exception as error:  # a bug is reported in the row, and does not stop the other captures
         return replace(row, reason=f"{type(error).__name__}: {error}")
     uncertainty, held_out = content.uncertainty, content.held_out
     named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
@@ -144,9 +154,9 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
 
 
 def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
-    """Return the rows with the difference of each episode's camera from the one that most episodes agree on.
+    """Return the rows with `moved_mm` and `moved_deg`, and a reason where the camera moved significantly.
 
-    The common camera is that of the episode with the smallest median χ² to the others of its data set.
+    The reference of a data set is the camera of the episode whose median χ² difference to all episodes is the smallest.
     """
     found = list(rows)
     for capture in {row.capture for row in rows}:
@@ -166,26 +176,26 @@ def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
 
 
 def _failed(task: Task, reason: str) -> BatchRow:
-    """Return the row of a capture that failed."""
+    """Return the row of a task that failed for this reason."""
     return BatchRow(capture=str(task[0]), out=str(task[1]), status="failed", reason=reason)
 
 
 def _rank(row: BatchRow) -> tuple[int, float, str]:
-    """Return the key by which rows are ranked: status, uncertainty of the translation, name."""
+    """Return the sort key of a row: status, standard deviation of the translation, path of the capture."""
     order = (*get_args(Verdict), "failed").index(row.status)
     return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
 
 
 def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
-    """Yield the row of each task as its process ends; the processes share the cores."""
-    # macOS cannot bind a process to cores.
+    """Yield the row of each task when it ends; the tasks run in processes, which divide the cores among them."""
+    # macOS has no sched_getaffinity, because it cannot bind a process to cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(options.processes or max(1, cores // 2), len(tasks))
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(THREADS, str(max(1, cores // processes))))
     try:
         left = yield from _over_pool(tasks, processes)
-        # A process that was killed takes its pool along; alone, only the capture that did it fails.
+        # A process that is killed ends its whole pool. Each unfinished task is therefore run again in its own pool.
         for task in left:
             if (yield from _over_pool([task], 1)):
                 yield _failed(task, "its process died: out of memory, or a crash in a library")
@@ -195,10 +205,10 @@ def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Batch
 
 
 def _over_pool(tasks: list[Task], processes: int):
-    """Yield rows as they come; return the tasks that a broken pool left undone."""
+    """Yield the row of each task when it ends; return the tasks that are unfinished because a process was killed."""
     left: list[Task] = []
-    # Spawned, not forked: libraries with threads of their own do not survive a fork. Ctrl-C, which reaches every process
-    # of the terminal, ends each without a report.
+    # Processes are spawned, because libraries with threads do not survive a fork. Ctrl-C, which reaches every process of
+    # the terminal, ends each of them without a traceback.
     context, on_interrupt = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
     pool = ProcessPoolExecutor(processes, context, initializer=signal.signal, initargs=on_interrupt)
     try:
@@ -218,7 +228,7 @@ def _over_pool(tasks: list[Task], processes: int):
 
 
 def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
-    """Yield the row of each task as it ends on the cluster; raise InputError where no node can run one."""
+    """Yield the row of each task when it ends on the Ray cluster; raise InputError if no node has enough resources."""
     extra("ray", "cluster", "--ray")
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
@@ -233,7 +243,7 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
         cpus, gpus = options.cpus_per_task, options.gpus_per_task
         resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in resources):
-            # Ray would wait for such a node without end.
+            # Ray would wait forever for a node with enough resources.
             raise InputError(
                 f"--ray {options.ray}: no node has the {cpus} cores and {gpus:g} GPUs that a capture takes; "
                 "lower --cpus-per-task or --gpus-per-task, or add the node first"
@@ -253,7 +263,7 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
 
 
 def _write_summary(out: Path, rows: Sequence[BatchRow]) -> None:
-    """Write the table as CSV and as a page."""
+    """Write the table as summary.csv and as the page summary.html, with links to the reports."""
     text, content = io.StringIO(), [asdict(row) for row in rows]
     table = csv.DictWriter(text, list(content[0]), lineterminator="\n")
     table.writeheader()

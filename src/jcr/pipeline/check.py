@@ -1,4 +1,4 @@
-"""Check of a capture before any heavy work: files, motion, features, poses to add, and the pose convention."""
+"""Quick check of a capture before a run: files, motion, features, gripper poses to add, and the pose convention."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -48,51 +48,53 @@ from jcr.rounding import significant
 from jcr.sfm.colmap import reconstruct_colmap
 
 CLEARER = 3.0
-"""Factor by which poses in one convention must fit the images better than in the others."""
+"""Factor by which the poses of one convention must fit the images better than those of any other to be selected."""
 QUICK, QUICK_SIZE_PX = 8, 800
-"""Number of images that are registered first, and their long side (px): both take seconds."""
+"""Number of images of the quick reconstruction, and their longer side (px), so that it takes seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """Result of the check of a capture."""
+    """Result of the check of a capture: motion, expected uncertainty, poses to add, findings, and notes."""
 
     sharpness: Float[ndarray, " n"]
-    """Variance of the Laplacian, relative to the median image's; empty where there are no images."""
+    """Variance of the Laplacian of each image, divided by the median; empty for a capture without images."""
     largest_move_m: float
+    """Largest distance between the gripper's origins in two poses."""
     largest_rotation_rad: float
     """Largest angle between two gripper poses."""
     observability: Observability
     expected: Uncertainty | None
-    """Uncertainty that a calibration of the counted images would report; None of fewer than three."""
+    """Predicted uncertainty of a calibration from the `counted` images; None for fewer than three of them."""
     counted: Int[ndarray, " c"]
-    """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
+    """Rows of the images that are expected to register: those that did or, if not all were tried, the clear ones."""
     suggestions: tuple[NextPose, ...]
+    """Gripper poses to add, best first."""
     hand_eye: Calibration | None
-    """The calibration by sparse features; None where the images were not registered."""
+    """Calibration from sparse features, or from given camera poses; None if no images were registered."""
     findings: tuple[Finding, ...]
     """Findings of the calibration and of the images, strongest first."""
     notes: tuple[str, ...]
-    """Remarks on the files, their exposure and their pairing, in words."""
+    """Sentences on the files, the exposure of images, and the pairing of images with poses."""
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict that a calibration of the capture is expected to get."""
+        """Expected verdict on a calibration of the capture."""
         return verdict_of(self.findings)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Comparison:
-    """Comparison of gripper poses with cameras."""
+    """Comparison of gripper poses with camera poses, by a calibration of both."""
 
     hand_eye: Calibration | None = None
-    """None where no cameras were found."""
+    """Calibration; None if no camera poses were found."""
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     registered: Int[ndarray, " c"] | None = None
-    """Rows of the images that a calibration would use; None where not all were looked at."""
+    """Rows of the images that the calibration uses; None if only some of the images were compared."""
     assumptions: Assumptions | None = None
-    """Camera and robot as found; None where nothing was found, or it would be rejected."""
+    """Camera and robot as the calibration estimates them; None if there is none, or it is rejected."""
 
 
 def check_capture(
@@ -105,12 +107,13 @@ def check_capture(
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
-    """Examine a capture, or what lies at its path.
+    """Examine a capture, or the capture at a path: its motion, images, expected uncertainty, and poses to add.
 
-    With `look` the images are registered sparsely and compared with the poses: a few at a small size, and all of them
-    where these speak against the capture or `thorough` is set. Given camera poses are compared instead of images.
-    `suggest` is the number of gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. Raises InputError
-    where gripper poses and joint angles contradict each other.
+    `look`: reconstruct the images from sparse features and compare the cameras with the gripper poses. A few reduced
+    images are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have given
+    camera poses, which are compared instead. `suggest` is the number of gripper poses to propose, `robot_noise` (m, rad)
+    one sigma per axis, and `reach` (2,3) the box (m, base frame) of proposed positions. Raises InputError if gripper
+    poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)[0]
@@ -160,7 +163,10 @@ def check_capture(
 def _look(
     capture: Capture, views: tuple[Finding, ...]
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, " n"], list[str]]:
-    """Return the rows of clear images, the relative sharpness of every image, and remarks on exposure."""
+    """Return the rows of well exposed sharp images, the relative sharpness of every image, and remarks on exposure.
+
+    `views` are the findings of the images alone, which name the blurred images.
+    """
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
@@ -179,9 +185,10 @@ def _compare_with_images(
     progress: Progress | None,
     thorough: bool,
 ) -> _Comparison:
-    """Compare the gripper poses with cameras from features, by a calibration and the poses that it left out.
+    """Compare the gripper poses with camera poses from features, by a calibration.
 
-    Few small images are compared first and, where these are not enough, all of them.
+    First QUICK images of reduced size are compared; then all images if `thorough` is set, or if the first comparison
+    fails, is rejected, or does not use all QUICK images.
     """
     is_quick = not thorough and len(capture) > QUICK
     tried, of_tried, size_px = capture, robot, WORKING_SIZE_PX
@@ -212,7 +219,7 @@ def _compare_with_images(
 
 
 def _compare_pairs(pairs: PosePairs, options: CalibrateOptions) -> _Comparison:
-    """Compare gripper poses with camera poses that were given, by the calibration of both."""
+    """Compare the gripper poses with the given camera poses, by a calibration."""
     hand_eye = calibrate_pose_pairs(pairs, options)
     used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
@@ -233,10 +240,10 @@ def read_and_compare(
     into: str | Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[Capture | PosePairs, ReadOptions]:
-    """Read a capture; where its file leaves the pose convention open, find the one that the images fit.
+    """Read a capture; if its file does not determine the pose convention, select the one that fits the images best.
 
-    Return the capture, with a note on the convention, and the options that read it. Raises InputError where the poses of
-    no convention agree with the images far better than those of the others.
+    Return the capture, with a note on the selected convention, and the options with which it was read. Raises InputError
+    if the best convention does not fit CLEARER times better than the second.
     """
     options = options or ReadOptions()
     with suppress(OpenConventionError):
@@ -266,9 +273,10 @@ def read_and_compare(
 def _fits(
     read: list[tuple[Capture, ReadOptions]], progress: Progress | None
 ) -> list[tuple[float, str, Capture, ReadOptions]]:
-    """Return the difference (m, and in words) of each capture's poses from the images, best first.
+    """Return (error in m, error in words, capture, options) of each reading of a capture, best fit first.
 
-    The list is empty where few small images give no cameras.
+    The error is the median residual between gripper poses and camera poses from a few reduced images. The list is empty
+    if these images cannot be reconstructed.
     """
     rows = spread_rows(len(read[0][0]))
     try:
@@ -279,7 +287,7 @@ def _fits(
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
         fit = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False)
-        # The noise of a rejected fit is the assumed one, and says nothing of the poses.
+        # Residuals are used, because the noise of a rejected fit is an assumption and does not depend on the poses.
         residuals = [(one.translation_residual_mm, one.rotation_residual_deg) for one in fit.images]
         mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
         off = f"{significant(mm)} mm and {significant(deg)}°"
@@ -288,5 +296,5 @@ def _fits(
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
-    """Return the rows of the images, out of `count`, that are examined first."""
+    """Return up to QUICK rows, spread evenly over `count` images."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)

@@ -1,4 +1,4 @@
-"""Options of batch and verify, apart from their modules, so that help of the command line loads fast."""
+"""Options of `jcr batch` and `jcr verify`, separate from their modules so that the command-line help loads fast."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Commands that make a run: the stages in order, into a run folder from whose files any of them can start again."""
+"""Functions that run the stages of a run in order and write its folder; a later call reuses the finished files."""
 
 import threading
 import time
@@ -56,11 +56,11 @@ def run(
     progress: Progress | None = None,
     calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
-    """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
+    """Calibrate a capture, or the capture at a path; write calibration, cloud, map and report to the folder `out`.
 
-    `backend` (auto, or a name of `jcr models`) takes the place of that of `options`. Finished stages are reused from
-    `out` if capture and options are unchanged, and so is a whole run. Without torch there is no map, and a note says how
-    to add it. `calibrated` is called with the calibration before depth and map are made. Raises InputError if the input
+    `backend` ("auto", or a name of `jcr models`) replaces the one of `options`. A finished reconstruction or run in
+    `out` is reused if capture and options are unchanged. Without torch there is no map, and a note says how to add it.
+    `calibrated` is called with the calibrated result before depth and map are computed. Raises InputError if the input
     cannot be used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
     out, report = Path(out), progress or silent
@@ -82,7 +82,7 @@ def run(
                 raise NothingFoundError(RejectedError(before.doubt))
             return before
         if options.map is not None:
-            # Torch takes more than a second to import, loops of depth as long to load; COLMAP leaves a core idle.
+            # Torch and the compiled loops of depth take over a second each to load; COLMAP leaves a core free for them.
             threading.Thread(target=_load_map_code, daemon=True).start()
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
@@ -101,16 +101,16 @@ def calibrate(
     backend: BackendName | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Calibrate a capture and write calibration and report to the folder `out`; raises as `run` does.
+    """Calibrate a capture without a map; write calibration and report to the folder `out`; raises as `run` does.
 
-    No dense depth is estimated: only a map and a known length need it, and `build_map` adds it if it is missing.
+    Dense depth is estimated only if a known length needs it; `build_map` estimates it later for a map.
     """
     options = replace(checked_options(options, RunOptions), map=None)
     return run(capture, out, options, backend=backend, progress=progress)
 
 
 def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None) -> RunResult:
-    """Write calibration.json and report to the folder `out`, from camera poses that were given, without images."""
+    """Calibrate from given camera poses, without images; write calibration.json and report to the folder `out`."""
     from jcr.report.html import report_html
 
     out = Path(out)
@@ -136,10 +136,11 @@ def build_map(
     read: ReadOptions | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Build cloud, map and report again, from the capture and the calibration of the run folder `out`.
+    """Build cloud, map and report of the run folder `out` again, from its capture and calibration.
 
-    `add` are captures of further images, oldest first, read with the options `read`. They change the map but not the
-    calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
+    `add` are captures of later images of the scene, oldest first, which are read with the options `read`. They change
+    the map but not the calibration, and are used in every later map of the folder. Dense depth is estimated if the
+    folder has none.
     """
     before, report = RunResult(out), progress or silent
     options = replace(
@@ -210,11 +211,11 @@ def measure(out: str | Path) -> "Measurement":
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """Return the options, without the map where none can be made, and a note on the package that it needs.
+    """Return the options, without the map if none can be made, and a note on the packages that are missing for it.
 
-    Raises InputError where a map is wanted, and the dense depth that it needs is not.
+    Raises InputError if the options want a map but no dense depth, which the map needs.
     """
-    # What a camera on the base sees moves with the gripper, not with the base.
+    # A fixed camera observes the object that the gripper carries; a map would not be fixed in the base frame.
     if options.map is None or capture.mount == "base":
         return replace(options, map=None), None
     if not options.depth.dense:
@@ -228,7 +229,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | 
 
 
 def _load_map_code() -> None:
-    """Import what depth and a map need; an error shows again where these are made."""
+    """Import the modules that depth and map need; errors are ignored, because the stages raise them again."""
     with suppress(Exception):
         from jcr.depth.densify import compile_loops
 

@@ -1,4 +1,4 @@
-"""Selection of the reconstruction: back ends are tried in turn, each reconstructed, calibrated and timed."""
+"""Selection of the reconstruction: back ends reconstruct the images one after the other until one is calibrated well."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -29,56 +29,63 @@ from jcr.records import Attempt, Capture, Reconstruction
 from jcr.result import RunOptions
 
 HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
-"""Concerns of a rejection against which another reconstruction of the same images may help."""
+"""Concerns of a rejecting finding for which another back end may give an accepted calibration of the same images."""
 TEXTURED = 50
-"""Observations per image of the capture. SIFT finds 600 to 850 in simulated tabletops of 640x480, 220 in those of half
-the size, and 90 where all are blurred by 9 px."""
+"""Observations per image above which images have enough SIFT features. SIFT finds 600 to 850 in simulated tabletops of
+640x480, 220 in those of half the size, and 90 if all are blurred by 9 px."""
 NEARLY_ALL = 0.9
-"""Share of the capture's images."""
+"""Share of the capture's images that SIFT must register so that other features are not tried."""
 
 Keep = Callable[[Reconstruction], None]
+"""Function that stores a reconstruction before its calibration."""
 Selected = tuple[Reconstruction, Calibration]
-"""Reconstruction that is kept, and its calibration with the record of all attempts and their times."""
+"""Selected reconstruction, and its calibration with the record of all attempts and their times."""
 
 
 class NothingFoundError(RejectedError):
-    """Error that no back end came to a calibration, with the attempts and the reasons, strongest first."""
+    """Error that no back end gave a calibration; it holds the attempts and the findings, strongest first."""
 
     def __init__(
         self, failure: RejectedError, attempts: tuple[Attempt, ...] = (), causes: tuple[Finding, ...] = ()
     ) -> None:
-        """Order `causes`, findings of the images alone, before the failure."""
+        """Take the failure of the last back end, the records of all attempts, and findings of the images alone.
+
+        `causes`, the findings of the images, come before the failure, so that the message names the cause.
+        """
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
         first = self.findings[0]
         if first.kind is FindingKind.NO_RECONSTRUCTION:
             super().__init__(failure.what, *failure.remedies, also=failure.also)
-        else:  # too few features, and what would give more, are its consequences
+        else:  # the failure and its remedies are consequences of the finding on the images
             super().__init__(text(first), *filter(None, [remedy(first)]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Reconstruction and calibration by one back end, or the error that prevented one."""
+    """One attempt to reconstruct and calibrate with one back end: its results, or the error that ended it."""
 
     account: Attempt
-    """Record for the files."""
+    """Record of the attempt for run.json and calibration.json."""
     reconstruction: Reconstruction | None
+    """Reconstruction; None if the back end failed."""
     hand_eye: Calibration | None
+    """Calibration; None if the reconstruction or the calibration failed."""
     failure: InputError | RejectedError | None
+    """Error of the reconstruction or the calibration; None without one."""
 
     @property
     def rejection(self) -> Finding | None:
-        """Strongest finding that rejects the calibration; None of one that is sound, or was not made."""
+        """Strongest finding that rejects the calibration; None if it is sound, or there is no calibration."""
         if self.hand_eye is None or self.hand_eye.is_sound:
             return None
         return next(finding for finding in self.hand_eye.findings if finding.severity == "rejects")
 
     @property
     def rank(self) -> tuple[bool, bool, bool, float]:
-        """Key of the comparison: calibrated, accepted, explained, minus the leave-one-out error (m).
+        """Sort key, largest for the best trial: (calibrated, accepted, explained, minus leave-one-out error in m).
 
-        A rejection is explained where a cause rejects it that holds for every reconstruction of the same images.
+        A rejection is explained if its finding holds for every reconstruction of the same images.
         """
         if self.hand_eye is None:
             return False, False, False, 0.0
@@ -88,14 +95,14 @@ class Trial:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the calibration failed, is not accepted, or leaves images out: the images may show why."""
+        """Whether the calibration failed, is not accepted, or leaves images out, which the images may explain."""
         if self.hand_eye is None:
             return not isinstance(self.failure, InputError)
         return self.hand_eye.verdict != "accepted" or not all(one.used for one in self.hand_eye.images)
 
     @property
     def name(self) -> str:
-        """Name of the back end with its features and, where there is a calibration, the leave-one-out error."""
+        """Name of the back end and its features, with the leave-one-out error of its calibration, for messages."""
         name = " with ".join(filter(None, (self.account.backend, self.account.features)))
         if self.hand_eye is None:
             return name
@@ -106,15 +113,15 @@ class Trial:
 
     @property
     def why_not(self) -> str:
-        """Name of the back end, and the reason why the attempt is not kept."""
+        """Name of the back end, and the reason why the trial is not selected, for messages."""
         if self.hand_eye is None:
             return f"{self.name} failed ({self.failure})"
         return f"{self.name} is rejected ({self.hand_eye.doubt})"
 
     def is_textured(self, images: int) -> bool:
-        """Test whether SIFT found plenty of features in that number of images, so that their lack rejects nothing.
+        """Test whether COLMAP found at least TEXTURED SIFT features per image, so that a lack of texture is excluded.
 
-        Learned features find as many on plain surfaces.
+        `images` is the number of images of the capture. Learned features do not count: they are found without texture.
         """
         if self.account.backend != "colmap" or self.account.features not in (None, "sift"):
             return False
@@ -130,19 +137,20 @@ def select_reconstruction(
     keep: Keep | None = None,
     before: Callable[[], Reconstruction] | None = None,
 ) -> Selected:
-    """Reconstruct and calibrate a capture by the back ends of `reconstruct.tries`, and keep the one of highest rank.
+    """Reconstruct and calibrate a capture with the back ends of `reconstruct.tries`, and return the best trial's result.
 
-    Another is tried as long as the best one failed, or is rejected for a reason that another may not have; a note says
-    which was kept and why. `keep` is called with the reconstruction of the only back end before its calibration.
-    `before` returns one that was selected earlier, which is calibrated instead. Raises InputError as the back end does,
-    and where gripper poses and joint angles contradict each other; NothingFoundError where no back end gave anything.
+    The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
+    a note names the selected one and the reason. `keep` is called with the reconstruction before its calibration, if
+    there is only one back end to try. `before` returns the reconstruction of an earlier selection, which is then only
+    calibrated. Raises InputError if a back end does, or if gripper poses and joint angles contradict each other;
+    NothingFoundError if no back end gives a calibration.
     """
-    robot_errors(capture, options.calibrate)  # refuses before the images cost time
+    robot_errors(capture, options.calibrate)  # raises InputError before time is spent on the images
     trials, notes = list[Trial](), list[str]()
 
     @cache
     def of_images() -> tuple[Finding, ...]:
-        """Return the findings of the images alone."""
+        """Return the findings of the images alone (blur, one view, repetition), computed once."""
         return view_findings(capture)
 
     if before is not None:
@@ -169,12 +177,12 @@ def _why_untried(
     images: int,
     of_images: Callable[[], tuple[Finding, ...]],
 ) -> tuple[str | None, bool]:
-    """Return why a back end is not tried after others, None where it is; and whether the next one may be.
+    """Return the reason why the next back end is not tried, and whether the back ends after it may be tried.
 
-    Findings about camera, robot, mount or motion hold for every reconstruction of the same images. A camera at rest
-    shows every back end the same view. Where SIFT registers nearly all images, other features show the same scene to
-    the same robot. Where SIFT finds plenty of features, a back end that does not test the camera as features do would
-    accept unseen what these reject.
+    The reason is None if the back end is tried, or if there is nothing to report. No other back end is tried if the best
+    trial is accepted, if its rejection holds for every reconstruction of the same images, or if the images alone are
+    rejected. Other features are not tried if SIFT registers nearly all images. A back end that does not test the
+    camera's intrinsics is not tried if SIFT finds enough features, because it could accept a wrong calibration.
     """
     best = max(trials, key=lambda one: one.rank)
     if best.hand_eye is not None:
@@ -201,9 +209,9 @@ def _why_untried(
 
 
 def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding, ...]) -> Selected:
-    """Return the trial of highest rank with the notes, and with the findings of the images alone.
+    """Return reconstruction and calibration of the trial of highest rank, with notes and findings of the images.
 
-    Raises InputError or NothingFoundError where there is none.
+    Raises NothingFoundError if no trial has a calibration, or its InputError if there is only one trial.
     """
     kept = max(trials, key=lambda one: one.rank)
     hand_eye, reconstruction = kept.hand_eye, kept.reconstruction
@@ -213,7 +221,7 @@ def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding,
         if isinstance(failure, InputError) and not earlier:
             raise failure
         failure = failure if isinstance(failure, RejectedError) else RejectedError(str(failure))
-        # The licence of weights that were used belongs to this answer, too.
+        # The notes include the licence of network weights that were used.
         failure = failure.with_more(*notes, *(f"back end {one.why_not}" for one in earlier))
         raise NothingFoundError(failure, tuple(one.account for one in trials), as_causes(of_images))
     if others := [one for one in trials if one is not kept]:
@@ -236,7 +244,7 @@ def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding,
 
 
 def timings_of(attempts: Sequence[Attempt]) -> dict[str, float]:
-    """Return the seconds that the stages took, all attempts together."""
+    """Return the seconds of the stages "reconstruct" and "calibrate", summed over all attempts."""
     return {
         "reconstruct": round(sum(attempt.reconstruct_s for attempt in attempts), 3),
         "calibrate": round(sum(attempt.calibrate_s for attempt in attempts), 3),
@@ -250,10 +258,10 @@ def _try(
     progress: Progress | None,
     keep: Keep | None = None,
 ) -> Trial:
-    """Make a reconstruction by a back end, or read one by a function, and calibrate.
+    """Reconstruct with the options of one back end, or read a reconstruction by a function; then calibrate it.
 
-    A known length ends on surfaces: with one, dense depth comes first, from cameras and tracks alone. Raises InputError
-    of the calibration, which no other back end avoids.
+    With a known length, whose ends are points of surfaces, dense depth is estimated before the calibration. An
+    InputError of the calibration is raised, because it would occur with every back end; other errors are in the trial.
     """
     start, report = time.perf_counter(), progress or silent
     candidate = source if isinstance(source, ReconstructOptions) else None
@@ -262,7 +270,7 @@ def _try(
         made = reconstruct(capture, source, progress) if isinstance(source, ReconstructOptions) else source()
     except (InputError, RejectedError) as error:
         failure = error.with_traceback(None)
-    give_back()  # memory of the back end
+    give_back()  # return the memory of the back end to the system
     if made is not None and keep is not None:
         keep(made)
     if made is not None and options.calibrate.known_length is not None:

@@ -1,4 +1,4 @@
-"""Table of the stages of a run: each makes its files in the run folder from the records of the stages before it."""
+"""Stages of a run: each computes records from those of the stages before it, and writes them into the run folder."""
 
 import hashlib
 import json
@@ -51,15 +51,18 @@ from jcr.result import (
 from jcr.scene.cloud import write_cloud
 
 MOVING = "moving"
-"""Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
+"""Subfolder with the images of a fixed camera without the static background, which show the carried object alone."""
 LIVE = "result"
-"""Run folder of all images, in the folder of a capture that was calibrated while it was taken."""
+"""Subfolder of a live capture with the run of all its images."""
 LARGE = 50_000_000
-"""Bytes. Size and date identify larger files, which are weights of networks; the content identifies others."""
+"""Size (bytes) above which size and date identify a file, such as network weights; the content identifies others."""
 
 
 def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
-    """Return the result of a run before its first stage; raise InputError for a name that is not UTF-8."""
+    """Return the result of a run before its first stage: capture, options, fingerprint of the reconstruction's inputs.
+
+    Raises InputError for a folder whose name is not UTF-8.
+    """
     folder = str(capture.folder.resolve())
     try:
         folder.encode()
@@ -77,12 +80,12 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
 
 
 def with_state(result: RunResult, **fields: Any) -> RunResult:
-    """Return the result with other fields of its state."""
+    """Return the result with the given fields of its RunState replaced."""
     return result.with_parts(state=result.state.model_copy(update=fields))
 
 
 def stages_of(result: RunResult) -> list[str]:
-    """Return the names of the stages of a run with these options."""
+    """Return the names of the stages that a run needs for its cameras and options, in order."""
     left_out = set() if result.others else {"cameras"}
     if result.state.options.map is None:
         left_out |= {"densify", "map"}
@@ -90,7 +93,7 @@ def stages_of(result: RunResult) -> list[str]:
 
 
 def is_unchanged(result: RunResult) -> bool:
-    """Test whether no stage has anything to make: inputs, options and files are those of a finished run."""
+    """Test whether the folder holds the finished run of the same inputs and options, with all its files."""
     with suppress(InputError, OSError):
         before = RunResult(result.out).state
         return before.made == made_of(result) and before.files == files_of(result.out) != {}
@@ -98,19 +101,19 @@ def is_unchanged(result: RunResult) -> bool:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run stages in order, each timed; return the result with their records."""
+    """Run stages in order and measure their times; return the result with their records."""
     for name in stages:
         start = time.perf_counter()
         result = STAGES[name][1](result, progress)
         give_back()
-        if name not in ("reconstruct", "calibrate"):  # they have the seconds of all back ends
+        if name not in ("reconstruct", "calibrate"):  # `timings_of` gives these, summed over all back ends
             timings = result.calibration.timings_s | {name: round(time.perf_counter() - start, 3)}
             result = result.with_parts(calibration=replace(result.calibration, timings_s=timings))
     return result
 
 
 def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run the stages after the calibration, and note in run.json that all files of the run are there."""
+    """Run the stages after the calibration, and mark the run as finished in run.json."""
     if not result.others:
         (result.out / CAMERAS).unlink(missing_ok=True)
         result = result.with_parts(cameras=None)
@@ -120,14 +123,14 @@ def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> Ru
 
 
 def complete(result: RunResult) -> RunResult:
-    """Note in run.json that all files of a run are there, and what they were made from."""
+    """Mark a run as finished in run.json: write the fingerprints of its inputs and the identities of its files."""
     result = with_state(result, made=made_of(result), files=files_of(result.out))
     write_state(result)
     return result
 
 
 def made_of(result: RunResult) -> dict[str, str]:
-    """Return the fingerprints of the inputs of a run: those of its reconstruction, and all with the options."""
+    """Return two fingerprints: "reconstruct" of the inputs of the reconstruction, "run" of all inputs and options."""
     capture, folder = result.capture, result.capture.folder
     depths = [folder / name for name in capture.depths or () if name is not None]
     others = [
@@ -139,9 +142,9 @@ def made_of(result: RunResult) -> dict[str, str]:
 
 
 def files_of(out: Path) -> dict[str, str]:
-    """Return the files of the stages that a run folder has, and images added to it, each with its identity.
+    """Return name and identity of the files of a run folder: those of its stages, and images added later.
 
-    The content identifies calibration.json and added images; others count where they exist.
+    The identity of calibration.json and of added images is a hash of the content; that of other files is empty.
     """
     names = [*(name for files, _ in STAGES.values() for name in files), ADDED]
     return {
@@ -152,12 +155,12 @@ def files_of(out: Path) -> dict[str, str]:
 
 
 def fingerprint(*values: Any) -> str:
-    """Return a hash of values: records by their fields, arrays and files by their content."""
+    """Return a SHA-256 hash of values, which covers the fields of records and the content of arrays and files."""
     return hashlib.sha256(json.dumps(values, default=_identity).encode()).hexdigest()
 
 
 def _identity(value: Any) -> Any:
-    """Return what identifies an array, a file or a folder, or a record."""
+    """Return the value that stands for an array, file, folder or record in `fingerprint`: hash, list or fields."""
     if isinstance(value, ndarray):
         return hashlib.sha256(value.tobytes()).hexdigest()
     if not isinstance(value, Path):
@@ -172,20 +175,20 @@ def _identity(value: Any) -> Any:
 
 
 def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
-    """Select a reconstruction among the back ends, with its calibration; or read the one of the same inputs.
+    """Select a reconstruction and its calibration; reuse a reconstruction that was made from the same inputs.
 
-    It may be in the folder, or in that of `jcr capture`. Where the camera watches the gripper, the carried object is the
-    scene.
+    Such a reconstruction is searched in the run folder and in the one that `jcr capture` wrote. For a fixed camera the
+    images are reduced to the object that the gripper carries, which is then the scene.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture
     if capture.mount == "base":
-        # The arm's kinematics are those of the reported poses, and not of their inverses.
+        # Gripper poses are inverted for a fixed camera, and the arm's kinematics do not apply to inverted poses.
         seen, own = eye_to_hand(capture, out / MOVING), replace(options.calibrate, robot=None)
         options = replace(options, calibrate=own)
 
     def is_same(folder: Path) -> bool:
-        """Test whether a folder has a reconstruction of the same inputs; a state that cannot be read proves nothing."""
+        """Test whether a folder has a reconstruction of the same inputs; False if its run.json cannot be read."""
         with suppress(InputError):
             made = RunResult(folder).state.made.get("reconstruct")
             return made == result.state.made["reconstruct"] and (folder / RECONSTRUCTION).is_file()
@@ -214,7 +217,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
 
 
 def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
-    """Write a reconstruction, then its fingerprint; pointmaps that were estimated become depth.npz."""
+    """Write a reconstruction without estimated pointmaps, which depth.npz holds; then run.json with its fingerprint."""
     forget_reconstruction(result.out)
     pointmaps = reconstruction.pointmaps
     predicted = pointmaps if pointmaps is not None and pointmaps.is_predicted else None
@@ -223,13 +226,13 @@ def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> No
 
 
 def forget_reconstruction(out: Path) -> None:
-    """Remove the reconstruction of other inputs, its state first: a kill leaves no file with the state of another."""
+    """Delete run.json, depth and reconstruction, in this order: run.json never describes other inputs than the files."""
     for name in (STATE, DEPTH, RECONSTRUCTION):
         (out / name).unlink(missing_ok=True)
 
 
 def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
-    """Return the error, with the --board that the images show, after its reason is written to the folder."""
+    """Write the reason of a failed selection to the run folder; return the error with a proposed `--board`."""
     capture, tried = result.capture, error.attempts
     board = proposed_for(capture, result.state.options.reconstruct.board)
     content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
@@ -240,7 +243,7 @@ def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
 
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
-    """Write the calibration of the reconstruction that was selected."""
+    """Complete the calibration of the selected reconstruction, and write calibration.json and log.txt."""
     capture, reconstruction, content = result.capture, result.reconstruction, result.found
     if capture.mount == "base":
         content = refined(capture, reconstruction, content, result.state.options.calibrate)
@@ -255,7 +258,7 @@ def _calibrate(result: RunResult, progress: Progress) -> RunResult:
 
 
 def keep_calibration(out: Path, content: AnyCalibration) -> None:
-    """Write calibration.json and log.txt; what was made from another one goes first, so that the two never mix."""
+    """Write calibration.json and log.txt; delete files that were made from a different calibration first."""
     same = False
     with suppress(InputError):
         before = RunResult(out).calibration
@@ -279,7 +282,7 @@ def write_state(result: RunResult) -> None:
 
 
 def place(result: RunResult, progress: Progress) -> CamerasFile:
-    """Return the other cameras of the cell as cameras.json has them."""
+    """Locate the other cameras of the cell, and return the content of cameras.json."""
     from jcr.cell.stage import place_cameras
 
     parts = result.capture, result.others, result.reconstruction, result.found
@@ -287,21 +290,21 @@ def place(result: RunResult, progress: Progress) -> CamerasFile:
 
 
 def _cameras(result: RunResult, progress: Progress) -> RunResult:
-    """Locate the other cameras of the cell."""
+    """Locate the other cameras of the cell, and write cameras.json."""
     found = place(result, progress)
     write_cameras(result.out, found)
     return result.with_parts(cameras=found)
 
 
 def _depth_made_from(result: RunResult) -> str:
-    """Return the fingerprint of the depth.npz that belongs to the reconstruction."""
-    # Whether depth is estimated changes nothing in it.
+    """Return the fingerprint of the inputs from which the depth.npz of this run is made."""
+    # The option `dense` decides whether depth is estimated, and does not change its values.
     depth = replace(result.state.options.depth, dense=True)
     return fingerprint(result.state.made["reconstruct"], depth, DEPTH_FORMAT)
 
 
 def _densify(result: RunResult, progress: Progress) -> RunResult:
-    """Add the dense depth of the map: predicted, in the folder, or estimated now."""
+    """Add dense depth to the reconstruction: predicted by a network, read from the folder, or estimated now."""
     options = result.state.options.depth
     result = result.with_parts(
         reconstruction=densify(result.capture, result.reconstruction, options, progress)
@@ -311,18 +314,18 @@ def _densify(result: RunResult, progress: Progress) -> RunResult:
 
 
 def _keep_depth(result: RunResult) -> None:
-    """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
+    """Write the estimated pointmaps of the reconstruction to depth.npz, unless the file holds them already."""
     pointmaps, file, made = result.reconstruction.pointmaps, result.out / DEPTH, _depth_made_from(result)
     if pointmaps is not None and not pointmaps.is_predicted and not is_made_from(file, made):
         write_depth(file, result.reconstruction, made)
 
 
 def _map(result: RunResult, progress: Progress) -> RunResult:
-    """Add cloud, map and measured objects, with the images that were added later.
+    """Make cloud, map and measured objects, with images that were added later, and write cloud and map.
 
-    Raises InputError where no point is confident enough, or the options leave nothing to map.
+    Raises InputError if no point is confident enough, or the options leave no points for a map.
     """
-    # Labels and sizes need half of SciPy, the map torch, which takes seconds; a calibration does not.
+    # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added import extend
     from jcr.depth.measured import with_measured_depth
     from jcr.scene.build import build_scene
@@ -364,12 +367,12 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
 
 
 def _report(result: RunResult, progress: Progress = silent) -> RunResult:
-    """Write the report."""
+    """Write report.html."""
     from jcr.report.html import report_html
 
     progress("report", 0.0)
     options = result.state.options
-    # The map has its own history.
+    # The options of the map are left out: the map holds its own history.
     stages = {"reconstruct": options.reconstruct, "calibrate": options.calibrate, "densify": options.depth}
     about = {stage: asdict(own) for stage, own in stages.items()}
     write_text(result.out / REPORT, report_html(result, about))
@@ -378,7 +381,7 @@ def _report(result: RunResult, progress: Progress = silent) -> RunResult:
 
 
 def noted(result: RunResult, *notes: str | None) -> RunResult:
-    """Return the result with more notes."""
+    """Return the result with `notes` added to those of its calibration; None is ignored."""
     every = [*result.calibration.notes, *filter(None, notes)]
     return result.with_parts(calibration=replace(result.calibration, notes=tuple(every)))
 
@@ -391,4 +394,4 @@ STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResu
     "map": ((CLOUD, MAP), _map),
     "report": ((REPORT,), _report),
 }
-"""Files of each stage in the run folder, and the function that writes them and adds its records to the result."""
+"""Stages in order: name, files in the run folder, and function that writes the files and adds records to the result."""

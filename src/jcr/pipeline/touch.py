@@ -1,4 +1,4 @@
-"""Touch test: error in task space between points that the robot's tip touched and the map."""
+"""Touch test: distances between points that the robot's tip touched and the same points of the surface in images."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,45 +15,47 @@ from jcr.geometry import apply, inverse, skew
 from jcr.result import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
+"""Columns of the CSV: image and pixel of a point, and position of the tip that touched the point (base frame)."""
 LEAST = 3
-"""Fewest points that distinguish a wrong calibration from one bad touch."""
+"""Smallest number of points with which a wrong calibration can be distinguished from one bad touch."""
 
 
 @dataclass(frozen=True)
 class TouchTest:
-    """Comparison of touched points with the map."""
+    """Result of a touch test: errors at the touched points, their expected sizes, and the p-value of a χ² test."""
 
     images: tuple[str, ...]
+    """Image in which each point was selected."""
     error: Float[ndarray, "k 3"]
-    """Position of the tip less that of the point in the map (m, base axes)."""
+    """Position of the tip minus position of the surface point (m, base axes), one row per point."""
     std: Float[ndarray, "k 3"]
-    """Standard deviations by the calibration and the robot's errors (m)."""
+    """Standard deviations (m) that the errors of calibration and robot let expect."""
     p_value: float
-    """Chance of errors like these or larger, all points together."""
+    """Probability of errors as large as these or larger, tested for all points together."""
 
     @property
     def rms(self) -> float:
-        """Root mean square length of the errors (m)."""
+        """Root mean square length (m) of the errors."""
         return float(np.sqrt((self.error**2).sum(1).mean()))
 
     @property
     def expected(self) -> float:
-        """Root mean square length that the reported uncertainty predicts (m)."""
+        """Root mean square length (m) of the errors that `std` predicts."""
         return float(np.sqrt((self.std**2).sum(1).mean()))
 
     @property
     def common(self) -> Float[ndarray, "3"]:
-        """Mean error (m), which a wrong tip or tool offset would cause."""
+        """Mean error (m, base axes); a wrong position of the tip in the gripper frame would cause one."""
         return self.error.mean(0)
 
 
 def touch(out: str | Path, points: str | Path) -> TouchTest:
-    """Compare points that the tip touched with the surface that the images show at their pixels.
+    """Compare points that the robot's tip touched with the surface points at their pixels in images of a run.
 
-    `points` is a CSV with the columns image, x_px, y_px (where an image of the run shows the point) and x_m, y_m, z_m
-    (the tip in the base frame as it touched). Expected errors: the covariance of the calibration, which all points
-    share, and of each touch the robot's random and systematic errors. Raises InputError on fewer than three points, an
-    image that is not in the run, or a pixel without a surface.
+    `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
+    run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The expected errors include
+    the covariance of the calibration, common to all points, and the robot's errors at each touch. Raises InputError for
+    fewer than three points, an image that is not in the run, or a pixel without a surface.
     """
     points = Path(points)
     calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
@@ -77,7 +79,7 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
-    """Return the image of each point, and pixel and position (m)."""
+    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()

@@ -1,4 +1,4 @@
-"""Test whether the camera has moved since it was calibrated, from a few new images."""
+"""Test from a few new images whether the camera has moved since its calibration."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,33 +32,36 @@ from jcr.result import RunResult
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9
-"""Largest change of a number of a pose that is written and read again."""
+"""Largest difference (m, or element of a rotation matrix) between two poses that count as copies of each other."""
 MIN_TO_RECALIBRATE = 5
-"""Images of another scene; with fewer a wrong one cannot be outvoted."""
+"""Smallest number of images of another scene; with fewer, a wrong gripper pose cannot be detected by the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verification(Drift):
-    """Verdict on a calibration, with the measured drift."""
+    """Result of the test for a moved camera: the measured drift, and the verdict on the old calibration."""
 
     moved: bool
+    """Whether the drift is significant and larger than the tolerance."""
     images: tuple[str, ...]
-    """Names of the images that were used."""
+    """Names of the new images that were used."""
     notes: tuple[str, ...]
+    """Warnings about the new images and the sensitivity of the test."""
     how: str
+    """Method in words: in the old scene, or by a new calibration in another scene."""
     fixed: str | None = None
-    """Name of the camera, where it is a fixed one; the drift is then along axes of the base."""
+    """Name of the camera if it is a fixed one, whose drift is along base axes; None: the camera on the gripper."""
     others: tuple["Verification", ...] = ()
-    """Fixed cameras of the run that the new capture has images of."""
+    """Results for the fixed cameras of the run of which there are new images."""
 
     @property
     def std(self) -> Float[ndarray, "6"]:
-        """Standard deviations of the drift (m, rad)."""
+        """Standard deviations of `offset`: three translations (m), three rotations (rad)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def drift_m(self) -> float:
-        """Distance (m) of the camera from its calibrated place."""
+        """Length (m) of the camera's translation since the calibration."""
         return float(np.linalg.norm(self.offset[:3]))
 
     @property
@@ -68,14 +71,14 @@ class Verification(Drift):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the calibration by the new images."""
+        """Verdict on the old calibration: rejected if the camera moved, accepted with warnings if there are notes."""
         if self.moved:
             return "rejected"
         return "accepted with warnings" if self.notes else "accepted"
 
     @property
     def finding(self) -> str:
-        """Body that has moved, in words."""
+        """Phrase that names the body that has moved: camera, scene or one of the two."""
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
@@ -83,7 +86,7 @@ class Verification(Drift):
 
     @property
     def advice(self) -> str:
-        """Remedy where something has moved."""
+        """Remedy, in words, for the case that something has moved."""
         if self.fixed is not None:
             return f"{self.fixed} has moved; fasten it, and calibrate it again (jcr add-camera, under another name)"
         anew = "tighten the mount, then calibrate again from 8 or more images (jcr run)"
@@ -102,10 +105,11 @@ def verify_run(
     options: VerifyOptions | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Test the calibration in the run folder `out` against the few images of `new`, a capture or its path.
+    """Test with the images of `new`, a capture or its path, whether the cameras of the run folder `out` have moved.
 
-    Raises InputError for a run that holds no accepted calibration, or images of another camera; RejectedError
-    when the images share too few features with the old scene, or too few of another, to tell.
+    New images of the calibrated scene are located in its reconstruction. Images of another scene are calibrated instead.
+    Raises InputError if the run has no accepted calibration or the images are of another camera. Raises RejectedError if
+    the images share too few features with the old scene and are too few for a new calibration.
     """
     report, options = progress or silent, checked_options(options, VerifyOptions)
     if not 0 < options.alpha < 0.5:
@@ -142,9 +146,10 @@ def verify_run(
 def _new_images(
     then: Capture | CellCamera, capture: Capture, now: Capture | CellCamera, new: Capture
 ) -> tuple[list[UInt8[ndarray, "h w 3"]], list[UInt8[ndarray, "h w 3"]]]:
-    """Return the images of a camera that calibrated it, and the new ones.
+    """Read the images of a camera from its calibration, and its new ones; return both lists.
 
-    Raises InputError for images of another size, and for an image of the calibration, which would confirm itself.
+    `then` and `now` name the images, `capture` and `new` the captures that hold them. Raises InputError if the new
+    images have another size, or one of them is an image of the calibration, which would confirm itself.
     """
     if now.image_size != then.image_size:
         (width, height), (wide, high) = now.image_size, then.image_size
@@ -172,10 +177,10 @@ def _in_old_scene(
     notes: list[str],
     options: VerifyOptions,
 ) -> Verification:
-    """Test by the images that are located in the calibrated scene, camera pose by row.
+    """Test with the new images that are located in the old reconstruction; `located` maps their rows to camera poses.
 
-    The calibration's poses are fitted again, without bundle adjustment, for the joint covariance that its file does not
-    keep: new images are located in the same cameras' frame.
+    Gripper and camera poses of the calibration are fitted again, without bundle adjustment, because calibration.json
+    does not contain the joint covariance that the test needs.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
     calibrate_options, rows = run.state.options.calibrate, list(located)
@@ -213,10 +218,10 @@ def _in_old_scene(
 def _fixed_cameras(
     run: RunResult, new: Capture, options: VerifyOptions, progress: Progress | None
 ) -> Iterator[Verification]:
-    """Compare the place of each fixed camera of the run with its new images, where `new` has some.
+    """Yield the drift of each fixed camera of the run that has images in `new`.
 
-    The places before and now are estimated together, so that the errors of the wrist camera move both alike. Raises
-    RejectedError where the images share too few features with the scene.
+    The old and the new pose of the camera are estimated together, so that errors of the wrist camera's calibration
+    cancel in their difference. Raises RejectedError if the images share too few features with the scene.
     """
     from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
 
@@ -233,7 +238,7 @@ def _fixed_cameras(
             continue
         own = others[camera.name]
         _new_images(own, capture, camera, new)
-        # One camera took both: an error of its intrinsics moves both places alike.
+        # Both poses are of the same camera, so that an error of its intrinsics cancels in their difference.
         intrinsics = placed[camera.name]
         known = {"intrinsics": intrinsics, "intrinsics_std": np.zeros(4 + len(intrinsics.distortion))}
         now = replace(camera, name=f"{camera.name[:60]}_now", folder=camera.folder or new.folder, **known)
@@ -255,7 +260,7 @@ def _fixed_cameras(
 def _by_recalibration(
     run: RunResult, new: Capture, options: VerifyOptions, progress: Progress | None
 ) -> Verification:
-    """Calibrate from the images of another scene, and test the difference against both covariances."""
+    """Calibrate from images of another scene; test the difference of both calibrations with the sum of covariances."""
     calibration, then = run.calibration, run.state.options
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics)
@@ -270,7 +275,7 @@ def _by_recalibration(
 
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
-    """Return the drift of a camera between two places whose difference has this covariance."""
+    """Return the drift of a camera between two poses that differ by `offset` (m, rad), with its covariance."""
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, options.alpha)
     found = {"offset": offset, "covariance": covariance, "p_value": p_value, "detectable": noticed}
@@ -280,7 +285,7 @@ def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], opti
 def _judged(
     found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str], how: str
 ) -> Verification:
-    """Return the verdict on a drift: it is significant, and larger than the tolerance."""
+    """Return the result for a drift: the camera moved if the drift is significant and larger than the tolerance."""
     notes = list(notes)
     if found.is_noisier:
         notes.append(
