@@ -1,1 +1,1 @@
-"""Calibration of a capture: fit, adjustment, checks, verdict, requirement."""
+"""Hand-eye calibration of a capture: fit, bundle adjustment, checks, verdict, required accuracy."""

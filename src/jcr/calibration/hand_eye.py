@@ -27,18 +27,20 @@ from jcr.least_squares import one_blas_thread
 from jcr.records import ImageVerdict, LeaveOneOut, PaperResiduals, RobotNoise, Uncertainty
 
 MAX_NOISE = (0.02, np.radians(3.0))
-"""Largest noise (m, rad), beyond that of the worst servo arm; poses and images then do not belong together."""
+"""Largest robot pose noise (m, rad) of an accepted calibration; servo arms have less, so larger noise means that poses
+and images do not belong together."""
 MAX_STD = (0.02, np.radians(3.0), 0.05)
-"""Largest standard deviations (m, rad, relative scale) of an accepted result."""
+"""Largest standard deviations (m, rad, relative scale) of an accepted calibration."""
 MIN_SHARE_USED = 0.6
+"""Smallest fraction of the registered images that an accepted calibration uses."""
 SCALE_STD = 0.002
 """Relative standard deviation of the size of a printed marker."""
 FEW = 5
-"""Number of images below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
+"""Number of images below which outliers cannot be detected and the robot pose noise is poorly known."""
 WELL_ABOVE = 2e-3
-"""Leave-one-out error (m) below which no finding is made."""
+"""Leave-one-out error (m) up to which no warning is given."""
 SURPRISE = 1.5
-"""Factor on the given robot noise beyond which a finding is made."""
+"""Ratio of the residuals to the given robot noise up to which no warning is given."""
 
 
 Offset = tuple[Float[ndarray, "3"], float, float]
@@ -61,12 +63,12 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     in_sequence: bool = True,
     names: Sequence[str] | None = None,
 ) -> Calibration:
-    """Return the hand-eye calibration with unknown scale from camera poses of your own.
+    """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
 
-    Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
+    Both are stacks (n,4,4), n ≥ 2, of poses at the same instants and in the same order: gripper poses in the base frame
     (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
-    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) of the steps of
-    the cameras (geometry.retract; recon axes) is needed if these are not exact compared with the gripper poses.
+    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is needed if the errors of the
+    camera poses are not negligible: the covariance of steps of these poses (geometry.retract; recon axes).
 
     `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
     base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
@@ -127,10 +129,10 @@ def _fit_distinct(
     covariance: Float[ndarray, "r r"] | None,
     systematic: Float[ndarray, "r r"],
 ) -> tuple[Solution, Int[ndarray, " n"]]:
-    """Return the robust fit to the distinct images, and the distinct image that each image is.
+    """Return the robust fit to the images without duplicates, and for each image its number in that fit.
 
-    The images are sorted by their poses, so that the result does not depend on their order. An image that was given
-    twice is one: its error counted as two would pass for agreement.
+    The images are sorted by their poses, so that the result does not depend on their order. Duplicates, images with the
+    same pair of poses, count once: an error that occurs twice would look like agreement.
     """
     n = len(gripper)
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
@@ -145,7 +147,10 @@ def _fit_distinct(
 def _with_residuals(
     gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"], names: Sequence[str]
 ) -> Calibration:
-    """Return the calibration of a fit to distinct images, without findings that its numbers decide."""
+    """Return the calibration that a fit gives, with residuals of all images, before `judged` adds its findings.
+
+    `distinct` holds the number of each image in the fit (_fit_distinct).
+    """
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
     used = fit.problem.used[distinct]
@@ -180,7 +185,10 @@ def image_verdicts(
     radians: Float[ndarray, " n"],
     reprojection_px: Float[ndarray, " n"] | None = None,
 ) -> tuple[ImageVerdict, ...]:
-    """Return the use of each registered image, its residuals (m, rad) and its median reprojection error (px or NaN)."""
+    """Return a record of each registered image: whether it is used, its residuals, and the reason if it is rejected.
+
+    `metres` and `radians` are the sizes of the residuals; `reprojection_px` is the median reprojection error or NaN.
+    """
     px = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
     return tuple(
         ImageVerdict(
@@ -196,11 +204,11 @@ def image_verdicts(
 
 
 JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
-"""Kinds of findings that the numbers of a calibration decide by themselves."""
+"""Kinds of findings that `judged` derives from the numbers of a calibration alone."""
 
 
 def judged(hand_eye: Calibration) -> Calibration:
-    """Return the calibration with findings of the kinds JUDGED by its present numbers, after those of other kinds."""
+    """Return the calibration with its findings of the kinds JUDGED derived anew from its numbers."""
     rejecting = list(_rejecting(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
     weak = "rejects" if any(one.kind is FindingKind.UNCERTAIN for one in rejecting) else "warns"
@@ -213,13 +221,13 @@ def judged(hand_eye: Calibration) -> Calibration:
 
 
 def poses_agree(noise: RobotNoise) -> bool:
-    """Return whether gripper poses with this noise belong to the images at all."""
+    """Return whether the estimated robot errors are small enough, at most MAX_NOISE, for an accepted calibration."""
     metres, radians = noise.together
     return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
 
 
 def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield findings that few images agree, that poses contradict images, and that the result is too uncertain."""
+    """Yield the findings that reject: few images agree, gripper poses contradict images, result too uncertain."""
     used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
         counts = {"value": float(used), "images": float(n)}
@@ -231,7 +239,7 @@ def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
     if not hand_eye.observability.observable:
         return
     std = hand_eye.uncertainty.std
-    # With few images, half of the uncertainty may come from the poorly known robot pose noise.
+    # With few images, half of the uncertainty may be due to the poorly known robot pose noise.
     unknown = {"noise_unknown": 1.0} if hand_eye.robot_noise.given is None and used < FEW else {}
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
@@ -241,7 +249,7 @@ def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
 
 
 def _warning(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield findings that do not reject: noise above the given one, leave-one-out error, few images."""
+    """Yield the findings that warn: residuals above the given noise, large leave-one-out error, few images."""
     noise, images = hand_eye.robot_noise, [one for one in hand_eye.images if one.used]
     residual = np.array([(one.translation_residual_mm, one.rotation_residual_deg) for one in images], float)
     # The rms residual per axis, corrected for the 13 fitted unknowns.
@@ -264,7 +272,10 @@ def _warning(hand_eye: Calibration) -> Iterator[Finding]:
 def leave_one_out(
     residual: Float[ndarray, "u 6"], how: str, reprojection_px: float | None = None
 ) -> LeaveOneOut | None:
-    """Return the mean size of the leave-one-out residuals of the used images; None where too few are left to fit."""
+    """Return the mean size of the leave-one-out residuals (m, rad) of the used images; None for fewer than four.
+
+    `how` states in words how each gripper pose was predicted.
+    """
     if len(residual) < 4:
         return None
     metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).mean(0)
@@ -272,7 +283,10 @@ def leave_one_out(
 
 
 def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None) -> Float[ndarray, "r r"]:
-    """Return the covariance of the systematic errors at 1 rad; raise InputError where arm, angles and poses misfit."""
+    """Return the covariance (6n,6n) of the systematic errors of gripper poses for a size of 1 rad.
+
+    Raises InputError if the poses do not fit the arm and its joint angles.
+    """
     if robot is None:
         if joints is not None:
             raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
@@ -287,6 +301,7 @@ def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | Non
 
 
 def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
+    """Return the argument `name` as an array of floats; raise InputError if it does not consist of numbers."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -294,6 +309,7 @@ def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
 
 
 def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
+    """Return the argument `name` as a stack of rigid transforms; raise InputError if it is none."""
     stack = _numbers(transforms, name, "(n,4,4)")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")

@@ -1,4 +1,4 @@
-"""Options of a calibration, apart from the stage that imports SciPy, for the help of the command line."""
+"""Options of a calibration, in a module that the command line's help imports without SciPy."""
 
 from dataclasses import dataclass
 from math import inf, isfinite, radians
@@ -10,12 +10,12 @@ from jcr.errors import InputError
 from jcr.findings.requirement import Where
 
 GRASPING = (5.0, 1.0)
-"""mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
-tip of a finger of 100 mm by 2 mm."""
+"""Default of the required accuracy (mm, degrees): a parallel gripper that opens 10 mm wider than its object has 5 mm to
+either side, and one degree moves the tip of a 100 mm finger by 2 mm."""
 MOST_POSES = 12
-"""Largest number of gripper poses that are proposed to reach the requirement; beyond it no number is given."""
+"""Largest number of gripper poses that are proposed to reach the required accuracy."""
 LengthInImage = tuple[str, float, float, float, float, float]
-"""An image, x and y of two pixels of it, and how far apart what they show is (mm)."""
+"""Image name, x and y of two pixels in it, and the distance (mm) between the two points that the pixels show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class CalibrateOptions:
 
 
 def check_options(options: CalibrateOptions) -> None:
-    """Raise InputError, before any work, if a number or a name is not valid."""
+    """Raise InputError if a number of the options is out of range or the name of the arm is unknown."""
     from jcr.estimation.arms import arm_named
 
     for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):

@@ -1,4 +1,4 @@
-"""Calibration: the record of a hand-eye calibration, in memory and as calibration.json, which is its dump."""
+"""Record of a hand-eye calibration, in memory and as calibration.json: verdict, transform, uncertainty, findings."""
 
 import json
 from collections.abc import Sequence
@@ -68,20 +68,20 @@ NAMES = {
     "gripper": ("gripper_from_camera", "base_from_recon"),
     "base": ("base_from_camera", "gripper_from_object"),
 }
-"""Names of the transforms of camera and reconstruction, by what the camera is mounted on."""
+"""Names of the two transforms of a calibration, for a camera on the gripper and for one fixed in the base frame."""
 
 
 def as_json(finding: Finding) -> dict[str, Any]:
-    """Return a finding as files have it: its fields, its text and its remedy."""
+    """Return a finding as JSON: its fields, and its text and remedy in words."""
     return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
 
 
 FindingJson = Annotated[Finding, PlainSerializer(as_json)]
-"""Finding with its text and remedy, which are for people and made again when it is read."""
+"""Finding whose JSON also holds text and remedy, for people; reading ignores both."""
 
 
 def derived(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return the fields of a file that hold findings, strongest first."""
+    """Return the fields of a JSON file that state findings: the findings, their verdict, and the warnings in words."""
     verdict = verdict_of(findings)
     return {
         "findings": list(findings),
@@ -92,13 +92,13 @@ def derived(findings: Sequence[Finding]) -> dict[str, Any]:
 
 
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
-    """Raise ValueError where the verdict contradicts the findings."""
+    """Raise ValueError if the `verdict` or `converged` that a file states is not that of its findings."""
     if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 
 
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
-    """Return a translation and a rotation in the units of the file."""
+    """Return a translation (m) and a rotation (rad) as the JSON fields translation_mm and rotation_deg."""
     return {"translation_mm": rounded(1e3 * metres), "rotation_deg": rounded(np.degrees(radians))}
 
 
@@ -113,10 +113,11 @@ AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """Findings, verdict and use of the images: the part of a result that exists even where no calibration was found.
+    """Part of a result that a failed calibration has too: findings, verdict, and the use of each image.
 
-    A camera is mounted on the gripper, and the scene rests in the base frame; or the camera is mounted on the base, and
-    the reconstruction is of an object in the gripper. `parent_from_camera` is the transform of either.
+    With mount "gripper" the camera is on the gripper, and the reconstructed scene rests in the base frame. With mount
+    "base" the camera is fixed, and the gripper carries the reconstructed object. `parent_from_camera` is
+    gripper_from_camera or base_from_camera.
     """
 
     __pydantic_config__ = ConfigDict(allow_inf_nan=False)
@@ -124,25 +125,26 @@ class Outcome:
     mount: Mount = "gripper"
     """Body that the camera is mounted on."""
     on_gripper: Annotated[Matrix | None, Field(alias="gripper_from_camera")] = None
-    """Pose of a camera on the gripper (m); None of a fixed one."""
+    """Pose of a camera on the gripper (m); None for a fixed camera."""
     on_base: Annotated[Matrix | None, Field(alias="base_from_camera")] = None
-    """Pose of a fixed camera (m); None of one on the gripper."""
+    """Pose of a fixed camera (m); None for a camera on the gripper."""
     resting: Annotated[Matrix | None, Field(alias="base_from_recon")] = None
-    """Rigid; maps recon coordinates multiplied by `scale` (m) to the base frame; None for a fixed camera."""
+    """Rigid transform of recon coordinates times `scale` (m) to the base frame; None for a fixed camera."""
     carried: Annotated[Matrix | None, Field(alias="gripper_from_object")] = None
-    """Rigid; maps coordinates of the reconstructed object multiplied by `scale` (m) to the gripper frame."""
+    """Rigid transform of the carried object's recon coordinates times `scale` (m) to the gripper frame; None for a
+    camera on the gripper."""
     backend: str = ""
     """Name of the back end that reconstructed the images."""
     images: tuple[ImageVerdict, ...]
-    """Every image of the capture, in its order; of a fit to poses, every pose."""
+    """Use of every image of the capture, in its order; of every pose pair, for a calibration from given poses."""
     intrinsics: IntrinsicsAndStd | None = None
-    """Intrinsics that belong to the transform (px); None where poses alone were given."""
+    """Intrinsics to use together with the transform (px); None for a calibration from given poses."""
     findings: tuple[FindingJson, ...] = ()
-    """Findings of the checks, strongest first; of the same severity causes before consequences."""
+    """Findings of the checks: first those that reject, then warnings, then remarks; causes before consequences."""
     notes: tuple[str, ...] = ()
-    """Remarks of the stages, and findings in words that require no action."""
+    """Remarks of the stages, and findings that require no action, in words."""
     attempts: tuple[Attempt, ...] = ()
-    """Back ends that were tried, in order; empty where camera poses were given."""
+    """Reconstructions that were tried, first to last; empty for a calibration from given poses."""
     timings_s: dict[str, float] = field(default_factory=dict)
     """Seconds of each stage."""
     version: str = field(default_factory=_version)
@@ -150,44 +152,44 @@ class Outcome:
     @computed_field
     @property
     def verdict(self) -> Verdict:
-        """Severity of the worst finding."""
+        """Result of all checks: accepted, accepted with warnings, or rejected."""
         return verdict_of(self.findings)
 
     @computed_field
     @property
     def converged(self) -> bool:
-        """Whether it is accepted."""
+        """Whether the calibration is accepted, with or without warnings."""
         return self.verdict != "rejected"
 
     @computed_field
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Findings that reject or warn, in words."""
+        """Sentences of the findings that reject or warn."""
         return warnings_of(self.findings)
 
     @computed_field
     @property
     def observability(self) -> Observability:
-        """Directions that the motions determine."""
+        """Directions of translation, rotation and scale that the motions leave unobservable."""
         return Observability(tuple(one for one in self.findings if one.kind is FindingKind.UNOBSERVABLE))
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"] | None:
-        """gripper_from_camera, or base_from_camera of a fixed camera; None where nothing was found."""
+        """gripper_from_camera, or base_from_camera of a fixed camera; None for a failed calibration."""
         return self.on_gripper if self.mount == "gripper" else self.on_base
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Transform of a camera on the gripper; InputError of a fixed one, RejectedError where nothing was found."""
+        """Pose of a camera on the gripper; raises InputError for a fixed one, RejectedError without a calibration."""
         return self._require(self.on_gripper, "gripper")
 
     @property
     def base_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Transform of a fixed camera; InputError of one on the gripper, RejectedError where nothing was found."""
+        """Pose of a fixed camera; raises InputError for one on the gripper, RejectedError without a calibration."""
         return self._require(self.on_base, "base")
 
     def _require(self, matrix: Float[ndarray, "4 4"] | None, mount: Mount) -> Float[ndarray, "4 4"]:
-        """Return a transform of this calibration; raise where the camera has the other mount, or nothing was found."""
+        """Return `matrix`; raise InputError if the camera's mount is not `mount`, RejectedError if `matrix` is None."""
         if self.mount != mount:
             raise InputError(f"the camera's mount is {self.mount}: read {' and '.join(NAMES[self.mount])}")
         if matrix is None:
@@ -196,22 +198,22 @@ class Outcome:
 
     @property
     def doubt(self) -> str | None:
-        """Reason of the rejection in words; None where it is accepted."""
+        """Reason of the rejection in words; None for an accepted calibration."""
         return doubt_of(self.findings)
 
     @property
     def short(self) -> Finding | None:
-        """Finding that the requirement is not met; None where it is."""
+        """Finding that the required accuracy is not reached; None if it is."""
         return next((one for one in self.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH), None)
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
+        """Whether the calibration is accepted apart from the required accuracy, so that later stages can use it."""
         return verdict_of(one for one in self.findings if one is not self.short) != "rejected"
 
     @property
     def remarks(self) -> list[str]:
-        """Remaining warnings in words, without those that the reason of the rejection explains."""
+        """Warnings in words, apart from the reason of a rejection and its consequences, and the unmet requirement."""
         first = self.short if self.converged else self.findings[0]
         said = without_consequences(self.findings)
         return [sentence(one) for one in said if one.severity != "informs" and one is not first]
@@ -222,11 +224,11 @@ class Outcome:
         return sum(image.used for image in self.images)
 
     def with_findings(self: AnyOutcome, *findings: Finding) -> AnyOutcome:
-        """Return the calibration with more findings, ordered from strongest to weakest."""
+        """Return the calibration with more findings, all of them sorted by `strongest_first`."""
         return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     def with_notes(self: AnyOutcome, *notes: str) -> AnyOutcome:
-        """Return the calibration with more notes, and those of the findings that require no action."""
+        """Return the calibration with more notes, and with the findings that require no action as notes."""
         informs = (sentence(one) for one in self.findings if one.severity == "informs")
         return replace(self, notes=tuple(dict.fromkeys([*self.notes, *notes, *informs])))
 
@@ -248,30 +250,31 @@ class Calibration(Outcome):
     scale: Positive
     """Metres per unit of the reconstruction."""
     uncertainty: Uncertainty
-    """Along axes of the gripper; of a fixed camera along axes of the base."""
+    """Uncertainty of transform and scale, along axes of the gripper, or of the base for a fixed camera."""
     source: Literal["images", "poses"] = "poses"
-    """images: the images were adjusted with the gripper poses; poses: the transform is fitted to camera poses."""
+    """images: result of a bundle adjustment with the gripper poses; poses: result of a fit to camera poses."""
     residuals: PaperResiduals = PaperResiduals(0.0, 0.0)
     robot_noise: RobotNoise
     joint_offsets: JointOffsets | None = None
-    """None where the arm is not known."""
+    """Estimated joint offsets; None where the arm is not known."""
     held_out: LeaveOneOut | None = None
     """Leave-one-out error; None where too few images are used."""
     requirement: Requirement | None = None
-    """Required and reached accuracy; None of a fit outside the stage calibrate."""
+    """Required and reached accuracy; None for the result of `solve_hand_eye`."""
     next_poses: tuple[NextPose, ...] = ()
-    """Gripper poses that would shrink the reported uncertainty most."""
+    """Gripper poses to add: those that reduce the uncertainty most."""
     with_given_intrinsics: WithGivenIntrinsics | None = None
-    """Transform for the intrinsics that were given; None where none were, or they were not estimated beside that."""
+    """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
     depth_check: DepthCheck | None = None
-    """None without depth images, or where too few features have a depth."""
+    """Scale and noise of the depth images; None without them, or if too few features have a depth."""
     lengths: tuple[LengthCheck, ...] = ()
-    """Every length that was compared with the robot's positions."""
+    """Known lengths, each compared with the robot's positions."""
     board: BoardFound | None = None
-    """None where no board took part beside features."""
+    """Adjusted board; None unless a board was adjusted together with features."""
 
     @model_validator(mode="after")
     def _is_of_one_mount(self) -> "Calibration":
+        """Raise ValueError unless the transforms present are exactly the two of the camera's mount."""
         own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
         own, other = (own, other) if self.mount == "gripper" else (other, own)
         if any(one is None for one in own) or any(one is not None for one in other):
@@ -281,7 +284,7 @@ class Calibration(Outcome):
     @computed_field
     @property
     def robot_errors(self) -> dict[str, Any]:
-        """Systematic errors of the gripper poses: one sigma, the part left in the poses per axis, and of each joint."""
+        """Systematic errors of the gripper poses, one sigma: size, part left after the fit per axis, joint offsets."""
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
@@ -300,17 +303,20 @@ class Calibration(Outcome):
 
     @property
     def base_from_recon(self) -> Similarity:
-        """Similarity from the reconstruction to the base frame; InputError for a fixed camera."""
+        """Similarity from the reconstruction to the base frame; raises InputError for a fixed camera."""
         return Similarity(self._require(self.resting, "gripper"), self.scale)
 
     @property
     def gripper_from_object(self) -> Similarity:
-        """Similarity from the reconstruction of what the gripper carries; InputError for a camera on the gripper."""
+        """Similarity from the reconstruction of the carried object to the gripper frame.
+
+        Raises InputError for a camera on the gripper.
+        """
         return Similarity(self._require(self.carried, "base"), self.scale)
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance in records.COVARIANCE_ORDER."""
+        """Covariance of the translation (m), rotation vector (rad) and log scale, as in records.COVARIANCE_ORDER."""
         return self.uncertainty.covariance
 
     @property
@@ -325,12 +331,15 @@ class Calibration(Outcome):
         return tuple(one.image for one in self.images if one.used)
 
     def with_used(self, used: Bool[ndarray, " m"]) -> "Calibration":
-        """Return the calibration with other images used, of a calibration whose images are the registered ones."""
+        """Return the calibration with the mask of used images replaced; its images are the registered ones."""
         images = tuple(replace(one, used=bool(own)) for one, own in zip(self.images, used, strict=True))
         return replace(self, images=images)
 
     def on_fixed_camera(self) -> "Calibration":
-        """Return the calibration of exchanged poses as that of a fixed camera, whose transform is base_from_camera."""
+        """Return the calibration as that of a fixed camera, with base_from_camera and gripper_from_object.
+
+        This calibration was made with gripper_from_base in place of base_from_gripper.
+        """
         transforms = {
             "on_gripper": None,
             "on_base": self.on_gripper,
@@ -340,13 +349,16 @@ class Calibration(Outcome):
         return replace(self, mount="base", with_given_intrinsics=None, **transforms)
 
     def with_uncertainty(self, uncertainty: Uncertainty) -> "Calibration":
-        """Return the calibration with another uncertainty, and the standard deviations of the intrinsics with it."""
+        """Return the calibration with `uncertainty`, from which the intrinsics take their standard deviations."""
         intrinsics, std = self.intrinsics, uncertainty.intrinsics_std
         intrinsics = None if intrinsics is None else intrinsics.with_std(std)
         return replace(self, uncertainty=uncertainty, intrinsics=intrinsics)
 
     def with_finding(self, finding: Finding) -> "Calibration":
-        """Return the calibration, as uncertain as the shifts of a finding make transform and intrinsics."""
+        """Return the calibration with the shift s of a finding as additional covariance s·sᵀ; the finding is not added.
+
+        The shift is that of the transform and, if the intrinsics were estimated, of the intrinsics.
+        """
         if finding.shift is None:
             return self
         moved, joint = finding.intrinsics_shift, self.uncertainty.joint
@@ -356,7 +368,10 @@ class Calibration(Outcome):
     def of_capture(
         self, capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs
     ) -> "Calibration":
-        """Return the calibration of the registered images as that of the capture, with the notes of its stages."""
+        """Return the calibration with a verdict on every image of the capture, and with the notes of reconstruction.
+
+        Images that were not registered are added as unused.
+        """
         own = dict(zip(reconstruction.image_index.tolist(), self.images, strict=True))
         why = f"not registered by {reconstruction.backend}"
         images = tuple(
@@ -369,11 +384,11 @@ class Calibration(Outcome):
     def point_in_base(
         self, pixel: ArrayLike, depth_m: ArrayLike | float, base_from_gripper: ArrayLike
     ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
-        """Return the base-frame coordinates (m) of points that the camera shows, and their covariances (m²).
+        """Return the base-frame coordinates (m) of points given by pixel and depth, and their covariances (m²).
 
         `pixel` (…,2) are pixels of the distorted image, `depth_m` (…) the z coordinates in the camera frame. The
-        covariance includes intrinsics, transform, and the errors of the reported gripper pose; errors of the pixel and
-        of a measured depth are the caller's to add. Raises InputError for a fixed camera or without intrinsics.
+        covariances include the errors of intrinsics, transform and reported gripper pose, but not those of `pixel` and
+        `depth_m`. Raises InputError for a fixed camera or without intrinsics.
         """
         x = self.gripper_from_camera
         if self.intrinsics is None:
@@ -382,11 +397,11 @@ class Calibration(Outcome):
         return point_in_base(x, self.uncertainty, self.intrinsics, self.robot_noise, pixel, depth_m, pose)
 
     def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
+        """Return the calibration as an HTML table, which notebooks display."""
         return self.as_html()
 
     def as_html(self, note: str = "") -> str:
-        """Return the transform with its standard deviations, the verdict and the warnings as a table, `note` below."""
+        """Return an HTML table of transform, standard deviations, verdict and warnings, with `note` below it."""
         mm, degrees = (
             1e3 * self.parent_from_camera[:3, 3],
             np.degrees(rotation_log(self.parent_from_camera[:3, :3])),
@@ -404,26 +419,27 @@ class Calibration(Outcome):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FailedCalibration(Outcome):
-    """Result for a capture whose images gave no camera poses; the findings are the reasons, strongest first.
+    """Result for a capture that could not be reconstructed; its findings are the reasons.
 
-    Its file has the keys of a Calibration, which are null. What it does not have raises RejectedError.
+    Fields of a Calibration, such as `scale`, are None here and null in the file. Properties and methods of a
+    Calibration raise RejectedError.
     """
 
     @computed_field
     @property
     def observability(self) -> Observability:
-        """Nothing is observed; the remedy is that of the first finding."""
+        """Observability of a failed calibration: nothing is observable; the remedy is that of the first finding."""
         advice = remedy(self.findings[0]) or text(self.findings[0])
         kind, motion = FindingKind.UNOBSERVABLE, "no camera poses"
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 
     @property
     def parent_from_camera(self) -> None:
-        """None: nothing was found."""
+        """None, because a failed calibration has no transform."""
         return None
 
     def __getattr__(self, name: str) -> Any:
-        """Return nothing for a field of a calibration; raise RejectedError for other attributes of one."""
+        """Return None, or an empty tuple, for a field of a Calibration; raise RejectedError for its other attributes."""
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
             return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):
@@ -431,7 +447,7 @@ class FailedCalibration(Outcome):
         raise RejectedError(f"no calibration was found: {self.doubt}")
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of calibration.json: the keys of a Calibration, whose own are null or empty."""
+        """Return the content of calibration.json: the keys of a Calibration, null or empty where this has no value."""
         fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
         empty = {name: [] if name in {"next_poses", "lengths"} else None for name in sorted(fields)}
         return super().as_json() | empty
@@ -447,7 +463,7 @@ def failed_calibration(
     timings_s: dict[str, float],
     attempts: Sequence[Attempt] = (),
 ) -> FailedCalibration:
-    """Return the result for a capture whose images gave no camera poses; `findings` are the reasons, strongest first."""
+    """Return the result for a capture that could not be reconstructed; `findings` are the reasons."""
     unregistered = (ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images)
     return FailedCalibration(
         mount=capture.mount,
@@ -462,17 +478,20 @@ def failed_calibration(
 
 @cache
 def adapter(kind: type[Outcome]) -> TypeAdapter:
-    """Return the reader and writer of a record's JSON."""
+    """Return the pydantic adapter that reads and writes a class of records as JSON."""
     return TypeAdapter(kind)
 
 
 def write_calibration(path: Path, content: Outcome) -> None:
-    """Write calibration.json whole or not at all."""
+    """Write a result as calibration.json; a failed write leaves an existing file unchanged."""
     write_text(path, json.dumps(content.as_json(), indent=2, allow_nan=False) + "\n")
 
 
 def read_calibration(path: Path) -> AnyCalibration:
-    """Read calibration.json, or the one in a run folder; raise InputError where there is none, or of another format."""
+    """Read a calibration.json, given as a file or as its run folder.
+
+    Raises InputError if the file is missing, damaged, or of another format.
+    """
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
@@ -480,7 +499,7 @@ def read_calibration(path: Path) -> AnyCalibration:
 
 
 def read_content(file: Path) -> dict[str, object]:
-    """Return the object in a JSON file; raise InputError where there is none."""
+    """Return the top-level object of a JSON file; raise InputError if the file is damaged or holds no object."""
     try:
         content = read_json(file)
     except InputError as error:
@@ -492,7 +511,10 @@ def read_content(file: Path) -> dict[str, object]:
 
 
 def validated(content: dict[str, object], file: Path) -> AnyCalibration:
-    """Return the calibration of a file's content; raise InputError where it is none, or of another format."""
+    """Return the calibration that the content of `file` describes.
+
+    Raises InputError, whose message names the file, if the content is invalid or of another format.
+    """
     kind = content.get("format")
     if kind != FORMAT:
         raise InputError(
@@ -501,7 +523,7 @@ def validated(content: dict[str, object], file: Path) -> AnyCalibration:
     is_empty = content.get("scale") is None and content.get("uncertainty") is None
     record = FailedCalibration if is_empty else Calibration
     try:
-        # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
+        # Strict validation accepts lists for tuples and arrays only in JSON text, not in Python values.
         found = adapter(record).validate_json(json.dumps(content), strict=True)
         require_one_verdict(found.findings, content.get("verdict"), content.get("converged"))
     except ValueError as error:

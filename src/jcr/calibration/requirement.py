@@ -1,4 +1,4 @@
-"""Required accuracy of a calibration, its accuracy in use, and the gripper poses to add until it is reached."""
+"""Required and reached accuracy of a calibration, and the gripper poses to add until the required one is reached."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -31,9 +31,9 @@ from jcr.geometry import Poses, inverse, rotation_angle
 from jcr.records import NextPose, Requirement, SceneUncertainty, Uncertainty, Where
 
 PROPOSED = 2
-"""Number of gripper poses proposed after a calibration, if these are enough."""
+"""Number of gripper poses that are proposed at least after a calibration that misses the required accuracy."""
 COMPARED, EXISTING = 80, 40
-"""Number of candidate poses that are compared, and of poses of the capture by which they are compared."""
+"""Largest number of candidate poses, and of poses of the capture that the predictions for the candidates include."""
 
 
 def better_poses(
@@ -45,10 +45,11 @@ def better_poses(
     seed: int = 0,
     is_likely: Callable[[Poses], Bool[ndarray, " k"]] | None = None,
 ) -> Float[ndarray, "c 4 4"]:
-    """Return the `count` gripper poses that reduce the predicted uncertainty most, best first.
+    """Return `count` gripper poses to add that reduce the predicted uncertainty most, best first.
 
-    `robot` are the errors of the poses of the capture, `reach` is that of `candidate_poses`, drawn with `seed`.
-    `is_likely` tells at which poses an image is likely to register; others are taken only where there are none.
+    `base_from_gripper` and `robot` are the poses of the capture and their errors. The candidates are random poses
+    (`candidate_poses`) within `reach`, drawn with `seed`. `is_likely` returns a mask of the poses whose images are
+    likely to register; the candidates are restricted to them unless there are none.
     """
     now, x = base_from_gripper, assumptions.gripper_from_camera
     if count == 0:
@@ -72,7 +73,7 @@ def better_poses(
 def predictions(
     assumptions: Assumptions, base_from_gripper: Poses, robot: RobotErrorPrior, added: Float[ndarray, "c 4 4"]
 ) -> Callable[[int], Uncertainty]:
-    """Return the function that predicts the uncertainty with the first of the added poses, by their number."""
+    """Return a function of c that predicts the uncertainty with the first c of the `added` poses."""
 
     def predicted(count: int) -> Uncertainty:
         together = np.concatenate([base_from_gripper, added[:count]])
@@ -88,10 +89,11 @@ def next_poses(
     predicted: Callable[[int], Uncertainty],
     reported: Uncertainty | None = None,
 ) -> tuple[NextPose, ...]:
-    """Return the added poses, each with the uncertainty expected with all up to it; `names` are those of the capture.
+    """Return records of the added poses, each with the uncertainty expected after it and those before it are added.
 
-    A `reported` uncertainty shrinks by the ratio by which the predicted one does: images and robot may be better or
-    worse than predicted.
+    `names` are the images of the poses in `base_from_gripper`. If the `reported` uncertainty of the calibration is
+    given, the expected one is the reported one times the predicted ratio, because images and robot may differ from the
+    assumptions of the prediction.
     """
     found = []
     for count, pose in enumerate(added, start=1):
@@ -116,7 +118,7 @@ def next_poses(
 
 
 def assumptions_of(case: Case) -> Assumptions:
-    """Return the assumption that further images and gripper poses are like those of an accepted calibration."""
+    """Return the assumptions of predictions: new images and gripper poses are like the used ones of the case."""
     used, metric_std = case.base_from_gripper[case.used], case.reconstruction.metric_std
     assumptions = assumptions_of_poses(case.hand_eye, used, metric_std)
     if case.adjusted is None or (distance := case.scene_distance_m) is None:
@@ -127,7 +129,10 @@ def assumptions_of(case: Case) -> Assumptions:
 def assumptions_of_poses(
     hand_eye: Calibration, used: Float[ndarray, "n 4 4"], scale_std: float | None = None
 ) -> Assumptions:
-    """Return the same assumption for a calibration from given camera poses; `used` are its gripper poses."""
+    """Return the assumptions of predictions for a calibration from camera poses; `used` are its used gripper poses.
+
+    `scale_std` is the relative standard deviation of a known scale; None: the scale is estimated.
+    """
     return Assumptions(
         gripper_from_camera=hand_eye.gripper_from_camera,
         distance_m=median_distance(used @ hand_eye.gripper_from_camera),
@@ -137,7 +142,10 @@ def assumptions_of_poses(
 
 
 def reached(uncertainty: Uncertainty, at: Where) -> tuple[float, float]:
-    """Return the bounds (mm, degrees) of 95 % of the errors at one place; without a scene at a seen point."""
+    """Return the bounds (mm, degrees) of 95 % of the errors of a seen point, the camera, or mapped points.
+
+    Without an uncertainty of the scene, `at` "scene" gives the bounds of a seen point.
+    """
     covariance, scene, seen = uncertainty.covariance, uncertainty.scene, uncertainty.seen
     if at == "camera":
         metres = within_95(covariance[:3, :3])
@@ -157,18 +165,18 @@ def advised(
     assumptions: Assumptions,
     scene: SceneUncertainty | None = None,
 ) -> Calibration:
-    """Return the calibration with its point uncertainty, the requirement, and the poses to add.
+    """Return the calibration with its point uncertainty, the required accuracy, and the gripper poses to add.
 
-    Poses are proposed where the requirement is not met or the user asks: the prediction takes a third of a calibration.
-    `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
-    calibration, `scene` is the uncertainty of the scene, where images were adjusted.
+    Poses are proposed if the required accuracy is not reached or the option `next_poses` requests them. `gripper` and
+    `robot` are the gripper poses of the registered images and their errors, `assumptions` those of the predictions.
+    `scene` is the uncertainty of the reconstructed scene; None for a calibration from camera poses.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
     x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty
     seen = seen_points(x, uncertainty, hand_eye.intrinsics, assumptions.distance_m)
     uncertainty = replace(uncertainty, seen=seen, scene=scene)
     required = _required(uncertainty, options)
-    # Wrong intrinsics and a strained robot stay the same with further images.
+    # More images reduce neither the error of wrong intrinsics nor that of robot errors that depend on the reach.
     lasting = [
         one.covariance
         for one in hand_eye.findings
@@ -177,7 +185,7 @@ def advised(
     assumptions = replace(assumptions, faults=sum(lasting, start=np.zeros((7, 7))))
     least = options.next_poses if required.met else max(PROPOSED, options.next_poses)
     if not hand_eye.converged:
-        # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
+        # Predictions for a rejected calibration assume a typical camera pose, and at least the typical robot errors.
         found, usual, least = hand_eye.robot_noise, typical_noise(), PROPOSED
         sizes = ("translation", "rotation", "systematic")
         noise = replace(found, **{name: max(getattr(found, name), getattr(usual, name)) for name in sizes})
@@ -212,7 +220,7 @@ def advised(
 
 
 def _required(uncertainty: Uncertainty, options: CalibrateOptions) -> Requirement:
-    """Return the requirement beside the accuracy in use of a calibration."""
+    """Return the accuracy that the options require (default: GRASPING), and the accuracy that `uncertainty` states."""
     reached_mm, reached_deg = reached(uncertainty, options.require_at)
     translation_mm, rotation_deg = options.require or GRASPING
     assert uncertainty.seen is not None

@@ -1,4 +1,4 @@
-"""Prior covariance of the systematic errors of gripper poses, of a known arm or of any."""
+"""Prior covariance of systematic gripper pose errors: joint and link errors of a known arm, or smooth errors."""
 
 from dataclasses import dataclass, replace
 
@@ -21,26 +21,27 @@ from jcr.records import Capture
 
 @dataclass(frozen=True)
 class RobotErrorPrior:
-    """Prior covariance of the systematic errors of gripper poses, and the arm that it follows from."""
+    """Prior covariance of the systematic errors of gripper poses, and the arm and joint angles it is computed from."""
 
     systematic: Float[ndarray, "r r"]
-    """Covariance of the errors at 1 rad, r = 6 times the poses."""
+    """Covariance of the pose errors for a size of 1 rad, r = 6 times the number of poses."""
     arm: Arm | None = None
-    """Arm with its tool; None where it is not known."""
+    """Kinematics of the arm and its tool; None: unknown, errors vary smoothly over the poses."""
     joints: Joints | None = None
-    """Joint angles at the poses."""
+    """Joint angles (rad) at the poses; None without an arm."""
     unused: Finding | None = None
-    """Finding that the arm of the capture is not used; None where it is used, or none is named."""
+    """Finding that the poses do not fit the arm that the capture names; None if they fit or no arm is named."""
 
     def of(self, poses: Int[ndarray, " m"]) -> "RobotErrorPrior":
-        """Return the errors of some of the poses."""
+        """Return the prior of a subset of the poses, given by their indices."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
     def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
-        """Return the covariance at 1 rad of the errors of these poses, then of others.
+        """Return the covariance, for a size of 1 rad, of the errors of these poses followed by `added` poses.
 
-        The arm takes the others in the posture of the nearest of these poses.
+        `base_from_gripper` are the poses of this prior. Inverse kinematics of an added pose starts at the joint angles
+        of the nearest of them.
         """
         if len(added) == 0:
             return self.systematic
@@ -53,10 +54,11 @@ class RobotErrorPrior:
 def robot_errors(
     capture: Capture, options: CalibrateOptions, later: Capture | None = None
 ) -> RobotErrorPrior:
-    """Return the errors of the capture's gripper poses and of `later` ones of the same robot.
+    """Return the error prior of the capture's gripper poses, followed by those of a `later` capture of the same robot.
 
-    Raises InputError where the poses are not those of the arm that the user named, or are all too long by one factor for
-    their joint angles. An arm that only the capture names is not used then.
+    Raises InputError if the poses do not fit the arm of the option `robot`, and for any arm if all poses are too long
+    by one factor for their joint angles (LengthError). An arm that only the capture names and that the poses do not fit
+    is not used.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:
@@ -74,9 +76,10 @@ def robot_errors(
 
 
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
-    """Return the errors of poses of an arm at joint angles (rad), or of any robot; unknown angles follow from the poses.
+    """Return the error prior of gripper poses of an arm at joint angles (rad), or of an unknown robot.
 
-    Raises InputError where poses, joints and arm do not fit.
+    If only the arm is given, inverse kinematics computes the angles. Raises InputError if the poses do not fit the arm
+    and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))
@@ -85,6 +88,7 @@ def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = No
 
 
 def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
+    """Return the arm named by the options or the capture, or that of the capture's URDF; None: unknown."""
     name = options.robot or capture.robot
     if name is not None:
         return arm_named(name)
@@ -94,6 +98,6 @@ def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the covariance of some of the poses."""
+    """Return the rows and columns of a pose covariance (6 rows per pose) that belong to the poses of these indices."""
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

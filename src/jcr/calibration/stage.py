@@ -1,4 +1,4 @@
-"""Calibration of a capture, or of given camera poses: fit, bundle adjustment, checks, verdict, requirement."""
+"""Stage calibrate, for a reconstructed capture or given camera poses: fit, bundle adjustment, checks, next poses."""
 
 from dataclasses import replace
 from functools import partial
@@ -40,25 +40,24 @@ CHECKS = (
     check_robot,
     check_remarks,
 )
-"""Checks in their order, causes before consequences.
+"""Checks in the order in which they run, causes before consequences.
 
-Poses of another convention fit nothing, so the convention is tested first where the fit was rejected. Effects on camera
-and robot compete in one test, of rejected calibrations as well, since they explain the rejection.
+The pose convention of a rejected calibration is tested early, because poses of another convention make all later checks
+meaningless. Rejected calibrations are also tested for effects on camera and robot, which may explain the rejection.
 """
 METRIC_STD = 0.005
-"""Relative standard deviation of the size of a printed marker."""
+"""Difference of the log scale of metric poses from 0 up to which the scale counts as 1 (size of a printed marker)."""
 
 
 @one_blas_thread
 def calibrate_reconstruction(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
 ) -> Calibration:
-    """Calibrate the registered images of a capture.
+    """Calibrate a capture from its reconstruction: fit, bundle adjustment, checks, and gripper poses to add.
 
-    Camera poses with a covariance are weighed with it and not adjusted. Other images are adjusted with the poses; on
-    correspondences between pointmaps, whose errors neighbours share, the adjustment stands only where its leave-one-out
-    error is smaller. Raises InputError for options that cannot be, and RejectedError with fewer than two registered
-    images.
+    Camera poses with a covariance (`evidence`) are fitted with it and not adjusted. For correspondences between
+    pointmaps, whose errors are correlated, the bundle adjustment replaces the fit only if its leave-one-out error is
+    smaller. Raises InputError for invalid options, and RejectedError with fewer than two registered images.
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
@@ -74,7 +73,10 @@ def calibrate_reconstruction(
 def calibrate_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case after fit, adjustment, checks and advice; `robot` is of the registered images."""
+    """Return the case after fit, adjustment and checks, with required accuracy and proposed gripper poses.
+
+    `robot` is the error prior of the registered images' gripper poses.
+    """
     case = checked_case(capture, reconstruction, options, robot)
     gripper, assumptions = case.base_from_gripper, assumptions_of(case)
     found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)
@@ -85,13 +87,16 @@ def calibrate_case(
 def checked_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case after fit, adjustment and checks, without advice; `robot` is of the registered images."""
+    """Return the case after fit, adjustment and checks, without required accuracy and proposed gripper poses.
+
+    `robot` is the error prior of the registered images' gripper poses.
+    """
     case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
     for check in CHECKS:
         try:
             case = check(case)
         except np.linalg.LinAlgError:
-            # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
+            # With a rejected calibration, points may lie behind the cameras; a check that fails then is skipped.
             if case.hand_eye.converged:
                 raise
     return case
@@ -100,9 +105,10 @@ def checked_case(
 def fit_poses(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Fit the hand-eye transform to camera poses, with the known lengths that replace what the motions do not show.
+    """Fit the hand-eye transform to camera poses; known scale, length and height are priors of the fit.
 
-    `robot` is of the registered images' poses. Raises RejectedError with fewer than two registered images.
+    `robot` is the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two
+    registered images.
     """
     evidence, rows = reconstruction.evidence, reconstruction.image_index
     if len(rows) < 2:
@@ -126,7 +132,7 @@ def fit_poses(
     )
     if options.known_length is not None:
         scale = length_cue(capture, reconstruction, options.known_length)
-        # Where the motions determine the scale, it is compared with the length beside others (checks/lengths.py).
+        # If the motions determine the scale, the length is no prior; checks/lengths.py compares both.
         scale = None if offset is None and solve().converged else scale
     if scale is offset is None and metric_std is not None:
         free, scale = solve(), (1.0, metric_std)
@@ -149,10 +155,10 @@ def fit_poses(
 
 
 def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
-    """Calibrate from given camera poses, without images.
+    """Calibrate from given pairs of gripper and camera poses, without images.
 
-    The estimated scale of metric poses tests the given size of the marker; where motions do not determine the scale, it
-    is taken as 1.
+    For metric camera poses, an estimated scale other than 1 shows a wrong marker size; if the motions do not determine
+    the scale, it is assumed to be 1.
     """
     check_options(options := options or CalibrateOptions())
     gripper = pairs.base_from_gripper
@@ -168,7 +174,7 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
-    """Return the fit to given camera poses, with the findings of its scale and of the pose convention."""
+    """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention."""
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     gripper, camera, height = pairs.base_from_gripper, pairs.recon_from_camera, options.known_height
@@ -179,19 +185,19 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
         robot_noise=options.robot_noise_m_rad,
         offset=None if height is None else height_cue(gripper, height / 1e3),
         systematic=robot.systematic,
-        in_sequence=not pairs.is_metric,  # poses of a marker of known size are found each by itself
+        in_sequence=not pairs.is_metric,  # each pose of a marker of known size is estimated independently
         names=pairs.images,
     )
     hand_eye = free = solve()
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
-    # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
+    # The known scale is a prior unless the scale estimated from the motions contradicts the metric poses.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve(scale=scale)
         if not free.observability.observable and scale == 1.0:
             return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
         found = better_reading(gripper, camera)
-        # Of degenerate motions another convention may fit by chance: what is missing comes first.
+        # Degenerate motions may fit another convention by chance, so their own finding must come first.
         severity = "rejects" if hand_eye.observability.observable else "warns"
         return hand_eye.with_findings(*(() if found is None else (convention_finding(found, severity),)))
     if pairs.is_metric and not is_one(hand_eye):
@@ -202,6 +208,6 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
 
 
 def is_one(hand_eye: Calibration) -> bool:
-    """Return whether the scale is 1 within its uncertainty."""
+    """Return whether the estimated scale differs from 1 by less than 3 standard deviations or METRIC_STD."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

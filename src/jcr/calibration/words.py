@@ -1,4 +1,4 @@
-"""Calibration in words: the summary on the terminal, and the details of log.txt and `--verbose`."""
+"""Text of a calibration: the summary on the terminal, and the details of log.txt and `--verbose`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -23,11 +23,11 @@ from jcr.records import BoardFound, Budget, LeaveOneOut, SeenAndCorners, WithGiv
 from jcr.rounding import labelled, significant, with_std
 
 NEGLIGIBLE = 0.02
-"""Share of the largest part of a budget below which a part is left out: its square is 0.04 % of the whole."""
+"""Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
 MOST_LINES = 14
-"""Lines of a summary on the terminal, with the two that name the report and the next command."""
+"""Largest number of lines of the terminal's summary, including two that the caller adds: report and next command."""
 MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
-"""Kinds whose remedy is more images, which do not help where something else rejects the calibration."""
+"""Kinds with the remedy "more images"; not printed if a finding of another kind rejects the calibration."""
 BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
 PARTS = {
     "random robot errors": "robot_random",
@@ -36,7 +36,7 @@ PARTS = {
     "images": "images",
     "faults found": "faults",
 }
-"""Parts of a budget by their names for people."""
+"""Printed name of each field of an uncertainty budget."""
 
 
 def verdict_in_words(findings: Iterable[Finding]) -> str:
@@ -50,9 +50,9 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
 
 
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
-    """Return at most `most` lines, two of which are left to the caller: verdict, transform, accuracy, what to act on.
+    """Return the summary for the terminal: verdict, transform, accuracy and warnings, in at most `most` - 2 lines.
 
-    A rejected calibration has its cause and remedy instead of the transform.
+    For a rejected calibration, cause and remedy replace transform and accuracy.
     """
     limit = ""
     if (required := content.requirement) is not None:
@@ -75,9 +75,9 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
 
 
 def _result(content: Calibration) -> list[str]:
-    """Return the transform with its standard deviations, the accuracy, and the intrinsics that belong to it.
+    """Return the lines of an accepted calibration: transform with standard deviations, accuracy, and intrinsics.
 
-    The accuracy is that of 95 % of the errors, at the centre and in the corner, or as `--require-at` has it.
+    The accuracy is the bound on 95 % of the errors of the quantity that `--require-at` selects.
     """
     uncertainty, matrix = content.uncertainty, content.parent_from_camera
     quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
@@ -111,9 +111,9 @@ def _result(content: Calibration) -> list[str]:
 
 
 def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[str]:
-    """Return cause and remedy of a rejection, then warnings, on at most `most` lines.
+    """Return the lines with cause and remedy of a rejection, then the warnings; at most `most` lines.
 
-    `proposed` are the images to add; they take the place of that remedy.
+    The text `proposed` (images to add) replaces the remedy of a missed accuracy if more images are that remedy.
     """
 
     def advice(finding: Finding) -> str:
@@ -127,7 +127,7 @@ def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[
         lines = labelled("Cause", text(cause)) + labelled("Remedy", *filter(None, [advice(cause)]))
     for one in findings:
         if one.kind is FindingKind.NOT_EXACT_ENOUGH:
-            # The verdict states the requirement, another line the accuracy.
+            # Other lines of the summary state the required and the reached accuracy.
             lines += labelled("WARNING", f"the limit is not met; {advice(one)}")
         elif one.severity != "informs":
             lines += labelled("WARNING", sentence(one))
@@ -138,7 +138,7 @@ def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[
 
 
 def details(content: AnyCalibration) -> list[str]:
-    """Return the lines of `--verbose` and log.txt: result, facts, images, findings and notes."""
+    """Return the lines of `--verbose` and log.txt: transform, uncertainty, `facts`, use of images, findings, notes."""
     lines = [f"jcr {content.version}, back end {content.backend}"]
     if isinstance(content, Calibration):
         uncertainty, held_out = content.uncertainty, content.held_out
@@ -168,7 +168,7 @@ def log(content: AnyCalibration) -> str:
 
 
 def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
-    """Return blocks of names and values: times, attempts, uncertainty, lengths, depth camera, robot and board."""
+    """Return named values in blocks, by title: times, uncertainty, lengths, depth camera, robot and board."""
     time = {stage: f"{seconds:.1f} s" for stage, seconds in content.timings_s.items()}
     time["together"] = f"{sum(content.timings_s.values()):.1f} s"
     for k, attempt in enumerate(content.attempts, start=1):
@@ -208,7 +208,7 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
 
 
 def _budget(budget: Budget) -> dict[str, str]:
-    """Return the size of each part of the uncertainty, largest first; negligible parts are left out."""
+    """Return the size (mm, degrees) of each part of the uncertainty budget, largest first, without negligible ones."""
     shares = {name: share_of(getattr(budget, part)) for name, part in PARTS.items()}
     sizes = {name: np.array([one.translation_mm, one.rotation_deg]) for name, one in shares.items()}
     least = NEGLIGIBLE * np.max(list(sizes.values()), axis=0)
@@ -220,7 +220,7 @@ def _budget(budget: Budget) -> dict[str, str]:
 
 
 def _board(board: BoardFound) -> dict[str, str]:
-    """Return size, place and flatness of a board that took part beside features."""
+    """Return named values of an adjusted board: corners, size, flatness, and position in the base frame."""
     stated = f", {board.stated_mm:g} mm stated" if board.stated_mm else ""
     rows = {
         board.spec: f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px rms per axis",
@@ -246,13 +246,13 @@ def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Floa
     name = ("the image's x axis", "the image's y axis", "the optical axis")[k]
     if abs(along[k]) < np.cos(np.radians(30)):
         name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
-    # An offset that is unobservable may be uncertain by metres.
+    # The standard deviation of an unobservable translation may be metres.
     size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
     return f"along {name}: ±{size}"
 
 
 def seen_in_words(seen: SeenAndCorners) -> str:
-    """Return the parts of the point uncertainty, across the ray, along it, and in the corner of the image."""
+    """Return a sentence with the point uncertainty across the ray, along the ray, and in a corner of the image."""
     return (
         f"point uncertainty: {significant(seen.lateral_95_mm)} mm across the ray and "
         f"{significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a corner of the "
@@ -261,7 +261,10 @@ def seen_in_words(seen: SeenAndCorners) -> str:
 
 
 def given_in_words(given: WithGivenIntrinsics) -> str:
-    """Return how far apart the given and the estimated intrinsics place a point, each with its own transform."""
+    """Return a sentence with the distance between a point's positions by given and by estimated intrinsics.
+
+    Each set of intrinsics is used with the transform that belongs to it.
+    """
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
         f"{significant(given.differs_mm)} mm from there, and within {significant(given.seen.within_95_mm)} mm"
@@ -269,6 +272,6 @@ def given_in_words(given: WithGivenIntrinsics) -> str:
 
 
 def leave_one_out_text(held_out: LeaveOneOut) -> str:
-    """Return the leave-one-out error in mm, degrees and, where known, pixels."""
+    """Return the leave-one-out error as text, in mm, degrees and, for adjusted images, pixels."""
     px = "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
     return f"{significant(held_out.translation_mm)} mm, {significant(held_out.rotation_deg)}°{px}"

@@ -1,1 +1,1 @@
-"""Checks of a calibration."""
+"""Checks of a calibration, each of which adds its findings: capture, camera, robot, boards, lengths, poses."""

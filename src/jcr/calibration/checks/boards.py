@@ -1,4 +1,4 @@
-"""Checks of boards: found, at one place, printed at their size, and their size by the robot."""
+"""Checks of boards: not found, moved between images, printed at a wrong size; size estimated by the robot."""
 
 from dataclasses import replace
 
@@ -14,13 +14,13 @@ from jcr.geometry import apply
 from jcr.records import BoardFound, Boards
 
 STRETCHED = 4.0
-"""Standard deviations of a printer's stretch from which a board was not printed at its size."""
+"""Estimated stretch of a board, in standard deviations of a printer's stretch, from which its size counts as wrong."""
 MOVED = 4.0
-"""Factor from the scatter of a board's corners in an image to their common shift where the board was moved."""
+"""Ratio of the mean shift of a board's corners in an image to their scatter, from which the board counts as moved."""
 
 
 def check_boards(case: Case) -> Case:
-    """Report boards that were not found or that moved, and their size by the robot."""
+    """Report boards that were not found, moved or were stretched in print, and a board size estimated by the robot."""
     boards = case.reconstruction.tracks.boards
     if boards is None:
         return case
@@ -43,10 +43,10 @@ def check_boards(case: Case) -> Case:
 
 
 def board_faults(case: Case) -> list[Finding]:
-    """Return a finding of the fault that an adjustment shows of its boards, whose size is then no known length.
+    """Return a finding if the adjusted boards are faulty (stretched in print, or moved); else an empty list.
 
-    A board whose sides are stretched was not printed at its size. The corners of a board that was moved are, in some of
-    the images, all displaced alike.
+    A stretched board has sides of different scale. A board was moved before an image in which all its corners have a
+    common residual shift. The size of a faulty board is no known length.
     """
     adjusted, boards = case.adjusted, case.reconstruction.tracks.boards
     if boards is None or adjusted is None or adjusted.problem.boards is None:
@@ -72,7 +72,7 @@ def board_faults(case: Case) -> list[Finding]:
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
-    """Return the boards as an adjustment has them."""
+    """Return the record of the adjusted boards: size, residuals, flatness, and positions in the base frame."""
     problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
     assert shapes is not None and problem.observations is not None
     size, by_unknown = size_of_boards(adjusted)
@@ -105,4 +105,5 @@ def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
 
 
 def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    """Return a point as a tuple of three numbers."""
     return float(x[0]), float(x[1]), float(x[2])

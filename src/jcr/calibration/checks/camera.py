@@ -1,7 +1,7 @@
-"""Effects on one camera: a focal length that varies, a rolling shutter, a thin prism, intrinsics that are wrong.
+"""Tests of effects on one camera: varying focal length, rolling shutter, sagging lens, thin prism, wrong intrinsics.
 
-Each is a hypothesis of estimation/hypotheses.py, tested beside a focal length that is wrong by one factor in all images.
-The images are adjusted with the effect free, which shows its size and the motion of the camera that comes with it.
+Each effect is a score test (estimation/hypotheses.py) with a common focal length error free in both hypotheses. For a
+significant effect, an adjustment with the effect as additional parameters gives its size and the shift of the camera.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,18 +35,18 @@ from jcr.records import Intrinsics
 from jcr.rounding import significant
 
 LOG_P = float(np.log(1e-6))
-"""Logarithm of the probability of a false alarm of one effect, over all places of a change."""
+"""Logarithm of the p-value up to which an effect is significant, corrected for the number of tested change points."""
 LOG_P_GIVEN = float(np.log(1e-4))
-"""LOG_P of given intrinsics: one hypothesis of a camera, whose finding also needs a difference that matters."""
+"""LOG_P for wrong given intrinsics: a single hypothesis, which must also exceed OFF or MATERIAL."""
 MATERIAL = 0.5
-"""Standard deviations by which an effect must move the camera on some axis to be reported."""
+"""Smallest shift of the camera, in standard deviations on at least one axis, for which an effect is reported."""
 OF_FIRST_STEP = 0.2
-"""Share of MATERIAL that the first step towards a fault must reach before it is adjusted."""
+"""Fraction of MATERIAL that the linearized shift must reach before the images are adjusted with an effect."""
 MOST_POINTS = 800
-"""Largest number of points that take part: more show a fault no better."""
+"""Largest number of points in these tests; more points do not make them more sensitive."""
 MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
-"""Limits on the derivatives of all observations by the nuisances of each image: 58 000 observations of 200 images need
-740 MB, and the equations several times that."""
+"""Largest size (bytes) of the Jacobian by the parameters of each image, and its size per observation and image: 58 000
+observations of 200 images would need 740 MB, and the equations several times that."""
 LEAST_PX = {
     FindingKind.ROLLING_SHUTTER: 3.0,
     FindingKind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
@@ -55,29 +55,29 @@ LEAST_PX = {
 }
 """Smallest size (px) that is reported; smaller effects are remaining errors of the distortion model."""
 OFF = 0.01, 0.01, 0.015, 0.015
-"""Differences of focal lengths and principal point from given ones, in focal lengths, that are a fault: factory values
-and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
+"""Differences of fx, fy, cx, cy from given ones, relative to the focal length, up to which Wald's test is not applied:
+factory values and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
 OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
-"""Effects that differ from image to image."""
+"""Effects with a separate parameter for each image."""
 SURE = 2.0
-"""Smallest size, in standard deviations, of effects that differ from image to image: of many images smaller ones
-are improbable wherever the noise is estimated a little too small."""
+"""Smallest reported size, in standard deviations, of an effect with a parameter per image: with many images, smaller
+ones become significant as soon as the noise is slightly underestimated."""
 MIN_IMAGES = 6
-"""Fewest images with which effects of single images, and the sizes of errors beside effects of poses, are known."""
+"""Fewest images with which effects other than wrong intrinsics, and effects on the gripper poses, are tested."""
 LEAST_PART = 2
-"""Fewest images before and after a change."""
+"""Fewest images before and after a change of the focal length."""
 ASPECT = ("fx", "p1", "p2")
-"""Parameters that are tested of estimated intrinsics, which have one focal length and no tangential distortion."""
+"""Parameters that are tested of estimated intrinsics, for which fx = fy and p1 = p2 = 0 was assumed."""
 CONCERNS: dict[FindingKind, Concerns] = {
     FindingKind.THIN_PRISM: "intrinsics",
     FindingKind.CENTRE_SAGS: "mount",
     FindingKind.INTRINSICS: "intrinsics",
 }
-"""Remedy of effects that other images do not help against."""
+"""Part of the capture that the remedy of an effect changes (Finding.concerns); for other effects, the images."""
 FOCUS = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE, FindingKind.ZOOM}
-"""Effects of a focal length that differs between images, of which one is named; their sizes have a sign."""
+"""Effects of a focal length that differs between images; at most one is reported, and its size is signed."""
 NEARLY_ALL = 0.9
-"""Share of the squared differences of focal lengths that a simpler effect must explain."""
+"""Fraction of the squared focal-length differences that a simpler effect must explain to replace FOCUS_BY_IMAGE."""
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 PAIRS = (
     (("fx", "fy"), "focal lengths of", " px", 1),
@@ -85,86 +85,89 @@ PAIRS = (
     (("k1", "k2"), "a distortion k1, k2 of", "", 3),
     (("p1", "p2"), "a distortion p1, p2 of", "", 4),
 )
-"""Parameters that are named together: names, words, unit and decimals."""
+"""Parameters that the message states together: their names, words, unit and number of decimals."""
 NAMED = 4.0
-"""Standard deviations from which a parameter is named by itself (4: p = 6e-5)."""
+"""Difference of a parameter, in standard deviations, from which the message states its value (4: p = 6e-5)."""
 Combinations = Float[ndarray, "e p"]
-"""Combinations of the columns of hypotheses.Alternatives."""
+"""p combinations of the e columns of hypotheses.Alternatives: each column of the matrix is one additional parameter."""
 
 
 @dataclass(frozen=True)
 class CameraEffect:
-    """Combinations of the columns of hypotheses.Alternatives that one effect frees."""
+    """Hypothesis about one camera: additional parameters, as combinations of the columns of hypotheses.Alternatives."""
 
     kind: FindingKind
     free: Combinations
-    """Combinations that the effect consists of."""
+    """Parameters of the effect, which are 0 without it."""
     beside: Float[ndarray, "e q"]
-    """Combinations that are free beside it and are no part of it."""
+    """Nuisance parameters, which are free with and without the effect."""
     _: KW_ONLY
     unit: float = 1.0
-    """Factor from the estimates to the size that is reported."""
+    """Factor from the estimated parameters to the reported size."""
     places: int = 1
-    """Number of places that were searched."""
+    """Number of change points that were tested, by which the p-value is multiplied."""
     after: int = 0
-    """Number of the image before a change."""
+    """Index of the last image before a change of the focal length."""
 
     @property
     def both(self) -> Float[ndarray, "e r"]:
-        """All combinations that are freed."""
+        """Nuisance parameters, then the parameters of the effect."""
         return np.concatenate([self.beside, self.free], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraAdjustment:
-    """Adjustment of images with effects on one camera and on gripper poses free."""
+    """Adjustment that also estimates the confirmed effects on one camera and on the gripper poses, for further tests."""
 
     adjusted: Solution
     adjust: Callable[[CameraPrior, Combinations | None, Float[ndarray, "s b"] | None], Solution]
-    """Adjust all images with another prior of this camera's intrinsics, with combinations of its columns free, and with
-    errors of one standard deviation of the gripper poses."""
+    """Function that adjusts all images with another prior of the intrinsics, additional parameters of the camera, and b
+    error patterns of the gripper poses (one standard deviation each)."""
     names: Sequence[str]
-    """Names of its images."""
+    """Names of the camera's images."""
     is_given: bool
-    """Whether the intrinsics were given; else the reconstruction estimated them."""
+    """Whether the intrinsics were given; otherwise the reconstruction estimated them."""
     prior: CameraPrior
     std: Float[ndarray, "6"]
-    """Standard deviations of the camera's pose; 0 where it is rejected."""
+    """Standard deviations of the camera's pose (m, rad); 0 for a rejected calibration."""
     camera: int = 0
-    """Number of the camera among the adjusted ones."""
+    """Index of the camera among the adjusted cameras."""
     place: Callable[[State], Float[ndarray, "4 4"]] = first_x
-    """Function that returns the camera's pose on its parent."""
+    """Function that returns the camera's pose, in the gripper or base frame, from the state."""
     arm: int | None = 0
-    """Number of the arm whose gripper poses are tested with the camera; None where another camera's test has them."""
+    """Index of the arm whose gripper poses are tested with the camera; None if another camera's tests include them."""
     found: tuple[CameraEffect, ...] = ()
-    """Effects on the camera that are free."""
+    """Confirmed effects on the camera, whose parameters are estimated."""
     poses: tuple[Row, ...] = ()
-    """Effects on the gripper poses that are free."""
+    """Confirmed effects on the gripper poses, whose parameters are estimated."""
 
     @cached_property
     def equations(self) -> Alternatives:
-        """Equations of the columns that may be freed."""
+        """Equations of all possible additional parameters, with the estimated size of the camera-model error."""
         return self.equations_with(None)
 
     def equations_with(self, model_error_std: float | None) -> Alternatives:
-        """Return these equations for a size of the camera-model error; None: as estimated."""
+        """Return the equations of all possible additional parameters for a size of the camera-model error.
+
+        None: the size that the adjustment estimated.
+        """
         return alternatives(self.adjusted, self.camera, self.place, model_error_std)
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Adjusted intrinsics."""
+        """Intrinsics of the camera after the adjustment."""
         return self.adjusted.images.view.cameras[self.camera]
 
     @property
     def combinations(self) -> Combinations | None:
-        """Combinations that all effects free; None without an effect."""
+        """Parameters of all confirmed effects on the camera, with their nuisance parameters; None without effects."""
         return np.concatenate([one.both for one in self.found], axis=1) if self.found else None
 
     @property
     def log_p_of_given(self) -> float:
-        """Logarithm of the probability of the estimated focal lengths and centre if the given ones were exact.
+        """Logarithm of the p-value of Wald's test that the given focal lengths and principal point are exact.
 
-        This is Wald's test; it is 0 for differences below OFF, and for intrinsics that were not given.
+        It is 0 (p = 1) for differences below OFF, and for intrinsics that were not given.
         """
         given = self.prior.intrinsics
         by = (parameters(self.intrinsics) - parameters(given))[:4]
@@ -176,9 +179,9 @@ class CameraAdjustment:
         return float(f_distribution.logsf(float(ratio), 4, self.equations.freedom))
 
     def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "CameraAdjustment":
-        """Adjust again with these effects free: the sizes of all errors change with them.
+        """Adjust again with the parameters of these effects; the sizes of all errors are estimated anew.
 
-        Raises LinAlgError where the images then determine nothing any more.
+        Raises LinAlgError if the problem becomes singular.
         """
         free = replace(self, found=tuple(found), poses=tuple(poses))
         own = rows_of_arm(self.adjusted.problem, self.arm or 0)
@@ -189,29 +192,29 @@ class CameraAdjustment:
     def test(
         self, free: Combinations, beside: Float[ndarray, "e q"], equations: Alternatives | None = None
     ) -> ScoreTest:
-        """Return the test of combinations beside others and those of the effects that are free."""
+        """Test the parameters `free`, with `beside` and those of the confirmed effects as nuisance parameters."""
         nothing = np.zeros((len(free), 1))
         known = spanned(np.concatenate([nothing, *(one.both for one in self.found)], axis=1))
         together = np.concatenate([known, beside], axis=1)
         return test_combinations(equations or self.equations, free, together)
 
     def log_p(self, one: CameraEffect, equations: Alternatives | None = None) -> float:
-        """Return the logarithm of the probability of an effect's gain by chance, times the places searched."""
+        """Return the logarithm of an effect's p-value, multiplied by the number of tested change points."""
         return self.test(one.free, one.beside, equations).log_p + float(np.log(one.places))
 
     def estimates(self, one: CameraEffect) -> Float[ndarray, " p"]:
-        """Return the estimates of the combinations of an effect that is free."""
+        """Return the estimated parameters of a confirmed effect, without its nuisance parameters."""
         return np.linalg.lstsq(one.both, self.equations.total, rcond=None)[0][one.beside.shape[1] :]
 
 
 def rows_of_arm(problem: Problem, arm: int) -> slice:
-    """Return the rows of the equations of the gripper poses that are those of an arm."""
+    """Return the rows of the gripper pose equations that belong to an arm: 6 per pose, arm after arm."""
     ends = np.cumsum([0, *(6 * len(one.rigs) for one in problem.arms)]).tolist()
     return slice(ends[arm], ends[arm + 1])
 
 
 def of_case(case: Case) -> CameraAdjustment:
-    """Return the capture's own camera, adjusted with no more points than the tests need."""
+    """Return the adjustment of the capture's camera for the tests, with a subset of the points if there are many."""
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
     if len(case.used) >= MIN_IMAGES and is_many:
@@ -237,11 +240,11 @@ def of_case(case: Case) -> CameraAdjustment:
 def best_camera_effect(
     state: CameraAdjustment, dismissed: Sequence[CameraEffect]
 ) -> tuple[CameraEffect | None, float]:
-    """Return the significant camera effect that explains most and the logarithm of its probability by chance.
+    """Return the most significant camera effect and the logarithm of its p-value; (None, 0) without one.
 
-    The size of the camera-model error absorbs every effect until all of them gain as little: the effects are compared
-    with that size at its typical value. The score test compares with intrinsics that are off by what is usual, and the
-    adjustment may have left those that were given: where nothing else explains the images, it is compared with them.
+    Effects in `dismissed` are not tested. Several significant effects are ranked with the camera-model error at its
+    typical size, because the estimated size absorbs part of each effect. If no effect is significant, given intrinsics
+    are compared with the adjusted ones by Wald's test.
     """
     excluded = {one.kind for one in (*state.found, *dismissed)}
     excluded |= FOCUS if excluded & FOCUS else set()
@@ -257,10 +260,10 @@ def best_camera_effect(
 
 
 def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjustment | None:
-    """Adjust with one more effect free, or with the simpler one that explains nearly the same.
+    """Adjust with the parameters of one more effect; return None if the effect hardly moves the camera.
 
-    A focal length that follows distance, or changed once, is simpler than one of each image. Return None where the
-    first step towards the effect moves the camera too little, or where the images then determine nothing.
+    A focal length per image (FOCUS_BY_IMAGE) is replaced by one that follows the distance or changes once, if that
+    explains nearly as much. Return None also if the adjustment becomes singular.
     """
     first = state.test(best.both, best.both[:, :0]).shift
     is_given = best.kind is FindingKind.INTRINSICS and state.is_given
@@ -285,9 +288,9 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
 
 
 def is_material(found: Finding, after: CameraAdjustment) -> bool:
-    """Return whether an effect is large enough to be a fault and moves the camera.
+    """Return whether an effect is large enough to be reported and moves the camera by more than MATERIAL.
 
-    Given intrinsics that are contradicted are a fault in any case: users have them elsewhere.
+    Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
     if found.value is not None and found.std is not None:
         least = SURE * found.std if found.kind in OF_EACH else -np.inf
@@ -297,19 +300,22 @@ def is_material(found: Finding, after: CameraAdjustment) -> bool:
         return True
     std = after.std
     if not std.any():
-        # A rejected calibration is uncertain by the effect: the uncertainty that remains beside the effects counts.
+        # The effect may be why the calibration is rejected, so the uncertainty after its adjustment is the measure.
         std = np.sqrt(np.diag(after.adjusted.transform(after.place)[1]))
     assert found.shift is not None
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
 def hypotheses(state: CameraAdjustment) -> list[CameraEffect]:
-    """Return the effects that are tested, with a focal length that is wrong in all images free beside them."""
+    """Return the effects to test, with a common error of the focal length as nuisance parameter.
+
+    The last effect is wrong intrinsics; with fewer than MIN_IMAGES images it is the only one.
+    """
     equations = state.equations
     m, far = equations.images, np.log(equations.distance)
     focal_px, width = state.prior.intrinsics.fx, state.intrinsics.width
     common = equations.of_camera(("fx", "fy")).sum(1, keepdims=True)
-    # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
+    # Wrong intrinsics include the common focal length, which is a nuisance parameter of the other effects.
     nothing = np.zeros((equations.columns, 0))
     intrinsics = CameraEffect(FindingKind.INTRINSICS, equations.of_camera(_freed(state)), nothing)
     if m < MIN_IMAGES:
@@ -331,18 +337,21 @@ def hypotheses(state: CameraAdjustment) -> list[CameraEffect]:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.of_images("focal", after[:, None])
         found.append(CameraEffect(FindingKind.ZOOM, free, common, places=len(steps), after=k - 1))
-    if len(state.adjusted.problem.cameras) == 1:  # all images share the glass
+    if len(state.adjusted.problem.cameras) == 1:  # all images have the same lens
         found.append(CameraEffect(FindingKind.THIN_PRISM, np.eye(equations.columns)[:, -PRISM:], of_centre))
     return [*found, intrinsics]
 
 
 def _freed(state: CameraAdjustment) -> tuple[str, ...]:
-    """Return the parameters of the camera model that are tested."""
+    """Return the names of the intrinsic parameters that the effect "wrong intrinsics" tests."""
     return tuple(name for name in (INTRINSICS if state.is_given else ASPECT) if name in state.equations.names)
 
 
 def camera_finding(after: CameraAdjustment, before: CameraAdjustment) -> Finding:
-    """Return the last camera effect that was freed as a finding."""
+    """Return the last confirmed camera effect as a finding; `before` is the adjustment without that effect.
+
+    Its shift is the change of camera pose and scale between both adjustments.
+    """
     best, place = after.found[-1], after.place
     alone = before.test(best.both, best.both[:, :0])
     last = replace(after, found=before.found).test(best.free, best.beside, after.equations)
@@ -365,9 +374,10 @@ def camera_finding(after: CameraAdjustment, before: CameraAdjustment) -> Finding
 
 
 def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[str, Any]:
-    """Return the fields of a finding that state the size of the last effect: of several estimates their rms.
+    """Return the fields of a finding that state the size of the last confirmed effect, and its standard deviation.
 
-    A thin prism has the largest displacement among the points; of wrong intrinsics each parameter is stated.
+    The size is the rms of the effect's parameters; for a thin prism it is the largest displacement of a point (px); for
+    wrong intrinsics each parameter is stated. `covariance` is that of the effect's parameters.
     """
     best, std = after.found[-1], np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if best.kind is FindingKind.INTRINSICS:
@@ -389,7 +399,10 @@ def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[st
 
 
 def _intrinsics(after: CameraAdjustment, std: Mapping[str, float]) -> dict[str, float | str]:
-    """Return the details of wrong intrinsics: each parameter as found and as given, and those that differ surely."""
+    """Return the details of wrong intrinsics: estimated and given values, and the significant differences in words.
+
+    `std` holds the standard deviation of each tested parameter.
+    """
     names, shown = parameter_names(after.intrinsics), list[str]()
     given, now = (
         dict(zip(names, parameters(one).tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Checks of capture, images, arm and reconstruction: too few images used, pose convention, pieces, views, warnings."""
+"""Checks of images and reconstruction: too few images used, reconstruction in pieces, static or blurred images."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -20,28 +20,29 @@ from jcr.geometry import inverse, largest_motion, scale_translation, step_betwee
 from jcr.records import Capture
 
 SAME = (10e-3, float(np.radians(1.0)))
-"""m, rad: nearer than this a gripper pose is that of the image."""
+"""Largest difference (m, rad) of a reported from a predicted gripper pose for which both count as the same pose."""
 LEAST_OF_PIECE = 3
-"""Fewest images of a further piece of a reconstruction; two agree by chance."""
+"""Fewest images of a piece of a reconstruction apart from the largest one; two images agree by chance."""
 CONCENTRATED = 4
-"""Estimates from the half of the images that agree best (Rousseeuw and Van Driessen 1999)."""
+"""Number of concentration steps of the least trimmed squares (Rousseeuw and Van Driessen 1999)."""
 MOST_IN_PIECES = 2 / 3
-"""Smallest share of the images beside the largest piece that are in further pieces."""
+"""Smallest fraction of the images outside the largest piece that must belong to other pieces."""
 STILL = (20e-3, np.radians(5.0))
-"""m, rad: larger motions of the gripper are visible in the images of a wrist camera."""
+"""Motion of the gripper (m, rad) from which the images of a wrist camera must differ."""
 REPETITIVE = 0.9
-"""Share of features with twins from which images are matched in the wrong places: a tenth is left to match."""
+"""Fraction of features with similar ones elsewhere in the image from which wrong matches are likely."""
 TWINS, MIN_TWINS, APART_PX, TWINS_AT = 3, 100, 8.0, 640
-"""Twins of a feature and features of an image at least, distance from which two are not one (px), long side (px)."""
+"""Similar features that make a feature repetitive, fewest features of an image, smallest distance of two distinct
+features (px), and long side of the shrunk image (px)."""
 MANY = 1 / 4
-"""Share of blurred images from which they explain a rejection."""
+"""Fraction of blurred images above which blur counts as the cause of a rejection."""
 
 
 def check_registered(case: Case) -> Case:
     """Report that too few images are used: all motions together would be observable, those of the used images are not.
 
-    The motions are then not the cause, and other motions are no remedy. Where all registered images would do, their
-    poses contradict them and the used ones agree by chance: what these leave unobservable is not reported.
+    The remedy is then a better reconstruction and not other motions. If the poses of all registered images would be
+    observable but few of them agree, the used images agree by chance; their unobservable directions are not reported.
     """
     hand_eye, capture = case.hand_eye, case.capture
     unseen = hand_eye.observability.findings
@@ -61,10 +62,10 @@ def check_registered(case: Case) -> Case:
 
 
 def check_pieces(case: Case) -> Case:
-    """Report a reconstruction in pieces: images that agree with their poses among themselves, not with the others.
+    """Report a reconstruction that consists of pieces, groups of images that fit their gripper poses only by group.
 
-    The transform of the images that agree shows base_from_recon of each image. Wrong poses scatter it, while each piece
-    of a reconstruction has one of its own.
+    The hand-eye transform of the largest group gives a base_from_recon for each image. The images of one piece share
+    it, while wrong gripper poses give scattered values.
     """
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
@@ -92,7 +93,7 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Report an arm that is not used, images that were rotated on reading, and the warnings of the back end."""
+    """Report an unused arm model, images that were rotated on reading, and the warnings of the back end."""
     first = (case.robot.unused, how_rotated(case.capture))
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
@@ -100,7 +101,7 @@ def check_remarks(case: Case) -> Case:
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
-    """Return the findings of the images alone: none for sharp images of several views."""
+    """Return the findings of the images themselves: static although the gripper moves, blurred, or repetitive."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
     is_still = metres > STILL[0] or radians > STILL[1]
@@ -129,7 +130,7 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 
 
 def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the share of an image's features that have TWINS or more nearly equal ones elsewhere in the image."""
+    """Return the fraction of an image's features that have at least TWINS similar features elsewhere in the image."""
     height, width = image.shape[:2]
     shrunk = min(1.0, TWINS_AT / max(height, width))
     x_px, descriptors = detect(grey_of(image, (round(shrunk * width), round(shrunk * height))))
@@ -141,7 +142,7 @@ def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings of the images alone for a rejected capture; those that concern many images reject."""
+    """Return `view_findings` as causes of a rejection: repetitive images, or many blurred ones, reject."""
     return tuple(
         replace(one, severity="rejects")
         if one.kind is FindingKind.REPETITIVE

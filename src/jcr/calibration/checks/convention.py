@@ -1,7 +1,7 @@
-"""Diagnosis of pose conventions: gripper poses that contradict the images, read by other conventions and orders.
+"""Diagnosis of wrong pose conventions: hand-eye fits with the gripper poses in other conventions and other orders.
 
-Readings are ranked by screw congruence (gripper and camera rotate by the same angle between two images), and the best
-are solved. A reading that fits is named, and never applied.
+Candidates are ranked by screw congruence (gripper and camera rotate by the same angle between two images), and the best
+are fitted. A convention that fits is reported, and never applied.
 """
 
 import warnings
@@ -24,17 +24,17 @@ from jcr.findings import Finding, FindingKind, Severity
 from jcr.geometry import Poses, inverse, transform
 
 SOLVED = 24
-"""Largest number of readings that are solved in full, the most congruent ones."""
+"""Largest number of candidate conventions, ranked by congruence, that are examined by a closed form or a fit."""
 SAME_ANGLE = np.radians(0.1)
-"""Difference of angles (rad) within which readings rank alike, so that usual mistakes are solved first."""
+"""Step (rad) to which the angle differences of candidates are rounded for ranking; ties go to usual mistakes."""
 FITS = 3.0
-"""Misfit (mm) up to which poses need no other reading."""
+"""Misfit (mm) up to which the given poses count as correct."""
 BETTER = 3.0
-"""Factor by which a reading must fit better than the poses as given."""
+"""Ratio of the misfit of the given poses to that of a candidate, above which the candidate is reported."""
 ROUGHLY = 2.0
-"""Factor to which a closed form shows the misfit of a reading."""
+"""Factor of uncertainty of a misfit that the closed form estimates."""
 MIN_SHARE = 0.8
-"""Smallest share of the images that agree under a reading."""
+"""Smallest fraction of the images that must agree with a candidate convention."""
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
 BY_NUMBER = "those of the images in order of their names as numbers (1, 2, … 10)"
 BY_TEXT = "those of the images in order of their names as text (1, 10, 11, … 2)"
@@ -43,33 +43,35 @@ EULER_ORDERS = (
     *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
 )
-"""SciPy's names, lower case about fixed axes, upper case about moving ones; the usual ones first."""
+"""Sequences of Euler angles in SciPy's notation (lower case: fixed axes, upper case: moving axes), usual ones first."""
 _Candidate = tuple[str, str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
-"""Name of a reading, its remedy, its gripper poses, and the rows of the cameras that they belong to."""
+"""Candidate convention: name, remedy, base_from_gripper in it, and for each pose the index of its camera pose."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention or order of the poses, its remedy, and its misfit."""
+    """Convention or order of the gripper poses, with the misfit of the calibration in it."""
 
     name: str
     remedy: str
     translation_mm: float
-    """Errors per axis that the fit leaves, random and systematic."""
+    """Estimated robot error per axis (mm), random and systematic."""
     rotation_deg: float
+    """Estimated robot error per axis (degrees), random and systematic."""
     used: int
-    """Number of images that agree."""
+    """Number of images that agree with the fit."""
 
     @property
     def misfit(self) -> float:
-        """Size of the noise, a degree counted as 5 mm."""
+        """Misfit (mm): translation error plus 5 mm per degree of rotation error."""
         return self.translation_mm + 5 * self.rotation_deg
 
 
 def check_convention(case: Case) -> Case:
-    """Report the convention by which the gripper poses fit, where these are rejected with and without the images.
+    """Report a pose convention in which the gripper poses fit, if fit and adjustment were rejected.
 
-    Degenerate motions fit another convention by chance, and are reported first. A board may be the cause instead.
+    It only warns for degenerate motions, which may fit another convention by chance. A wrong board size explains the
+    rejection too; no convention is searched then.
     """
     fit, capture = case.pose_fit, case.capture
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
@@ -77,7 +79,7 @@ def check_convention(case: Case) -> Case:
         return case
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
     by_name = {by_number: poses[case.reconstruction.image_index] for by_number, poses in by_name.items()}
-    # Of other readings neither noise nor cues are known, nor are their camera poses weighed.
+    # Candidates are fitted without given noise, known lengths and camera covariance; the given poses must be, too.
     alone = not case.priors and case.reconstruction.evidence is None and fit.robot_noise.given is None
     found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, fit if alone else None)
     if found is None:
@@ -92,10 +94,10 @@ def better_reading(
     by_name: Mapping[bool, Poses] | None = None,
     solved: Calibration | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the pose convention that fits far better than the given one, and the given one; None where none does.
+    """Return the pose convention that fits much better than the given one, and the given one; None without such one.
 
-    `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False). `solved` is the
-    calibration of the poses as given, where there is one from the camera poses alone.
+    `by_name` holds the gripper poses for images sorted by name, as numbers (key True) or as text (key False). `solved`
+    is the calibration with the given poses if it used the camera poses alone.
     """
     n = len(base_from_gripper)
     given, *others = _candidates(base_from_gripper)
@@ -112,7 +114,7 @@ def better_reading(
     order = np.argsort(np.round(np.divide(gaps, SAME_ANGLE)), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * min(gaps) + SAME_ANGLE]
     rough = [_rough_error(candidate, recon_from_camera) for candidate in worth]
-    # Of a reading that may be named: shuffled poses fit no reading, and each would be solved in vain.
+    # Candidates whose closed form fits too badly are not fitted; shuffled poses fit no candidate.
     enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
     if not min(rough) <= min(enough, _rough_error(given, recon_from_camera) / ROUGHLY):
         return None
@@ -129,7 +131,7 @@ def better_reading(
 def convention_finding(
     found: tuple[PoseConvention, PoseConvention], severity: Severity = "rejects"
 ) -> Finding:
-    """Return the finding that the poses fit under another reading, with the remedy."""
+    """Return the finding that the poses fit in another convention; `found` holds that one and the given one."""
     fits, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
@@ -142,7 +144,7 @@ def convention_finding(
 def _solved(
     candidate: _Candidate, recon_from_camera: Poses, solved: Calibration | None = None
 ) -> PoseConvention:
-    """Return a reading with the misfit of its calibration."""
+    """Calibrate with a candidate convention, unless `solved` is that calibration, and return its misfit."""
     name, remedy, base_from_gripper, image = candidate
     fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
     metres, radians = fit.robot_noise.together
@@ -150,9 +152,9 @@ def _solved(
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
-    """Return the error (m) of a closed form in the images that agree best, in a hundredth of the time of a fit.
+    """Return the error (m) of a closed-form calibration of the images that agree best, 100 times faster than a fit.
 
-    It is infinite where the scale is negative, as of mirrored poses.
+    It is infinite if the scale is negative, as for mirrored poses.
     """
     _, _, base_from_gripper, image = candidate
     camera = recon_from_camera[image]
@@ -161,13 +163,13 @@ def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
 
 
 def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
-    """Return the angles (rad) of all relative rotations by their traces, which are imprecise near 0 and π."""
+    """Return the rotation angle (rad) between each two poses, from the trace, which is imprecise near 0 and π."""
     flat = a_from_b[:, :3, :3].reshape(-1, 9)
     return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
 
 
 def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
-    """Yield the poses as given, then with one mistake each, usual mistakes first."""
+    """Yield the given poses, then the poses with one assumed mistake corrected each, usual mistakes first."""
     n = len(base_from_gripper)
     every = np.arange(n)
     yield ("they are given", "", base_from_gripper, every)
@@ -186,6 +188,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
     def with_rotation(name: str, read: Rotation, remedy: str = AT_SOURCE) -> _Candidate:
+        """Return a candidate with other rotations and the given translations."""
         return (name, remedy, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
@@ -203,7 +206,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     for order in EULER_ORDERS:
         read = Rotation.from_euler(order, np.degrees(angles[order]))
         yield with_rotation(f"Euler angles ({order}) {in_radians}", read)
-    # Angles about fixed axes are angles about moving axes in reverse order, so that each mistake has two names.
+    # Angles about fixed axes equal angles about moving axes in reverse order, so each mistake occurs twice.
     named = set[tuple[str, str]]()
     for pair in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: sum(map(EULER_ORDERS.index, pair))):
         taken, meant = pair

@@ -1,8 +1,8 @@
-"""Tests of additional effects on the camera and on the gripper poses, one after the other, until none is significant.
+"""Forward selection of additional effects on the camera and on the gripper poses, until none is significant.
 
-Effects of both kinds compete (checks/camera.py, estimation/hypotheses.py). Of two significant ones that one is the
-cause beside which the other is no longer significant. What was found is free while the next is tested, and the
-calibration adopts the effects that its model can carry.
+In each round the best effect on the camera (checks/camera.py) competes with the best one on the poses
+(estimation/hypotheses.py). If both are significant, the cause is the one that makes the other insignificant. Confirmed
+effects are estimated in all further tests, and the final adjustment includes those that its model can represent.
 """
 
 from collections.abc import Collection, Sequence
@@ -50,23 +50,26 @@ from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import Poses, step_between
 
 AT_ONCE = 3
-"""Largest number of effects that are named of one capture."""
+"""Largest number of effects that are reported for one capture."""
 LOG_ALPHA = {kind: np.log(1e-6) for kind in kinds_of("strain")}
-"""Logarithm of the probability of a false alarm of the effects of the arm. Of 132 simulated captures of 8 to 20 images,
-72 of them by arms with joint offsets of up to 1° and links 1 mm off, none comes below 1e-5."""
+"""Largest log p-value of significant effects of the arm. In 132 simulated captures of 8 to 20 images without such
+effects, 72 of them by arms with joint offsets up to 1° and link errors of 1 mm, no p-value is below 1e-5."""
 LOG_ALPHA_OF_ORDER = np.log(1e-4)
-"""Logarithm of the probability of a false alarm of the effects that depend on the order of the images."""
+"""Largest log p-value of significant effects that depend on the order of the images."""
 SHARES = frozenset({FindingKind.SLIP, FindingKind.BASE_MOVED, FindingKind.DRIFT})
-"""Effects of a motion that has a share in each image, tested against other orders of the images."""
+"""Effects with one motion times a known factor per image; also compared with other orders of the images."""
 EFFECTS = kinds_of("camera", "strain") | SHARES | {FindingKind.DELAY}
 """Kinds of findings that these tests make."""
 LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
-"""m, rad: beyond these a motion of the camera or the base rejects. A smaller one is part of the uncertainty, and the
-requirement decides."""
+"""Motion of the camera or the base (m, rad) above which the calibration is rejected; a smaller motion is added to the
+uncertainty."""
 
 
 def check_effects(case: Case) -> Case:
-    """Return what the used images and gripper poses show against one camera on one straight arm, in any order."""
+    """Report effects on the camera and on the gripper poses that the model of a rigid camera and arm lacks.
+
+    Cases with adjusted images adopt the effects; a fit to camera poses is tested for effects of the image order only.
+    """
     if not case.is_open:
         return case
     longer = _with_rejected_runs(case)
@@ -88,9 +91,9 @@ def check_effects(case: Case) -> Case:
 
 
 def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, ...]]:
-    """Return the adjustment with all effects free that one camera's images show, and a finding of each.
+    """Return the adjustment with all confirmed effects on one camera and its gripper poses, and a finding of each.
 
-    An effect beside which the gripper poses still contradict the images is not their cause, and is not reported.
+    A camera effect is not reported if gripper poses and images contradict each other even with the effect estimated.
     """
     findings, dismissed, passed = list[Finding](), list[CameraEffect](), set[FindingKind]()
     camera_explains = True
@@ -119,7 +122,10 @@ def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, .
 
 
 def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
-    """Return whether an effect on the poses rather than one on the camera is the cause where both are significant."""
+    """Decide between two significant effects: return whether that on the poses, not that on the camera, is the cause.
+
+    Each is tested again with the other one estimated; `log_chance` is the camera effect's log p-value.
+    """
     with_camera = with_effect_free(state, of_camera)
     if with_camera is None:
         return True
@@ -131,18 +137,21 @@ def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_
 
 @dataclass(frozen=True, kw_only=True)
 class ArmEquations:
-    """Equations of the gripper poses, and which rows and columns are those of one arm."""
+    """Equations of all gripper poses, with the rows, the columns and the poses of one arm."""
 
     equations: Equations
     log_sizes: LogSizes
+    """Logarithms of the sizes of the robot errors."""
     base_from_gripper: Poses
+    """Reported gripper poses of the arm."""
     rows: slice
+    """Rows of the arm's poses, 6 per pose."""
     columns: Int[ndarray, "12"]
-    """Columns of the arm's hand-eye transform and of its base_from_recon."""
+    """Columns of the arm's gripper_from_camera (6), then of its base_from_recon (6)."""
 
 
 def _tested_poses(state: CameraAdjustment) -> ArmEquations:
-    """Return the equations of the arm whose poses are tested with the camera."""
+    """Return the gripper pose equations of the arm that is tested together with the camera."""
     adjusted, arm = state.adjusted, state.arm or 0
     return ArmEquations(
         equations=adjusted.equations,
@@ -154,10 +163,11 @@ def _tested_poses(state: CameraAdjustment) -> ArmEquations:
 
 
 def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
-    """Return the most significant effect on the poses of an arm, none of the kinds `passed`.
+    """Return the test of the most significant effect on the poses of an arm; kinds in `passed` are not tested.
 
-    Return None where the most significant one is larger than its cause can produce, or leaves poses that contradict the
-    images: the poses then have another fault. A motion must show less in nearly all other orders of the images.
+    Return None if the effect is implausibly large, or if poses and images contradict each other even with the effect
+    estimated: the poses then have another fault. A motion must also be less significant in nearly all other orders of
+    the images.
     """
     equations, own, gripper = poses.equations, poses.rows, poses.base_from_gripper
     n, s = len(gripper), len(equations.residual)
@@ -193,9 +203,9 @@ def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Te
 def pose_finding(
     test: Test, poses: ArmEquations, names: Sequence[str], std: Float[ndarray, "6"]
 ) -> Finding | None:
-    """Return a confirmed effect as a finding; None where it moves the camera by less than is material.
+    """Return a significant effect on the poses as a finding; None if it moves the camera by less than MATERIAL.
 
-    `names` are those of the images in their order, `std` is the uncertainty of the camera's place (m, rad).
+    `names` are those of the images in their order, `std` are the standard deviations of the camera's pose (m, rad).
     """
     own, moved = test.shift[poses.columns[:6]], test.estimate
     kind, place, p = test.row.kind, test.row.place, float(np.exp(max(test.log_p, -700)))
@@ -209,7 +219,7 @@ def pose_finding(
         moved = own
     if not (np.abs(moved) > MATERIAL * std).any():
         return None
-    # A base that moves takes no part in the hand-eye transform: its shift is what it does to the fit.
+    # The shift of the finding is the effect on gripper_from_camera; for a motion of the base, that on the fit.
     shift = {FindingKind.SLIP: moved, FindingKind.DRIFT: moved / 2}.get(kind, own)
     known: dict[str, Any] = {"p": p, "shift": (*shift.tolist(), 0.0)}
     if kind is FindingKind.DELAY:
@@ -227,7 +237,7 @@ def pose_finding(
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
-    """Return the fields of a finding that state how large an effect of the arm is, without its shift."""
+    """Return the fields of a finding that state the size of an arm's effect, its standard deviation, and its axis."""
     estimate, covariance = test.estimate, test.covariance
     if test.row.kind is FindingKind.BASE_LEANS:
         return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
@@ -240,16 +250,16 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
         k = int(np.abs(values).argmax())
         axis, frame = vectors[:, k] * np.sign(vectors[np.abs(vectors[:, k]).argmax(), k]), "base"
         by = np.einsum("a,kab,b->k", axis, STRAINS, axis)
-        # The two other axes are shorter by half of the strain each.
+        # The strain has trace 0: the two other axes have minus half of it each.
         value, std = 1.5 * float(values[k]), 1.5 * float(np.sqrt(by @ covariance @ by))
     return {"value": value, "std": std, "frame": frame, **dict(zip("xyz", axis.tolist(), strict=True))}
 
 
 def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]) -> Case:
-    """Return the calibration with the effects that its model can carry; one that is rejected stays.
+    """Replace the calibration by one that includes the effects, unless that one is rejected.
 
-    The effects were found with some of the points. Effects on the camera that do not move the calibration by all points
-    are not reported; of many images with an effect each, as many points take part as memory allows.
+    The effects were found with a subset of the points. Camera effects that do not move the calibration from all points
+    by more than MATERIAL are not reported. With a parameter per image, memory limits the number of points.
     """
     free = state.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
@@ -275,11 +285,11 @@ def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...])
 def with_effects(
     case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
-    """Adjust a case with the effects on camera and arm free, and return the findings with the shifts that remain.
+    """Adjust a case with the effects on camera and arm as parameters; return it with the findings' remaining shifts.
 
-    The calibration stays that of the effective transform, which predicts best from the poses as they are reported. How
-    far it is from that of the true poses, and what the scale may be off by, counts as uncertainty. A thin prism becomes
-    part of the intrinsics. Return None where there is no effect that the model can carry.
+    The result is the effective hand-eye transform, which predicts best from reported gripper poses. Its difference from
+    the transform for the true poses, and the possible error of the scale, are the remaining shifts. A thin prism
+    becomes part of the intrinsics. Return None as adjustment if there is no effect on camera or arm.
     """
     strains = [row for row in state.poses if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):
@@ -290,7 +300,7 @@ def with_effects(
         case = replace(case, reconstruction=replace(case.reconstruction, intrinsics=camera), adjusted=None)
         found = tuple(one for one in state.found if one.kind is not FindingKind.THIN_PRISM)
         if (free := replace(state, found=found).combinations) is not None:
-            # The columns of the further parameters follow those of the camera as it was.
+            # Rows for the new camera parameters are inserted after those of the previous camera model.
             before, now = len(parameters(state.intrinsics)), len(parameters(camera))
             free = np.insert(free, [before] * (now - before), 0.0, axis=0)
     bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
@@ -299,12 +309,12 @@ def with_effects(
         if one.kind.row.group == "camera":
             one = as_adopted(one)
         elif bent is not None and one.kind in (row.kind for row in strains):
-            # The shift by all strains counts once.
+            # The shift due to all effects of the arm together belongs to the first finding.
             straight = np.zeros(7)
             if one.kind is strains[0].kind:
                 straight = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
             if one.kind is FindingKind.LENGTHS and one.value is not None:
-                # Of three lengths one differs, and no image shows which is a metre.
+                # One of three axes has another scale; no image shows which scale is the true metre.
                 jacobian = adjusted.equations.jacobian[:, :UNKNOWNS]
                 region = Region.of_unknowns(np.delete(jacobian, SCALE, axis=1), UNKNOWNS)
                 metre = abs(one.value) / 3 * np.r_[-(region.fit @ jacobian[:, SCALE])[:6, 0], 1.0]
@@ -315,20 +325,23 @@ def with_effects(
 
 
 def as_adopted(found: Finding) -> Finding:
-    """Return the finding of an effect that is part of the calibration, which no uncertainty remains of."""
+    """Return the finding of an effect that the calibration includes: its shift is removed."""
     return replace(found, shift=None, intrinsics_shift=None)
 
 
 def straight_shift(
     equations: Equations, log_sizes: LogSizes, columns: Float[ndarray, "s b"]
 ) -> Float[ndarray, " p"]:
-    """Return the step from the effective unknowns to those of the true poses; `columns` are errors of the poses."""
+    """Return the step of the unknowns from their effective values to those that fit the true gripper poses.
+
+    `columns` are the confirmed error patterns of the poses, one standard deviation each.
+    """
     straight = replace(equations, confirmed=columns @ columns.T)
     return solve_equations(straight, log_sizes).step - solve_equations(equations, log_sizes).step
 
 
 def _with_rejected_runs(case: Case) -> Case:
-    """Return the case with images that were rejected in a row: after a slip they are, and one by itself is wrong."""
+    """Return the case with consecutive rejected images used again, which may follow a slip of the camera."""
     in_order = with_rejected_runs(case.hand_eye.inliers)
     if (in_order == case.hand_eye.inliers).all():
         return case
@@ -342,7 +355,7 @@ def _with_rejected_runs(case: Case) -> Case:
 
 
 def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
-    """Return the used images and those that were rejected in a row."""
+    """Return the mask of the used images, extended by rejected images next to another rejected one."""
     rejected = np.pad(~used, 1)
     return used | rejected[:-2] | rejected[2:]
 
@@ -354,9 +367,9 @@ def effects_of_fit(
     names: Sequence[str],
     **known: Any,
 ) -> tuple[Finding, ...]:
-    """Return the most significant effect of the order on a fit to camera poses.
+    """Return the most significant effect of the image order on a fit to camera poses, as no or one finding.
 
-    `names` are those of the poses, `known` is what `pose_problem` takes beside them.
+    `names` are the images of the poses; `known` are keyword arguments of `pose_problem`.
     """
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
@@ -369,7 +382,7 @@ def effects_of_fit(
         rows=slice(0, 6 * int(used.sum())),
         columns=columns_of_arm(0),
     )
-    # Errors of camera poses that come from features look like a strained arm; only the adjustment separates them.
+    # Errors of camera poses resemble effects of the arm, which only a bundle adjustment separates from them.
     test = best_pose_effect(poses, kinds_of("strain"))
     std = np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged
     found = (

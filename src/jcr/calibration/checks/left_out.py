@@ -1,4 +1,4 @@
-"""Check of the gripper poses of images that an accepted calibration does not use."""
+"""Check of the reported gripper poses of images that a calibration does not use: exchanged or contradicted poses."""
 
 import numpy as np
 from jaxtyping import Float
@@ -16,30 +16,31 @@ from jcr.records import Capture, Reconstruction
 from jcr.sfm.register import register
 
 NEARER = 0.1
-"""Share of the distance to an image's own pose within which the pose listed at another image is the one it shows."""
+"""Ratio of two distances from the pose that an image shows, to another image's reported pose and to its own, below
+which the other pose belongs to the image."""
 
 
 def check_pairing(case: Case) -> Case:
-    """Report images whose gripper poses are those of one another, where the poses of the other images agree.
+    """Report unused images whose gripper poses are exchanged with each other, if the poses of the used images agree.
 
-    Such poses are left out one by one, so that a calibration of the others may be accepted.
+    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted.
     """
     kinds = {one.kind for one in case.hand_eye.findings}
     disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
     if disagree or len(case.capture) - len(case.used) < 2:
         return case
-    # An adjustment bends the cameras towards wrong poses that it uses; the fit to the cameras of the images does not.
+    # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
     fit = case.pose_fit
     found = left_out_poses(case.capture, case.reconstruction, fit)
     return case.after(tuple(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
 
 
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
-    """Return the findings of exchanged poses and of poses that their images contradict.
+    """Return findings about unused images whose reported gripper poses are exchanged, or contradicted by the image.
 
-    The matching leaves out images whose poses contradict it; registered by their features alone, they show the gripper
-    pose. Poses are exchanged where two or more images show poses that are listed at others that are left out. Images
-    that cannot be registered have no finding.
+    Unused images are registered by their features alone; camera pose and hand-eye transform then give the true gripper
+    pose. Poses are exchanged if two or more images show poses that are reported for other unused images. Images that
+    cannot be registered give no finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
     right = set(made.image_index[hand_eye.inliers].tolist())
@@ -68,7 +69,10 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
 def _shown_poses(
     capture: Capture, made: Reconstruction, hand_eye: Calibration
 ) -> dict[int, Float[ndarray, "4 4"]]:
-    """Return base_from_gripper, by row, of each image that is left out, from its camera pose among the others."""
+    """Return base_from_gripper that each unused image shows, by row of the capture, from its camera pose.
+
+    Images without a camera pose are registered in the reconstruction first; those that fail are missing.
+    """
     used = set(made.image_index[hand_eye.inliers].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
     unseen = [row for row in range(len(capture)) if row not in camera]

@@ -1,8 +1,8 @@
-"""Known lengths (board, known length, depth camera, network) and a network's focal length, compared with the robot.
+"""Checks of known lengths (board, known length, depth camera, network) against the robot, and of a network's focal.
 
-Lengths that agree with the robot become priors of the mixed model. Where two lengths contradict each other, the scale
-stays the robot's, and a finding names both. The scale of depth cameras is off by a few percent, and their noise grows
-with the square of the distance (Khoshelham and Elberink, Sensors 2012).
+Lengths that agree with the robot become priors of the scale. If two lengths contradict each other, the scale stays that
+of the robot, and a finding names both. Depth cameras have scale errors of a few percent, and noise that grows with the
+square of the distance (Khoshelham and Elberink, Sensors 2012).
 """
 
 from dataclasses import dataclass, replace
@@ -29,49 +29,54 @@ from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruc
 from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
-"""Relative standard deviations of the metre of depth cameras, off by a few percent, and of networks, by up to ten."""
+"""Relative standard deviations of the scale of depth cameras (errors of a few percent) and networks (up to 10 %)."""
 ROBOT_STD = 0.002
-"""Relative standard deviation of a factor common to all of a robot's positions, which no pose shows."""
+"""Relative standard deviation of a common scale error of all robot positions, which the poses cannot show."""
 SIGMAS = 3.5
-"""Standard deviations of a difference from which two lengths contradict each other."""
+"""Difference of two lengths, in standard deviations, above which they contradict each other."""
 LEAST = 0.005
-"""Smallest relative difference of two lengths that contradict each other."""
+"""Relative difference of two lengths above which they contradict each other; SIGMAS must be exceeded too."""
 AGREES = 2.0
-"""Standard deviations of a difference up to which a length is weighed with the robot's. Between these and SIGMAS neither
-is likely, and of positions that are 1 % too long weighing takes the transform from 1.0 mm off to 1.4: the poses give way
-by rotating and shifting it, where the whole answer is but too large."""
+"""Difference of a length from the robot's, in standard deviations, below which the length is a prior of the scale. At a
+larger difference a prior does harm: with robot positions 1 % too long, it increases the error of the transform from 1.0
+to 1.4 mm, because the adjustment rotates and shifts the transform."""
 EXACT = 0.015
-"""Relative standard deviation up to which a length can reject a calibration."""
+"""Largest relative standard deviation with which a length can reject a calibration."""
 WORTH = 10.0
-"""Standard deviations of the robot's scale: a length less exact than that hardly moves it, and is compared alone."""
+"""Largest ratio of a length's standard deviation to that of the robot's scale for which the length is a prior; a less
+exact one hardly changes the scale and is only compared."""
 
 OF_NETWORK = 1.64
-"""Standard deviations between a network's focal length and the given one; a tenth of the networks is farther off."""
+"""Difference of a network's focal length from the given one, in standard deviations, from which it is reported; one in
+ten correct focal lengths exceeds it."""
 MIN_IMAGES, MIN_FEATURES = 3, 60
-"""Fewest images and features at which depth is compared."""
+"""Fewest images and features with which depth images are compared with the robot."""
 OUTSIDE = 0.3
-"""Relative difference from the common one beyond which a depth is that of another surface."""
+"""Log ratio of a measured to a predicted depth, relative to the median one, above which the surfaces differ."""
 BINS = 8
-"""Bins of distance in which the noise of depth is measured."""
+"""Number of distance bins in which the noise of depths is estimated."""
 NORMAL = 1.4826
-"""Standard deviations of a normal error in its median absolute deviation."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
 
 
 @dataclass(frozen=True)
 class Length:
-    """Logarithm of a length by the robot's positions over its stated value, and its own standard deviation."""
+    """Known length compared with the robot's positions."""
 
     name: LengthName | Literal["robot"]
     off: float
+    """Logarithm of the ratio: length by the robot's positions over stated length."""
     std: float
+    """Relative standard deviation of the stated length."""
 
 
 def check_lengths(case: Case) -> Case:
-    """Estimate the scale with all known lengths, or report two that contradict each other."""
+    """Compare all known lengths with the robot: use those that agree as priors, or report two that contradict."""
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
 
     def sigmas(pair: tuple[Length, Length]) -> float:
+        """Return the difference of two lengths in standard deviations."""
         return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
 
     pair = max(combinations([robot, *lengths], 2), key=sigmas, default=None) if converged else None
@@ -99,7 +104,7 @@ def check_lengths(case: Case) -> Case:
     findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
     if pair is not None:
         return case.after((_contradiction(*pair, hand_eye), *findings), hand_eye)
-    # The difference of the most exact length from the robot, beyond their uncertainties, counts as uncertainty.
+    # The difference of the most exact length from the robot, as far as it exceeds their uncertainties, is a fault.
     best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
     beyond = best.off**2 - best.std**2 - robot.std**2
     if best.std < EXACT and beyond > 0:
@@ -113,7 +118,7 @@ def check_lengths(case: Case) -> Case:
 
 
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with the measurements of lengths, and the lengths."""
+    """Return the calibration with its `depth_check`, and all known lengths compared with the robot's positions."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     size_std = None if boards is None or hand_eye.source == "poses" else boards.size_std
@@ -135,15 +140,15 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
         found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
         hand_eye = replace(hand_eye, depth_check=depth)
-    # A unit with a stated standard deviation was used for the scale, and is no check of it.
+    # A metric unit with a standard deviation is a prior of the scale already, and no independent check.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
-        # A network's length of 1 is `scale` metres by the robot.
+        # A length of 1 m in the network's reconstruction is `scale` metres by the robot.
         found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
     return hand_eye, found
 
 
 def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
-    """Return the finding that two lengths contradict each other; the robot is the first where it is one of them."""
+    """Return the finding that two lengths contradict each other; if one is the robot's, it is `one`."""
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
         size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
@@ -156,14 +161,17 @@ def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
-    """Return the change of a calibration if the robot's positions were too long by exp(off)."""
+    """Return the change of the calibration (COVARIANCE_ORDER) if all robot positions are too long by a factor exp(off).
+
+    Translation and scale then shrink by that factor.
+    """
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
 def _fused(
     case: Case, hand_eye: Calibration, lengths: list[Length], fault: Float[ndarray, "7 7"]
 ) -> tuple[Calibration, Solution]:
-    """Return calibration and adjustment with the lengths as priors of the scale."""
+    """Return the calibration and adjustment with the lengths as priors of the scale; `fault` adds to its covariance."""
     adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
     assert adjusted is not None
     for one in lengths:
@@ -181,7 +189,7 @@ def _fused(
         refined = refined.with_finding(one)
     depth = hand_eye.depth_check
     if depth is not None:
-        # What is measured with depth images is in the metre that the map has.
+        # The scale error of the depth images refers to the new scale.
         percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
         depth = replace(depth, off_percent=percent)
     measured = {name: getattr(hand_eye, name) for name in ("findings", "lengths", "board")}
@@ -189,7 +197,7 @@ def _fused(
 
 
 def check_predicted_focal(case: Case) -> Case:
-    """Report that a network's focal length contradicts the one that was given; their difference is uncertainty."""
+    """Report that a network's focal length contradicts the given one; the difference is added to the covariance."""
     given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
     if given is None or predicted is None:
         return case
@@ -207,9 +215,9 @@ def check_predicted_focal(case: Case) -> Case:
 
 
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
-    """Return scale and noise of the depth images by the robot; None where too few features have a depth.
+    """Return scale error and noise of the depth images, measured by the robot; None if too few features have a depth.
 
-    Raises InputError where a depth image cannot be read.
+    Raises InputError if a depth image cannot be read.
     """
     if capture.depths is None:
         return None
@@ -219,7 +227,7 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
     rows = rows[count >= MIN_FEATURES // 6]
     if len(rows) < MIN_IMAGES or len(off) < MIN_FEATURES:
         return None
-    # An image's features share what its pose is off by, so images are counted and not features.
+    # Features of an image share its pose error, so the standard error follows from the number of images.
     medians = np.array([np.median(off[image == row]) for row in rows])
     common = float(np.median(medians))
     spread = NORMAL * float(np.median(np.abs(medians - common)))
@@ -242,7 +250,7 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
 def _depths(
     capture: Capture, reconstruction: Reconstruction, scale: float
 ) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
-    """Return measured depths (m), depths by the robot, and images of all features that have both."""
+    """Return measured depths (m), reconstructed depths (m), and image indices of all features that have both."""
     tracks, depths = reconstruction.tracks, list(capture.depths or [])
     parts = [np.zeros((3, 0))]
     for k, row in enumerate(reconstruction.image_index):
@@ -256,7 +264,7 @@ def _depths(
         around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
         camera_from_recon = inverse(reconstruction.recon_from_camera[k])
         z = apply(camera_from_recon, tracks.points_in_recon[tracks.point[seen]])[:, 2]
-        # At the edge of a thing, colour and depth are of different ones.
+        # At the edge of an object, colour and depth image may show different surfaces.
         whole = (around > 0).all(0) & (np.ptp(around, axis=0) < 0.03 * around[4]) & (z > 0)
         parts.append(np.stack([around[4][whole], scale * z[whole], np.full(whole.sum(), k)]))
     measured, predicted, image = np.concatenate(parts, axis=1)
@@ -264,13 +272,13 @@ def _depths(
 
 
 def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
-    """Return a (m) and b (1/m) of sigma² = a² + (b z²)² by the spread of the residuals in bins of distance."""
+    """Return a (m) and b (1/m) of the noise sigma² = a² + (b z²)², fitted to the residuals in bins of the depth z."""
     from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
 
     bins = np.array_split(np.argsort(depth), BINS)
     z = np.array([np.median(depth[rows]) for rows in bins])
     variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
-    # Relative, for a variance that is estimated is as uncertain as it is large.
+    # The rows are divided by the variance, because the error of an estimated variance is proportional to it.
     design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
     (constant, growing), _ = nnls(design, np.ones(BINS))
     return float(np.sqrt(constant)), float(np.sqrt(growing))

@@ -1,4 +1,4 @@
-"""Check of the joints of a known arm."""
+"""Estimation of the joint offsets of a known arm."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,13 +14,13 @@ from jcr.findings import Finding, FindingKind, joined
 MIN_EXAMINED = 4
 """Fewest images from which joint offsets are estimated."""
 SURE = 2.5
-"""Standard deviations from which a joint's offset is named."""
+"""Size of a joint offset, in standard deviations, above which it is reported."""
 
 
 def check_robot(case: Case) -> Case:
-    """Estimate the offsets of a known arm's joints from the fit to poses, and name those that are surely off.
+    """Estimate the joint offsets of a known arm from the fit to camera poses, and report the significant ones.
 
-    A camera that is not as its model has it changes the cameras' poses: then no joint is named.
+    No joint is reported if there are findings about the camera, whose effects also change the camera poses.
     """
     used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
     if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
