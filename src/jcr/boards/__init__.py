@@ -1,1 +1,1 @@
-"""Calibration boards and tags: detection, corners in tracks, and the back end marker."""
+"""Calibration boards and tags: detection, corners as tracks, printed sheets, and the back end `marker`."""

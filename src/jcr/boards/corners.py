@@ -1,8 +1,8 @@
-"""Corners of a board or of tags among the tracks of a reconstruction that features made.
+"""Addition of the corners of boards or tags to the tracks of a reconstruction made from features.
 
-The cameras are known up to one similarity, so that corners are triangulated as any other points. What the board shows
-beside that, its shape and its size, the adjustment takes as a prior (estimation/boards.py). Where a body is not at one
-place in all images, the place that most images agree on counts.
+A body is a board or a single tag. The cameras are known up to one similarity, so that corners are triangulated like
+other points. The bundle adjustment takes the board's shape and size as a prior (estimation/boards.py). If a body moved
+between images, the position that most images agree on is used.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,35 +22,36 @@ from jcr.progress import Progress, silent
 from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Tracks
 
 FEWEST_POINTS = 4
-"""Fewest points of a body in an image."""
+"""Least number of corners of a body that an image must show to be used."""
 FEWEST_IMAGES = 2
-"""Fewest images of a body."""
+"""Least number of images that must show a body, or one of its corners."""
 SAME_PLACE = 0.006
-"""Largest rms distance of corners from the projections of triangulated ones, as a share of the image's width."""
+"""Largest rms distance of detected corners from the projected triangulated ones, as a share of the image's width."""
 MOST_PAIRS = 100
-"""Largest number of pairs of images from which a body is triangulated to find those that agree."""
+"""Largest number of image pairs from which a body is triangulated in the search for the images that agree."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The corners of one body in the images, by image and by corner; not a number where one does not show it."""
+    """Corners of one body: pixels by image (m) and corner (c), NaN where not detected, and positions (m)."""
 
     number: int
+    """Number of the tag; 0 for a board."""
     x_px: Float[ndarray, "m c 2"]
     x_in_body: Float[ndarray, "c 3"]
 
     @property
     def images(self) -> Int[ndarray, " i"]:
-        """Rows of the images that show enough of its corners."""
+        """Rows of the images that show at least FEWEST_POINTS of the body's corners."""
         return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
 
 
 def with_boards(
     capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress | None = None
 ) -> Reconstruction:
-    """Add the corners of the boards that `--board` names to the tracks of a reconstruction.
+    """Add the corners of the boards that `spec` (the option `--board`) names to the tracks of a reconstruction.
 
-    Raises InputError for a board that is none.
+    Raises InputError for a name that means no board.
     """
     report = progress or silent
     readings = boards(spec)
@@ -81,7 +82,7 @@ def with_boards(
 
 
 def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
-    """Yield each body that any image shows."""
+    """Yield the corners of each body that any image shows; `sightings` are those of each image."""
     for number in sorted({s.body for shown in sightings for s in shown}):
         own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
         x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
@@ -95,7 +96,7 @@ def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
 def _at_one_place(
     seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Return the largest set of images that agree on the body's position; empty where no two do."""
+    """Return the largest set of images (rows) that agree on the body's position; empty where no two agree."""
     images, best = seen.images, np.zeros(0, int)
     pairs = np.array(list(combinations(images.tolist(), 2)), int).reshape(-1, 2)
     if len(pairs) > MOST_PAIRS:
@@ -111,7 +112,7 @@ def _at_one_place(
 def _agreeing(
     seen: _Seen, by: Int[ndarray, " b"], cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Return the images in which the corners are where these images triangulate them."""
+    """Return the images (rows) whose detected corners agree with those triangulated from the images `by`."""
     points = _triangulated(seen.x_px[by], cameras[by], intrinsics)
     limit_px, agreeing = SAME_PLACE * intrinsics.width, list[int]()
     for k in seen.images:
@@ -127,7 +128,7 @@ def _agreeing(
 def _triangulated(
     x_px: Float[ndarray, "b c 2"], cameras: Float[ndarray, "b 4 4"], intrinsics: Intrinsics
 ) -> Float[ndarray, "c 3"]:
-    """Corners that two or more of these images show; not a number where fewer do."""
+    """Return the corners in the recon frame, triangulated from these images; NaN if fewer than two show it."""
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])
     for c in np.flatnonzero(shown.sum(0) >= FEWEST_IMAGES):
@@ -145,7 +146,7 @@ def _with_corners(
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """Return the tracks with the corners of a body in these images as further points."""
+    """Return the tracks with the corners of a body in `images` (rows) as further points, and the body."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

@@ -1,6 +1,6 @@
-"""Calibration boards and tags as a user names them, and where their points are in an image.
+"""Boards and tags from their names as a user writes them, and detection of their points in images by OpenCV.
 
-The detectors are OpenCV's. A *body* is what is rigid and of known size: a board, or each single tag.
+A *body* is a rigid object of known size: a board, or a single tag.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,44 +23,45 @@ KINDS = (
     "aruco:0.050:DICT_4X4_50 and apriltag:0.050:36h11 (any number of tags, side of the black square in metres)",
 )
 INK = 120
-"""Difference of a pixel's strongest and weakest channel, of 255, beyond which it is no part of a grey board."""
+"""Least difference of a pixel's strongest and weakest channel (0 to 255) at which it is too coloured for a grey board.
+Least difference of a pixel's strongest and weakest channel (0 to 255) at which it is too coloured for a grey board."""
 LARGEST = 1.0
-"""m. A square or tag of more was meant in millimetres."""
+"""Largest length of a square or tag, m; a larger number was meant in millimetres."""
 PRINTED = 0.002
-"""Relative one-sigma error of a printed board's size."""
+"""Relative standard deviation of a printed board's size."""
 SIDE, MARKER = "SIDE", "MARKER"
-"""Words in place of lengths that are unknown: the side is then the unit."""
+"""Words that replace unknown lengths in a board's name; with SIDE, the unit is the side of a square or tag."""
 RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
-"""Usual ratios of marker to square of a ChArUco board."""
+"""Usual ratios of marker to square of a ChArUco board, tried in this order."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """Points of one body in one image."""
+    """Detected points of one body in one image."""
 
     body: int
     """Number of the tag; 0 for a board."""
     index: tuple[int, ...]
-    """Numbers of the body's points."""
+    """Number of each point on the body."""
     x_in_body: Float[ndarray, "k 3"]
-    """Metres, z = 0."""
+    """Points in the body's frame, z = 0, m or sides."""
     x_px: Float[ndarray, "k 2"]
 
 
 @dataclass(frozen=True)
 class Board:
-    """One way to read a board's name."""
+    """One meaning of a board's name, with the detector of the board in a grey image."""
 
     name: str
     detect: Callable[[UInt8[ndarray, "h w"]], list[Sighting]]
 
 
 def boards(spec: str) -> list[Board]:
-    """Return the possible boards of a board's name, the literal one first.
+    """Return the boards that a name may mean, the literal one first.
 
-    A ChArUco board has others: printed by OpenCV before 4.6, with its sides swapped, or with a marker of unknown size.
-    With SIDE in place of the length of a side, and MARKER in place of that of a marker, the unit is the side. Raises
-    InputError on a name that means none, with the forms it may have.
+    A ChArUco board has alternatives: printed by OpenCV before 4.6, its two counts swapped, and each of the RATIOS if the
+    name has MARKER. SIDE in the name replaces an unknown length; the unit is then the side. Raises InputError, with the
+    valid forms, for a name that means no board.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:
@@ -82,12 +83,12 @@ def boards(spec: str) -> list[Board]:
 
 
 def is_of_unknown_size(spec: str) -> bool:
-    """Test whether a board's name leaves its side open."""
+    """Test whether a board's name has SIDE instead of a length."""
     return SIDE in spec.split(":")
 
 
 def side_of(spec: str) -> float:
-    """Return the side of a square or tag that a board's name states (m); 1 where it is the unit."""
+    """Return the side of a square or tag in a board's name, m; 1 for an unknown side."""
     kind, *parts = spec.split(":")
     return _length(parts[0] if kind in ("aruco", "apriltag") else parts[1])
 
@@ -151,7 +152,7 @@ def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Callable[[UInt8[ndarray,
 
 @cache
 def _charuco_shift_px() -> float:
-    """Half a pixel that OpenCV adds to the corners of ChArUco boards before its pull request 28380, else 0."""
+    """Return the half pixel that OpenCV before pull request 28380 adds to corners of ChArUco boards, else 0."""
     square, margin = 40, 20
     board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
     drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)
@@ -212,7 +213,7 @@ def _circles(count: tuple[int, int], spacing: float) -> Callable[[UInt8[ndarray,
 
 
 def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
-    """Return the points of a grid, row by row, one apart, z = 0."""
+    """Return the points of a grid with spacing 1 and z = 0, row by row."""
     row, column = np.indices((down, across)).reshape(2, -1).astype(float)
     return np.column_stack([column, row, 0 * row])
 
@@ -247,10 +248,10 @@ def _single_tags(
 def most_seen(
     readings: Sequence[Board], images: Sequence[UInt8[ndarray, "h w 3"]]
 ) -> tuple[Board, list[list[Sighting]]]:
-    """Return the possible board that finds most points in the images, and its sightings per image.
+    """Return the board of `readings` with most points in the images, and its sightings in each image.
 
-    Other readings, and images without the lines that a detector drew into them, are tried only where the
-    literal one finds the board in fewer than half of the images.
+    The alternatives to the first board, and images without strongly coloured pixels, are tried only while the board is
+    found in fewer than half of the images.
     """
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     best, seen, points = readings[0], [], -1
@@ -266,6 +267,6 @@ def most_seen(
 
 
 def _without_ink(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w"]:
-    """Grey image whose strongly coloured pixels are filled from around them."""
+    """Return the grey image with strongly coloured pixels, such as a detector's drawing, filled in from around them."""
     ink = (np.ptp(image, axis=2) > INK).astype(np.uint8)
     return cv2.cvtColor(cv2.inpaint(image, ink, 3, cv2.INPAINT_TELEA), cv2.COLOR_RGB2GRAY)

@@ -1,6 +1,6 @@
-"""The marker back end: metric camera poses from a board or tags of known size, for those who have one.
+"""The back end `marker`: metric camera poses from a board or tags of known size.
 
-Poses of planes come from estimation/absolute_pose.py.
+Poses of planar bodies come from estimation/absolute_pose.py.
 """
 
 from collections import Counter
@@ -25,22 +25,22 @@ from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 FEWEST_POINTS = 4
 WORST_PX = 3.0
-"""A board whose points miss by more (rms) is bent, or no such board."""
+"""Largest rms reprojection error of a body's points; above it the board is bent, or another one."""
 GATE_PX = 10.0
-"""Distance within which corners take part in a pose; those of a bent board are all near."""
+"""Largest reprojection error of a point that takes part in a pose; all points of a bent board stay below it."""
 FEWEST_FOR_INTRINSICS = 4
-"""Fewest images of a board that determine intrinsics."""
+"""Least number of images of a board that determine intrinsics."""
 
 
 Pose = tuple[float, Float[ndarray, "4 4"]]
-"""Distance of a body's points from where they were seen, px rms, and camera_from_body."""
+"""Pose of a body in one image: rms reprojection error (px) of its points, and camera_from_body."""
 
 
 def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
-    """Reconstruct cameras from a board or tags, in metres or sides; the recon frame is that of the body seen most.
+    """Reconstruct cameras from a board or tags, in metres or sides; the recon frame is that of the most detected body.
 
-    `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
-    InputError for a board that is none, and RejectedError when fewer than three images show it.
+    `look_for` names the board in a form of `detection.KINDS`. Unknown intrinsics are calibrated from the board. Raises
+    InputError for a name that means no board, and RejectedError when fewer than three images show it.
     """
     report = progress or silent
     readings = boards(look_for)
@@ -90,7 +90,10 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
 def _intrinsics(
     capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
 ) -> tuple[Intrinsics, list[str]]:
-    """Return the given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
+    """Return the given intrinsics, or else focal length, centre and two radial coefficients calibrated from the board.
+
+    The second value are notes for the user.
+    """
     if capture.intrinsics is not None:
         return capture.intrinsics, []
     shown = [s for sightings in seen for s in sightings]
@@ -117,7 +120,7 @@ def _intrinsics(
 
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
-    """Return the body's pose; None where its points lie on a line, miss, or fit two poses."""
+    """Return the body's pose; None where its points are collinear, have large errors, or fit two poses."""
     x = sighting.x_in_body
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
         return None
@@ -133,9 +136,10 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
 def locate_cameras_and_bodies(
     poses: Sequence[dict[int, Pose]],
 ) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
-    """Return cameras by row and bodies by number in one frame, chained from the body seen most often.
+    """Return the poses of cameras by row and bodies by number in the frame of the most detected body.
 
-    A camera is placed by the body that it sees best, a body by the camera that sees it best.
+    `poses` has for each image the pose of each body in it. Poses are chained: a camera is located by its body of
+    smallest error, and a body by the camera of smallest error.
     """
     counts = Counter(body for bodies in poses for body in bodies)
     cameras: dict[int, Float[ndarray, "4 4"]] = {}

@@ -1,4 +1,4 @@
-"""Proposal of a --board where none was given: tags by their family, chessboards by their corners."""
+"""Proposal of the option --board from what the images show: tags by their family, chessboards by their corners."""
 
 from collections.abc import Sequence
 
@@ -12,19 +12,19 @@ from jcr.findings import Finding, FindingKind
 from jcr.records import Capture
 
 LOOKED_AT = 3
-"""Number of images that are searched; a board that helps is in most of them."""
+"""Number of images that are searched; a useful board is in most of them."""
 FAMILIES = ("4X4", "5X5", "6X6", "7X7", "APRILTAG_36h11", "APRILTAG_25h9")
 SIZES = (50, 100, 250, 1000)
 FEWEST = 2
-"""Number of images in which the same tags or chessboard must be found: texture may look like one in a single image."""
+"""Least number of images that must show the same tags or chessboard; in a single image, texture may look like one."""
 SMALLEST = 4
-"""Least number of inner corners on a side of a chessboard; windows and keyboards show three by three, too."""
+"""Least number of inner corners on a side of a chessboard; windows and keyboards also show 3x3 corners."""
 LONG_SIDE_PX = 800
-"""Larger images are reduced to this before they are searched."""
+"""Largest long side, px, of an image that is searched; larger images are reduced to it."""
 
 
 def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
-    """Return the --board for what the images show, with SIDE in place of the length; None without a board."""
+    """Return the value of --board for the board in the images, with SIDE as its length; None without a board."""
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in chosen]
     if (factor := LONG_SIDE_PX / max(grey[0].shape)) < 1:
@@ -33,9 +33,9 @@ def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
 
 
 def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
-    """Return the --board for the family whose tags are found most often; None without tags.
+    """Return the value of --board for the family whose tags are found most often; None without tags.
 
-    The tags of a ChArUco board are proposed as single ones: its number of squares is for the user to count.
+    The tags of a ChArUco board are proposed as single tags, because the user has to count its squares.
     """
     best: tuple[int, str, set[int]] = (0, "", set())
     for family in FAMILIES:
@@ -57,7 +57,7 @@ def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 
 
 def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
-    """Return the --board for the chessboard found most often; None without one."""
+    """Return the value of --board for the chessboard that is found most often; None without one."""
     sizes = []
     for image in grey:
         found, _, meta = cv2.findChessboardCornersSBWithMeta(
@@ -73,14 +73,14 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 
 
 def proposed_for(capture: Capture, board: str | None) -> Finding | None:
-    """Return the finding of a board in the images; None where one was given or the camera watches the gripper."""
+    """Return the finding that the images show a board; None with a given board or a camera that watches the gripper."""
     if board is not None or capture.mount == "base":
         return None
     return proposed([read_image(capture.folder / name) for name in capture.images])
 
 
 def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:
-    """Return the finding of a board in view with the --board that would use it; None where there is none."""
+    """Return the finding that the images show a board, with the --board that would use it; None without a board."""
     if (board := board_in_view(images)) is None:
         return None
     return Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=board)

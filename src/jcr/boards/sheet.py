@@ -1,4 +1,4 @@
-"""A calibration board to print at its exact size, as a PDF page, with rulers that show whether the printer kept it."""
+"""PDF page of a calibration board at its exact size, with rulers to check the printer's scale."""
 
 import io
 
@@ -12,30 +12,29 @@ from jcr.boards.detection import boards
 from jcr.errors import InputError
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "a2": (594.0, 420.0), "letter": (279.4, 215.9)}
-"""Width and height, the long side across."""
+"""Width and height of landscape paper."""
 MARGIN_MM = 8.0
-"""Printers leave a border of some millimetres white."""
+"""Blank border, because printers leave some millimetres white."""
 RULER_MM = 100.0
 BAND_MM = 14.0
-"""Below and beside the board: a ruler and its text."""
+"""Width of the bands below and left of the board, each with a ruler and its text."""
 TEXT_MM = 3.2
 LEAST_PX_PER_MM = 600 / 25.4
 MM_PER_INCH = 25.4
 
 
 def as_pdf(page: Image.Image, px_per_mm: float) -> bytes:
-    """Return a page at its true size as PDF, without loss."""
+    """Return a page as a PDF file of its true size, without lossy compression."""
     file = io.BytesIO()
     page.save(file, "PDF", resolution=MM_PER_INCH * px_per_mm)
     return file.getvalue()
 
 
 def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
-    """Return the page of a ChArUco board or chessboard as `--board` names it, in black and white, and its pixels per mm.
+    """Return the black-and-white page of the ChArUco board or chessboard that `spec` names, and its pixels per mm.
 
-    A square is a whole number of pixels wide.
-
-    Raises InputError on a name that means none, and on a board that the paper has no room for.
+    A square is a whole number of pixels wide. Raises InputError for a name that means no such board, and for a board
+    that does not fit on the paper.
     """
     boards(spec)
     kind, *parts = spec.split(":")
@@ -92,7 +91,7 @@ def _charuco(
 def _ruler(
     pixels: Image.Image, px_per_mm: float, start_mm: tuple[float, float], length_mm: float, along_x: bool
 ) -> None:
-    """Draw a line with a tick each 10 mm (long) and 1 mm, above or left of it."""
+    """Draw a ruler from `start_mm` with long ticks every 10 mm and short ticks every 1 mm, above or left of the line."""
     draw, width = ImageDraw.Draw(pixels), round(0.15 * px_per_mm)
     x, y = start_mm
     ends = [((0.0, 0.0), (length_mm, 0.0))]
