@@ -39,9 +39,9 @@ MULTIPLE = 32
 LEAST_SCORE = 0.05
 """Threshold of the keypoint heat map, as published."""
 LENGTH = 64
-"""Length of a descriptor."""
+"""Number of elements of a descriptor."""
 FARTHEST = 0.6
-"""Largest distance of the descriptors of a match: the published cosine of 0.82."""
+"""Largest distance of the unit descriptors of a match, from the published least cosine of 0.82."""
 SHA256 = {
     "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
     "xfeat-lighterglue.pt": "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",

@@ -1,1 +1,1 @@
-"""Pointmaps of networks: pairwise or in one frame, predicted here or read from a file, refined by matches."""
+"""Pointmaps of networks, pairwise or in one frame: prediction, import from a file, and refinement by matches."""

@@ -1,4 +1,4 @@
-"""Adapter of networks that predict depth, confidence and a camera pose of all views at once."""
+"""Adapter of networks that predict depth, confidence and a camera pose of all images at once."""
 
 import sys
 from collections.abc import Callable
@@ -26,12 +26,12 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Views:
-    """Input of a model."""
+    """Undistorted images of one camera, the input of a network."""
 
     colors: UInt8[ndarray, "n h w 3"]
-    """RGB, upright and without distortion, in the camera's own resolution: resizing is part of a model."""
+    """RGB, upright and undistorted, at the camera's own resolution; the network resizes them."""
     pinhole: Intrinsics | None
-    """The camera of these images; None: unknown."""
+    """Pinhole intrinsics of these images; None: unknown."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -40,7 +40,7 @@ class Views:
 
 
 Predict = Callable[[Views], PosedPointmaps]
-"""A model with its weights loaded."""
+"""Function of a network with its weights loaded, from images to pointmaps with camera poses."""
 
 
 def reconstruct_any_view(
@@ -51,9 +51,9 @@ def reconstruct_any_view(
     backend: str,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Predict all images with a model and refine the prediction; the unit is the model's own.
+    """Predict all images with a network and refine the prediction by matches; the unit is the network's own.
 
-    `load` returns the model of a folder of weights on a device. Raises InputError for weights that are missing or
+    `load` returns the network of a folder of weights on a device. Raises InputError for weights that are missing or
     damaged.
     """
     report = progress or silent
@@ -74,7 +74,11 @@ def reconstruct_any_view(
 
 
 def usable_pointmaps(maps: PosedPointmaps, model: str) -> PosedPointmaps:
-    """Return the pointmaps with confidence 0 wherever they cannot be used; raise InputError where nothing is left."""
+    """Return the pointmaps with confidence 0 at unusable pixels; raise InputError where no pixel is usable.
+
+    A pixel is unusable if its point or confidence is not finite, or if the point lies behind the camera. `model` is the
+    network's name in the message.
+    """
     confidence = maps.confidence
     there = np.isfinite(maps.x_in_camera).all(-1) & np.isfinite(confidence) & (confidence > 0)
     there &= maps.x_in_camera[..., 2] > 0
@@ -90,7 +94,7 @@ def usable_pointmaps(maps: PosedPointmaps, model: str) -> PosedPointmaps:
 
 
 def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
-    """Return images (n,3,h,w) in the normalisation of encoders that were trained on ImageNet."""
+    """Return images as a tensor (n,3,h,w), normalised as for encoders that were trained on ImageNet."""
     mean, deviation = (
         torch.tensor(values, device=device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
     )
@@ -99,7 +103,7 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
-    """Return an output of a network as float32 of a shape; raise InputError where it is absent or of another size."""
+    """Return the output `name` of a network as float32 of this shape; raise InputError if absent or of another size."""
     tensor = answer.get(name) if hasattr(answer, "get") else None
     if not isinstance(tensor, torch.Tensor) or tensor.numel() != np.prod(shape):
         raise InputError(
@@ -110,7 +114,7 @@ def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarra
 
 
 def rigid(matrices: Float[ndarray, "n r 4"]) -> Float[ndarray, "n 4 4"]:
-    """Return transforms (n,4,4) float64 from the 3x4 or 4x4 matrices of a network, with exact rotations."""
+    """Return rigid transforms from a network's 3x4 or 4x4 matrices, with the nearest exact rotations."""
     made = np.tile(np.eye(4), (len(matrices), 1, 1))
     made[:, :3] = matrices[:, :3]
     made[:, :3, :3] = nearest_rotation(made[:, :3, :3])

@@ -1,7 +1,8 @@
-"""Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of views.
+"""Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of images.
 
-Its conventions: cameras are camera_from_recon, x right, y down, z forward; depth is along z; intrinsics count from the
-image's corner; the unit is arbitrary. Only the network of its package is used, not the package's other requirements.
+Conventions of the network: cameras are camera_from_recon, x right, y down, z forward; depth is along z; intrinsics have
+their origin at the image's corner; the unit is arbitrary. Only the network of its package is used, without the package's
+other requirements.
 """
 
 import json
@@ -45,7 +46,7 @@ def reconstruct_da3(
 
 
 def load(weights: Path, device: str) -> Predict:
-    """Load the network from a folder of config.json and model.safetensors.
+    """Load the network from a folder with config.json and model.safetensors.
 
     Raises InputError for files that are missing, damaged or of another network.
     """
@@ -64,7 +65,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def build(name: str) -> nn.Module:
-    """Build the network of a configuration of the package with random weights; raise KeyError for an unknown name."""
+    """Return the network of a named configuration with random weights; raise KeyError for an unknown name."""
     os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # else the package prints its layers
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of its configuration's library
@@ -75,7 +76,7 @@ def build(name: str) -> nn.Module:
 
 
 def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
-    """Return the pointmaps of all views, predicted in one pass."""
+    """Return the pointmaps and camera poses of all images, predicted in one pass."""
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
@@ -97,7 +98,7 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
 
 
 def rays_of_edges(matrices: Float[ndarray, "n 3 3"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
-    """Return the directions of unit depth through pixels' centres, by matrices that count from the corner."""
+    """Return the rays with z = 1 through the pixels' centres, by matrices whose origin is the image's corner."""
     pixel = np.stack(
         [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1
     )
@@ -105,7 +106,7 @@ def rays_of_edges(matrices: Float[ndarray, "n 3 3"], height: int, width: int) ->
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Return the grid of an image: the long edge becomes `long_edge`, edges are rounded to multiples of the patch."""
+    """Return the network's grid for an image size: long edge `long_edge`, edges rounded to multiples of the patch."""
     edges = (round(edge * long_edge / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))
@@ -114,7 +115,7 @@ def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
 def resized_for_grid(
     image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int
 ) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize an image to `long_edge` and then to the grid, with the filters that Depth Anything 3 uses for each."""
+    """Resize an image to `long_edge` and then to the grid, with the interpolation of Depth Anything 3 for each step."""
     height, width = image.shape[:2]
     scale = long_edge / max(width, height)
     for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):

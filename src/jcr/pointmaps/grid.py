@@ -1,4 +1,4 @@
-"""Images in the resolution of a network, and the intrinsics of their pixels.
+"""Images at the resolution of a network, and the intrinsics of their pixels.
 
 Pixel (0, 0) is the centre of the top-left pixel: a resize by s maps x' = (x + 0.5)·s − 0.5, a crop subtracts its corner.
 """
@@ -33,7 +33,7 @@ class ImageGrid:
     """Pixel grid of a network in an undistorted image, which is resized to `resized_size` and then cropped."""
 
     original_size: tuple[int, int]
-    """Width, height in pixels, upright and undistorted."""
+    """Width, height of the upright, undistorted image, px."""
     resized_size: tuple[int, int]
     crop_corner: tuple[int, int]
     """Left, top of the crop in the resized image."""
@@ -47,7 +47,7 @@ class ImageGrid:
 
     @property
     def scale(self) -> Float[ndarray, "2"]:
-        """Resized over original, for x and y (they differ by the rounding of the sizes)."""
+        """Resized over original size for x and y, which differ by rounding."""
         return np.array(self.resized_size) / np.array(self.original_size)
 
     def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
@@ -55,13 +55,13 @@ class ImageGrid:
         return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
 
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
-        """Return the pinhole of the grid from that of the original image; its distortion is dropped."""
+        """Return the grid's pinhole intrinsics from those of the original image, whose distortion is dropped."""
         return cropped(
             resized(without_distortion(original), *self.resized_size), *self.crop_corner, *self.size
         )
 
     def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
-        """Return the pinhole of the original image from that of the grid."""
+        """Return the original image's pinhole intrinsics from those of the grid."""
         left, top = self.crop_corner
         whole = cropped(without_distortion(grid), -left, -top, *self.resized_size)
         return resized(whole, *self.original_size)
@@ -70,11 +70,11 @@ class ImageGrid:
 def image_grid(
     original_size: tuple[int, int], long_edge: int = 512, patch: int = PATCH, keep_square: bool = False
 ) -> ImageGrid:
-    """Return the published resize and crop for an image of `original_size` (width, height).
+    """Return the resize and crop published with DUSt3R for an image of `original_size` (width, height).
 
-    512: the long edge becomes 512 and both edges are cropped around the centre to multiples of the patch; a
-    square image is cropped to 4:3, DUSt3R having seen none. 224: the short edge becomes 224, then a square is
-    cropped.
+    With `long_edge` 512, the long edge becomes 512 and both edges are cropped around the centre to multiples of the
+    patch. A square image is cropped to 4:3 unless `keep_square`, because DUSt3R was not trained on squares. With 224,
+    the short edge becomes 224, then a square is cropped.
     """
     width, height = original_size
     longest = max(width, height)
@@ -98,14 +98,14 @@ class PreparedImages:
     colors: UInt8[ndarray, "n h w 3"]
     grid: ImageGrid
     intrinsics_of_capture: Intrinsics | None
-    """The camera of the capture's own images, with distortion; None: unknown."""
+    """Intrinsics of the capture's own images, with distortion; None: unknown."""
     pinhole: Intrinsics | None
-    """The camera of the undistorted images that `grid` resizes; None: unknown."""
+    """Pinhole intrinsics of the undistorted images that `grid` resizes; None: unknown."""
     warnings: tuple[str, ...] = ()
 
     @property
     def intrinsics(self) -> Intrinsics | None:
-        """Pinhole of the network's grid; None: unknown."""
+        """Pinhole intrinsics of the network's grid; None: unknown."""
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
     def grid_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
@@ -119,7 +119,7 @@ class PreparedImages:
 def prepare_images(
     capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
 ) -> PreparedImages:
-    """Read, undistort where the intrinsics are known, resize and crop the images of a capture.
+    """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
 
     `grid_of` gives the resize and crop for the size of an image. Raises InputError for an image that cannot be read.
     """
@@ -140,7 +140,7 @@ def prepare_images(
 def read_colors(
     capture: Capture, grid: ImageGrid, intrinsics: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
-    """Read the images of a capture on a grid, undistorted to `pinhole` first where the camera has distortion.
+    """Read the images of a capture on a grid; images of a camera with distortion are undistorted to `pinhole` first.
 
     Raises InputError for an image that cannot be read.
     """
@@ -155,7 +155,7 @@ def read_colors(
 
 
 def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize and crop an image to the grid by the published filters: Lanczos to shrink, bicubic to enlarge."""
+    """Resize and crop an image to the grid with the published filters: Lanczos to shrink, bicubic to enlarge."""
     shrinks = max(grid.original_size) > max(grid.resized_size)
     filter_ = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
     resized = Image.fromarray(image).resize(grid.resized_size, filter_)

@@ -20,21 +20,21 @@ ARRAYS = {
     "pts3d_in_other_view": "E H W 3",
     "conf2": "E H W",
 }
-"""Required arrays of a file and their shapes, named as in DUSt3R's output."""
+"""Required arrays of a file and their shapes, named as in DUSt3R's output; E pairs, images of H x W pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairPredictions:
-    """Pointmaps of ordered image pairs, each pair in its first image's camera frame, at a scale of its own.
+    """Pointmaps of ordered image pairs, each pair in its first image's camera frame and in a unit of its own.
 
-    For edge e = (n, m), `pts3d[e]` has a point for each pixel of image n, `pts3d_in_other_view[e]` one for
-    each pixel of image m, both in the camera frame of n (paper section III: X_n,e and X_m,e).
+    For edge e = (n, m), `pts3d[e]` has a point for each pixel of image n, `pts3d_in_other_view[e]` one for each pixel of
+    image m, both in the camera frame of n (paper section III: X_n,e and X_m,e).
     """
 
     edges: Int[ndarray, "e 2"]
     pts3d: Float[ndarray, "e h w 3"]
     conf: Float[ndarray, "e h w"]
-    """Confidence of `pts3d`, at least 0; the network's own is at least 1."""
+    """Confidence of `pts3d`, at least 0; DUSt3R's own is at least 1."""
     pts3d_in_other_view: Float[ndarray, "e h w 3"]
     conf2: Float[ndarray, "e h w"]
     """Confidence of `pts3d_in_other_view`."""
@@ -50,19 +50,19 @@ class PairPredictions:
 
     @property
     def image_count(self) -> int:
-        """Number of images that the edges join."""
+        """Number of images, named or else joined by the edges."""
         return len(self.images) or int(self.edges.max()) + 1
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the images for messages, or their numbers."""
+        """Names of the images for messages, or their numbers (#0, #1, …) without names."""
         return self.images or tuple(f"#{k}" for k in range(self.image_count))
 
 
 def read_pairs(path: Path) -> PairPredictions:
-    """Read predictions from npz and check them.
+    """Read pairwise predictions from an npz file and check them.
 
-    Raises InputError for a file that is missing, damaged, lacks an array, or has shapes that do not agree.
+    Raises InputError for a file that is missing, damaged, lacks an array, or has inconsistent shapes.
     """
     return pairs_from_arrays(read_arrays(path), str(path))
 
@@ -70,7 +70,7 @@ def read_pairs(path: Path) -> PairPredictions:
 def read_arrays(path: Path) -> dict[str, ndarray]:
     """Read all arrays of an npz file.
 
-    Raises InputError where the file is missing or damaged, or unpacks to more than the machine's memory.
+    Raises InputError for a file that is missing or damaged, or that does not fit into memory.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give predictions as npz (jcr docs predictions)")
@@ -90,9 +90,9 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
-    """Return checked predictions from the arrays of a file, named `source` in messages.
+    """Return checked pairwise predictions from the arrays of a file, named `source` in messages.
 
-    Raises InputError for what is missing or does not agree.
+    Raises InputError for arrays that are missing or inconsistent.
     """
     check_arrays(arrays, ARRAYS, source)
     edges = arrays["edges"]
@@ -115,7 +115,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 
 
 def _check_edges(edges: ndarray, names: int, source: str) -> int:
-    """Return the number of images, `names` or else that of the edges; raise InputError for wrong edges."""
+    """Return the number of images, `names` or else by the largest edge index; raise InputError for wrong edges."""
     if len(edges) == 0:
         raise InputError(f"{source}: no pair in it; predict at least one")
     if edges.dtype.kind not in "iu":
@@ -127,9 +127,9 @@ def _check_edges(edges: ndarray, names: int, source: str) -> int:
 
 
 def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: str) -> None:
-    """Check that arrays are there, finite and of `shapes`, such as "N H W 3" with equal sizes for equal letters.
+    """Check that arrays exist, are finite and have the `shapes`, such as "N H W 3" with equal sizes for equal letters.
 
-    Raises InputError for the first that is not, and for a confidence below 0.
+    Raises InputError for the first wrong array, and for a confidence below 0.
     """
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
@@ -154,9 +154,9 @@ def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: 
 def camera_of_arrays(
     arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> tuple[Intrinsics | None, ImageGrid | None]:
-    """Return `intrinsics` and `grid` of a file for pointmaps of `size` (width, height).
+    """Return `intrinsics` and `grid` from the arrays of a file, for pointmaps of `size` (width, height).
 
-    Raises InputError for wrong ones.
+    Each is None if absent. Raises InputError for wrong ones.
     """
     intrinsics = grid = None
     if "intrinsics" in arrays:

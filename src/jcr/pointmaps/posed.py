@@ -1,4 +1,4 @@
-"""Pointmaps with a camera pose each, in one frame: the common form of every prediction."""
+"""Pointmaps of images with a camera pose each, in one frame: the common form of every network's prediction."""
 
 from dataclasses import dataclass, replace
 
@@ -11,45 +11,45 @@ from jcr.pointmaps.grid import ImageGrid
 from jcr.records import Intrinsics
 
 SAMPLES = 20_000
-"""Approximate number of pixels of all images that the pinhole is fitted to."""
+"""Approximate number of pixels, over all images, that the pinhole is fitted to."""
 PREDICTED_STD = (0.02, np.radians(1.5))
-"""Standard deviations of a predicted camera that no match confirms: of its distance from the scene (relative), and of
-its rotation per axis (rad). Depth Anything 3's largest model has these on 7-Scenes (27 % of pairs within an average
-threshold of 3°, its benchmark page)."""
+"""Standard deviations of a predicted camera pose without matches: position per axis, relative to the distance of the
+scene, and rotation per axis (rad). They hold for Depth Anything 3's largest model on 7-Scenes (27 % of pairs within
+an average threshold of 3°, its benchmark page)."""
 FOCAL_STD = 0.05
-"""Relative standard deviation of a network's focal length, common to its views, which no match confirms."""
+"""Relative standard deviation of a network's focal length without matches, common to all images."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosedPointmaps:
-    """A camera pose and a pointmap of each image, in one frame."""
+    """Camera pose and pointmap of each image, in one recon frame."""
 
     grid: ImageGrid
     """Position of the pointmaps' pixels in the undistorted images."""
     recon_from_camera: Float[ndarray, "n 4 4"]
     """Rigid camera poses."""
     x_in_camera: Float[ndarray, "n h w 3"]
-    """A point per pixel of the grid in its own camera's frame; finite where the confidence is above 0."""
+    """Point of each pixel in its own camera's frame; finite where the confidence is above 0."""
     confidence: Float[ndarray, "n h w"]
-    """Confidence, at least 0; 0 means no estimate. Comparable within an image only, and no probability."""
+    """Confidence, at least 0; 0 means no estimate. It is comparable only within an image, and no probability."""
     is_metric: bool
-    """Whether the unit is meant to be the metre."""
+    """True if the unit is the metre."""
     covariance: Float[ndarray, "r r"] | None = None
-    """Covariance of the steps of all cameras (translation, rotation), r = 6n; None: unknown."""
+    """Covariance of the steps of all camera poses (translation, rotation), r = 6n; None: unknown."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
-        """Return the pointmaps with each point moved along z onto the ray of its pixel in a pinhole of the grid."""
+        """Return the pointmaps with each point moved at the same z onto its pixel's ray; `pinhole` is of the grid."""
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
 
 def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
-    """Fit a pinhole of the grid to all points and pixels; return it with the median misfit in pixels.
+    """Fit pinhole intrinsics of the grid to all points and pixels; return them with the median residual in px.
 
-    u = fx · x/z + cx is linear in the unknowns; residuals beyond the common spread lose their weight (Geman
-    and McClure). The misfit is infinite where half the points lie behind their camera.
+    The model u = fx · x/z + cx is linear in the unknowns, and residuals are weighted robustly (Geman-McClure). The
+    residual is infinite where half of the points lie behind their camera.
     """
     confidence = maps.confidence
     height, width = confidence.shape[1:]
@@ -78,9 +78,9 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
 
 
 def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
-    """Return the covariance (6n,6n) of cameras with the published errors of a network, relative to the first camera.
+    """Return the covariance (6n,6n) of camera poses relative to the first, by the published errors of a network.
 
-    Every camera has an error of its own; the first camera's error rotates all others about it.
+    Every camera has an independent error; the first camera's error also moves all others relative to it.
     """
     poses = maps.recon_from_camera
     count = len(poses)

@@ -1,4 +1,4 @@
-"""The back end `predictions`: the output of any network from one npz file (jcr docs predictions)."""
+"""The back end `predictions`: output of any network, read from one npz file (jcr docs predictions)."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +18,14 @@ from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
 
 POINTMAPS = {"confidence": "N H W", "recon_from_camera": "N 4 4", "points_in_recon": "N H W 3"}
-"""Required arrays of pointmaps that share a frame, and their shapes."""
+"""Required arrays of pointmaps in one frame, and their shapes; N images of H x W pixels."""
 LARGEST_MISFIT = 0.02
-"""Median distance of the points' projections from their pixels, over the width, beyond which poses are wrong."""
+"""Largest median distance of the points' projections from their pixels, as a share of the width; above it the poses are
+wrong."""
 
 
 def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
-    """Return camera poses, pointmaps and tracks from predictions in an npz file.
+    """Return camera poses, pointmaps and tracks from the predictions in an npz file.
 
     Raises InputError for a file that is missing, damaged, or does not fit the capture.
     """
@@ -55,7 +56,7 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
 def _posed_pointmaps(
     arrays: dict[str, ndarray], order: Int[ndarray, " m"], grid: ImageGrid, source: str
 ) -> PosedPointmaps:
-    """Return the pointmaps of a file in an order; raise InputError where the points miss their pixels."""
+    """Return the pointmaps of a file, images in this order; raise InputError where points miss their pixels."""
     poses = arrays["recon_from_camera"].astype(np.float64)
     poses = np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order])
     points, confidence = arrays["points_in_recon"][order], arrays["confidence"][order].astype(np.float32)
@@ -85,7 +86,7 @@ def _posed_pointmaps(
 
 
 def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> Int[ndarray, " m"]:
-    """Return the rows of the capture of the file's images; raise InputError for names that do not fit."""
+    """Return the capture's row of each image of the file; raise InputError for names that do not fit."""
     if not names:
         if count != len(capture):
             raise InputError(
@@ -107,8 +108,8 @@ def _images(
 ) -> PreparedImages:
     """Return the images on the file's grid, in ascending order of `rows`.
 
-    Intrinsics in the file are those of an undistorted image, as our own predictions are made from. Without
-    them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
+    Intrinsics in the file are those of undistorted images, as in predictions made by this package. Without them, the
+    pixels are taken to be those of the capture's images, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
@@ -144,7 +145,10 @@ def _images(
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
-    """Return the published resize and crop where it gives `size`, else a resize alone where the aspect allows it."""
+    """Return the published resize and crop if it gives `size`, else a plain resize if the aspect ratios agree.
+
+    Raises InputError where they do not.
+    """
     for published in (image_grid(original), image_grid(original, 224)):
         if published.size == size:
             return published

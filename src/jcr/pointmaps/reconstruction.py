@@ -33,9 +33,10 @@ def align_pairs(
     progress: Progress | None = None,
     pixels: int = PIXELS,
 ) -> PosedPointmaps:
-    """Align pairwise pointmaps.
+    """Align pairwise pointmaps into one frame by global alignment.
 
-    The focal length is that of the pointmaps: with another one their shapes do not fit each other, and the cameras move.
+    The focal length is estimated from the pointmaps, even with known intrinsics: with another one the pointmaps do not
+    fit each other, and the cameras move.
     """
     alignment = global_align(replace(predictions, intrinsics=images.intrinsics), pixels, progress)
     return PosedPointmaps(
@@ -58,7 +59,7 @@ def reconstruct_pointmaps(
     progress: Progress | None = None,
     image_index: Int[ndarray, " m"] | None = None,
 ) -> Reconstruction:
-    """Return the reconstruction of the images `image_index` (None: all) from their pointmaps.
+    """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps.
 
     `images` has colours on the grid of `maps`. Raises InputError where the points lie on no pinhole's rays.
     """

@@ -16,10 +16,10 @@ from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.colmap import reconstruct_near_cameras
 
 LEAST_MATCHES = 70
-"""Matches of an image in bundle adjustment; with fewer in any image nothing is refined. The calibration adjusts the
-tracks of three images from 200 observations on."""
+"""Least number of observations in every image for a refinement. The calibration adjusts the tracks of three images from
+200 observations on."""
 BEND_STD = 0.03
-"""Prior standard deviation of the logarithm of a depth correction's uneven part."""
+"""Prior standard deviation of the coefficients, except the constant, of the log of a depth correction."""
 
 
 def refine(
@@ -31,9 +31,9 @@ def refine(
 ) -> tuple[Reconstruction, PosedPointmaps] | None:
     """Adjust the predicted cameras to matches of SIFT, or else of learned features, and the depth to their points.
 
-    Returns the reconstruction of the matches, and the pointmaps with its cameras, both in the unit of the prediction;
-    None where too few match. `pinhole` belongs to the undistorted images; where `images` has no intrinsics, they are
-    estimated.
+    Returns the reconstruction from the matches, and the pointmaps with its cameras, both in the unit of the prediction;
+    None where an image has too few matches. `pinhole` belongs to the undistorted images and is the initial estimate of
+    unknown intrinsics.
     """
     given = images.intrinsics_of_capture
     kinds: tuple[FeatureName, ...] = ("sift", "xfeat") if xfeat_is_installed() else ("sift",)
@@ -57,7 +57,7 @@ def refine(
 
 
 def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray, "*k 6"]:
-    """Return 1, x, y, x², xy, y² of pixels of an image (width, height), scaled to -1 … 1."""
+    """Return 1, x, y, x², xy, y² of pixels, with x and y scaled to -1 … 1 over an image of `size` (width, height)."""
     scaled = 2 * x_px / (np.array(size) - 1) - 1
     x, y = scaled[..., 0], scaled[..., 1]
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
@@ -66,11 +66,11 @@ def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray
 def _depth_changes(
     made: Reconstruction, maps: PosedPointmaps, x_px: Float[ndarray, "k 2"]
 ) -> tuple[Float[ndarray, "n 6"], float]:
-    """Fit per view a quadratic in the image's coordinates to the logarithm of the factor that corrects its depth.
+    """Fit the log of a factor that corrects each image's depth, as a quadratic in the image coordinates.
 
-    `x_px` are the pixels of the tracks on the grid of the pointmaps. The fit is robust, with a prior on all coefficients
-    but the constant: five points in a corner do not bend the rest. The second value is the unit of the reconstruction in
-    units of the prediction.
+    Returns the coefficients in the order of `_basis`, and the unit of the reconstruction in units of the prediction.
+    `x_px` are the pixels of the tracks on the pointmaps' grid. The fit is robust, with a prior on all coefficients but
+    the constant, so that five points in a corner do not change the depth elsewhere.
     """
     tracks, size = made.tracks, maps.grid.size
     camera_from_recon = inverse(made.recon_from_camera)[tracks.image]

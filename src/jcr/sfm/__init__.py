@@ -1,1 +1,1 @@
-"""Structure from motion: mapping, registration of new images and given cameras."""
+"""Structure from motion with COLMAP: mapping, registration of new images, and triangulation with given cameras."""

@@ -1,4 +1,4 @@
-"""The COLMAP back end: structure from motion by matching, mapping, bundle adjustment, alignment of the observations.
+"""The back end `colmap`: matching, incremental mapping, bundle adjustment and least-squares matching of observations.
 
 Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 """
@@ -56,21 +56,24 @@ from jcr.sfm.model import (
 _FILM_DIAGONAL_MM = 43.27
 """Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
 _START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
-"""Initial focal lengths in long sides, without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
-cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
+"""Initial focal lengths for unknown intrinsics, as multiples of the long side. COLMAP's 1.2 alone fails on two of three
+real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
 _MANY, _GROWN = 40, 1.3
-"""Number of images above which COLMAP adjusts all only after growth by the second (its default is 1.1)."""
+"""Number of images above which COLMAP adjusts the whole map only after growth by the factor _GROWN (its default is 1.1).
+Number of images above which COLMAP adjusts the whole map only after growth by the factor _GROWN (its default is 1.1)."""
 _ROUGHLY = 1e-3
-"""Relative change of the cost that ends the adjustment before the last one."""
+"""Relative change of the cost that ends the adjustment that another one follows."""
 _MOST_OBSERVATIONS = 60_000
-"""Largest number of observations of a map; the robot's errors limit what more could add."""
+"""Largest number of observations of a map; more would not help, because the robot's errors limit the accuracy."""
 _MOST_MATCHED = 120_000
-"""Largest number of matched keypoints that are mapped; adjusting a point costs the square of the images that see it."""
+"""Largest number of matched keypoints that are mapped; adjusting a point costs the square of the number of its images.
+Largest number of matched keypoints that are mapped; adjusting a point costs the square of the number of its images."""
 _SIFT_THREADS = 8
-"""Largest number of images whose features are found at once; each takes 240 bytes a pixel while it is worked on."""
+"""Largest number of images whose features are found at once; each takes 240 bytes per pixel meanwhile."""
 _FEW_FEATURES = 1000
-"""Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
+"""Number of features per image below which texture is too scarce; textured tabletops give 1500 to 5000, a chessboard
+before a plain background 400."""
 
 
 def reconstruct_colmap(
@@ -80,10 +83,10 @@ def reconstruct_colmap(
     progress: Progress | None = None,
     working_size_px: int = WORKING_SIZE_PX,
 ) -> Reconstruction:
-    """Reconstruct camera poses and tracks of a capture, up to one similarity; one seed gives one result, bit for bit.
+    """Reconstruct camera poses and tracks of a capture, up to one similarity; a seed gives the same result bit for bit.
 
     The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated. Raises
-    RejectedError when fewer than three images register: how many did, the likely reason, and what to do instead.
+    RejectedError when fewer than three images register, with their number, the likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
@@ -111,9 +114,9 @@ def reconstruct_near_cameras(
     features: FeatureName,
     report: Progress = silent,
 ) -> Reconstruction | None:
-    """Return cameras and tracks near predicted cameras of all images; None where an image matches too little.
+    """Return cameras and tracks adjusted from predicted poses of all images; None where an image has too few points.
 
-    `intrinsics` are held if `known`, else they are the initial ones.
+    `intrinsics` are held if `known`, and otherwise are the initial estimate.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
     with matched_database(capture, images, intrinsics, known, features, 0, report) as (database, camera):
@@ -133,7 +136,10 @@ def matched_database(
     seed: int,
     report: Progress,
 ) -> Iterator[tuple[Path, pycolmap.Camera]]:
-    """Yield a database of the matches of a capture's images, and its camera; COLMAP's log is silent meanwhile."""
+    """Yield the path of a COLMAP database with the verified matches of a capture's images, and its camera.
+
+    COLMAP's log is silent meanwhile. `intrinsics` are given if `known`, else an initial estimate.
+    """
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         (camera,) = working_cameras([intrinsics], known)
         matcher = matcher_of(images, camera, known, features, seed, report)
@@ -154,7 +160,10 @@ def _adjusted(
     known: bool,
     seed: int,
 ) -> Reconstruction:
-    """Return cameras and tracks of a model after alignment of its observations and the last adjustment."""
+    """Return the reconstruction of a model after least-squares matching of its observations and a last adjustment.
+
+    `like` are the intrinsics at the images' size, held if `known`.
+    """
     _thin(model, seed)
     adjust_robustly(model, known, _ROUGHLY)
     std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
@@ -170,10 +179,9 @@ def _adjusted(
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
-    """Return the initial intrinsics, tried in turn; whether they are given; and warnings about them.
+    """Return the initial intrinsics to try in turn, whether they are given, and warnings about them.
 
-    Given ones are the only ones, and do not fold over; else these are initial values of a focal length and two radial
-    coefficients.
+    Given intrinsics that are usable are the only ones. Otherwise each has a guessed focal length and no distortion.
     """
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
@@ -197,10 +205,11 @@ def map_images(
     report: Progress,
     begun: pycolmap.Reconstruction | None = None,
 ) -> tuple[Matched, pycolmap.Reconstruction | None]:
-    """Match the images, and map the pairs by COLMAP's mapper, then by predicted cameras of the images it left out.
+    """Match the images and map the verified pairs by COLMAP's mapper; return the matches and the model.
 
-    `cameras` are tried in turn, after the intrinsics by the gripper's angles where none are given. A map that is `begun`
-    is continued with the images that it lacks and that match others.
+    The model is None if no pair could be mapped. The initial `cameras` are tried in turn, after the intrinsics estimated
+    from the gripper's angles if there are any. A model `begun` is continued with the images that it lacks and that match
+    others. Images that the mapper leaves out are added near cameras predicted from the gripper poses.
     """
     report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
@@ -234,7 +243,10 @@ def matcher_of(
     seed: int,
     report: Progress,
 ) -> Matcher:
-    """Return the matcher of some kind of features; SIFT is found here, networks find theirs when they match."""
+    """Return a matcher for one kind of features; SIFT features are found here, those of a network during the matching.
+
+    `known` says that the intrinsics of `camera` are given.
+    """
     if features != "xfeat":
         give_back()
         size, threads = (camera.width, camera.height), min(os.cpu_count() or 1, _SIFT_THREADS)
@@ -250,9 +262,9 @@ def matcher_of(
 
 
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
-    """Return the matches of a random part of the features, so that at most _MOST_MATCHED keypoints have some.
+    """Return the matches of random features, so that at most _MOST_MATCHED keypoints remain.
 
-    A feature is what matches join to each other; all its matches stay, or none.
+    A feature is a set of keypoints that matches connect; either all its matches are kept or none.
     """
     rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
     ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]
@@ -279,10 +291,10 @@ def _map_incrementally(
     report: Progress,
     begun: pycolmap.Reconstruction | None,
 ) -> pycolmap.Reconstruction | None:
-    """Return the model with most images over all initial cameras, with relaxed thresholds if it lacks more than half.
+    """Return the model with most images over all initial cameras; None if none could be mapped.
 
-    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
-    falls back where another start is tried.
+    Thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with the images
+    that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
     """
     n_images, pipeline = len(matcher.x_px), _pipeline_options(matcher.known, matcher.seed)
     if n_images > _MANY:
@@ -326,7 +338,7 @@ def _map_incrementally(
 
 
 def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Return the options of COLMAP's incremental mapping; one seed gives one result."""
+    """Return the options of COLMAP's incremental mapping, for which a seed gives the same result."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
@@ -343,7 +355,7 @@ def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpt
 
 
 def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
-    """Delete points at random until the model has at most _MOST_OBSERVATIONS observations."""
+    """Delete random points until the model has at most _MOST_OBSERVATIONS observations."""
     if model.compute_num_observations() <= _MOST_OBSERVATIONS:
         return
     order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -355,9 +367,9 @@ def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
 def _align_observations(
     model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
 ) -> Float[ndarray, " k"] | None:
-    """Align the model's observations by least-squares matching, in the images that features were found in.
+    """Refine the model's observations by least-squares matching, in images of the size that features were found in.
 
-    The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
+    Returns the standard deviation of each observation, in pixels of the original images and in the order of `tracks_of`.
     """
     camera, rows = model.camera(1), rows_of(model)
     size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
@@ -374,7 +386,7 @@ def _align_observations(
 def _not_registered(
     matcher: Matcher, matched: Matched, model: pycolmap.Reconstruction | None
 ) -> RejectedError:
-    """Return the error: number of registered images, likely reason and remedy."""
+    """Return the error that too few images register, with their number, the likely reason and a remedy."""
     x_px, pairs = matcher.x_px, len(matched.geometries)
     features = int(np.median([len(x) for x in x_px]))
     if features < _FEW_FEATURES:

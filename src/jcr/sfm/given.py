@@ -1,4 +1,4 @@
-"""The back end `given`: camera poses of a COLMAP model, with its points or with triangulated features."""
+"""The back end `given`: camera poses of a COLMAP model, with its own points or with triangulated features."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,14 +14,15 @@ from jcr.sfm.colmap import matched_database
 from jcr.sfm.model import tracks_of, triangulated_model
 
 MIN_POINTS = 50
+"""Least number of points of a reconstruction; with fewer in the model, features are triangulated."""
 
 
 def reconstruct_given(
     capture: Capture, cameras: Path, seed: int = 0, progress: Progress | None = None
 ) -> Reconstruction:
-    """Reconstruct the images that the model at `cameras` contains, with its poses fixed.
+    """Reconstruct the images that the COLMAP model at the path `cameras` contains, with its poses held.
 
-    Raises InputError when the model knows fewer than three, RejectedError when nothing can be triangulated.
+    Raises InputError when the model contains fewer than three, RejectedError when too few points can be triangulated.
     """
     report = progress or silent
     names, recon_from_camera = colmap.read_registered_cameras(cameras)
@@ -59,7 +60,10 @@ def reconstruct_given(
 
 
 def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
-    """Return a function from an image's path to the row of that name, with its folders where stated, or None."""
+    """Return a function from an image's path to the row of its name in `names`, or None.
+
+    A name with folders matches the end of the path; otherwise the file name alone must match.
+    """
     by_path = {Path(name).parts: row for row, name in enumerate(names)}
     by_name = {Path(name).name: row for row, name in enumerate(names)}
 
@@ -72,7 +76,7 @@ def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
 
 
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
-    """Return the observations that a COLMAP model holds."""
+    """Return the tracks of the COLMAP model at `cameras` in the images `names`, in pixels of images of `size`."""
     model = colmap.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)

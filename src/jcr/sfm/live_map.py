@@ -1,4 +1,4 @@
-"""Map of a capture that is being taken: images are matched as in a batch, and COLMAP's mapper continues the last map."""
+"""Map of a capture that is being taken: new images are matched, and COLMAP's mapper continues the last map."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,14 +23,14 @@ from jcr.sfm.model import (
 )
 
 FEW = 5
-"""Number of images up to which COLMAP maps all with each new one; the first pair may have been an unlucky one."""
+"""Largest number of images for which every update maps from scratch, because the first pair may have been a poor one."""
 
 
 class LiveMap:
-    """Cameras and tracks of the images of a capture that is being taken."""
+    """Map (camera poses and tracks) of the images of a capture that is being taken."""
 
     def __init__(self, capture: Capture) -> None:
-        """Begin a map without images; the intrinsics are those of the capture, or estimated."""
+        """Begin a map without images; the intrinsics are those of the capture, or are estimated."""
         self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
         self._cameras = working_cameras(self._all_intrinsics, self._known)
         camera = self._cameras[0]
@@ -43,16 +43,19 @@ class LiveMap:
 
     @property
     def registered(self) -> list[int]:
-        """Rows of the capture with a camera in the map."""
+        """Rows of the capture's images that have a camera pose in the map, ascending."""
         return sorted(self._places[row] for row in self._rows())
 
     def matched_with(self, place: int) -> int:
-        """Return the number of other images that an image matches and the gripper poses do not contradict."""
+        """Return the number of images with verified matches to the image in the capture's row `place`."""
         row = self._places.index(place)
         return sum(row in key for key in self._geometries)
 
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
-        """Map the images of a capture; `new` holds those that the map has not, and images that are gone leave it."""
+        """Update the map to the images of a capture; `new` has the images that the map lacks, by name.
+
+        Images that are no longer in the capture are removed, and the map then begins anew.
+        """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
             self._features.remove(row)
@@ -80,11 +83,11 @@ class LiveMap:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
 
     def _rows(self) -> list[int]:
-        """Return the rows, among the matcher's images, of the images that the model has registered."""
+        """Return the rows, in the matcher's order of images, of the images that the model has registered."""
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:
-        """Return the map as a reconstruction, rows counted as in the capture; None with fewer than two cameras."""
+        """Return the map as a reconstruction, with the capture's rows; None with fewer than two registered images."""
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None

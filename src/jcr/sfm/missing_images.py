@@ -1,7 +1,8 @@
-"""Models near predicted cameras, for images that the mapper left out and for the cameras of a network.
+"""Models near predicted cameras: images that the mapper left out, and cameras predicted by a network.
 
-Points are triangulated and adjusted in turn. The mapper's images are predicted by gripper poses and the map's own X, and
-more points of the map are searched near their projections.
+Points are triangulated and adjusted alternately. Cameras of images that the mapper left out are predicted from the
+gripper poses and the hand-eye transform X of the model itself; keypoints near projected points are then matched with
+them.
 """
 
 from collections import Counter
@@ -21,20 +22,21 @@ from jcr.geometry import inverse
 from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated_model
 
 PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
-"""Largest reprojection error of a point (px), refinements of each triangulation, and scale (px) of the loss of the
-adjustment after it."""
+"""Settings of the passes of triangulation and adjustment: largest reprojection error of a point (px), number of
+refinements of the triangulation, and scale (px) of the adjustment's Cauchy loss."""
 ROUGHLY = 1e-3
 """Relative change of the cost that ends these adjustments."""
 LEAST_POINTS = 15
-"""Least number of points of an image that images of the map see, too."""
+"""Least number of points of an image that images of the map see, too; an image with fewer is removed."""
 LEAST_MAPPED = 4
-"""Least number of mapped cameras from which others are predicted."""
+"""Least number of mapped cameras from which the others are predicted."""
 RADII_PX = (8.0, 4.0)
-"""Largest distances from a projection in turn; the camera is adjusted after each."""
+"""Largest distance, px, of a keypoint from the projection of its point in each pass; each pass ends with an adjustment.
+Largest distance, px, of a keypoint from the projection of its point in each pass; each pass ends with an adjustment."""
 RATIO = 0.85
-"""Largest ratio of a descriptor's distances to the best and second best keypoint near the projection."""
+"""Largest ratio of the descriptor distances to the best and the second-best keypoint near the projection."""
 LARGEST_PX = 4.0
-"""Reprojection error above which an observation is a mismatch, as COLMAP's."""
+"""Reprojection error, px, above which an observation is a mismatch, as in COLMAP."""
 
 
 def with_missing_images(
@@ -43,7 +45,11 @@ def with_missing_images(
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
 ) -> pycolmap.Reconstruction:
-    """Return the model with the images that it lacks, where points confirm the cameras that its own X predicts."""
+    """Return the model with images that it lacks, near cameras predicted by its own hand-eye transform X.
+
+    An image is added only where enough points confirm its camera. `base_from_gripper` has a row per image of the
+    matcher.
+    """
     rows = rows_of(model)
     poses = poses_of(model, rows)
     if len(rows) < LEAST_MAPPED:
@@ -77,9 +83,10 @@ def model_near_cameras(
     known: bool,
     mapped: Container[int] | None = None,
 ) -> pycolmap.Reconstruction:
-    """Return a model of predicted cameras, by row, adjusted to all verified matches; intrinsics that are `known` stay.
+    """Return a model adjusted from predicted cameras, by row, to all verified matches of the database.
 
-    It lacks images with few points; those count that an image of `mapped` (None: any) sees, too.
+    Intrinsics are held if `known`. Images with fewer than LEAST_POINTS points are removed, where only points that an
+    image of the rows `mapped` (None: any) sees are counted.
     """
     model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
     for largest_px, refinements, scale_px in PASSES:
@@ -103,7 +110,7 @@ def model_near_cameras(
 
 
 def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
-    """Add the keypoints of one image that match points projected near them."""
+    """Add observations to an image: free keypoints within `radius_px` of projected points of similar descriptor."""
     image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
     free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)

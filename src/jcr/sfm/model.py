@@ -1,7 +1,7 @@
-"""COLMAP's databases and models, in the conventions of this project.
+"""Conversion between COLMAP's databases and models and this project's conventions.
 
-COLMAP has the centre of the top-left pixel at (0.5, 0.5); this file is the border where that half pixel,
-the working size and COLMAP's camera models are converted. The image of row k has the id k + 1.
+COLMAP has the centre of the top-left pixel at (0.5, 0.5). This module alone converts this half pixel, the working size
+and COLMAP's camera models. The image of row k has the COLMAP id k + 1.
 """
 
 import signal
@@ -23,12 +23,12 @@ from jcr.geometry import inverse, transform
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 ENOUGH = 1e-6
-"""Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
-1e-5 of their distance elsewhere."""
+"""Relative change of the cost that ends an adjustment. COLMAP's 0 takes three times as long and moves cameras by only
+1e-5 of their distance."""
 
 
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
-    """Return COLMAP's camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
+    """Return COLMAP's camera of the intrinsics; if not `known`, with a focal length and two radial coefficients."""
     centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     both = [intrinsics.fx, intrinsics.fy, *centre]
     if not known:
@@ -48,7 +48,7 @@ def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
 def working_cameras(
     all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int = WORKING_SIZE_PX
 ) -> list[pycolmap.Camera]:
-    """Return COLMAP's cameras at the working size, whose long side is at most `working_size_px`."""
+    """Return COLMAP's cameras for images of the working size, whose long side is at most `working_size_px`."""
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -56,7 +56,7 @@ def working_cameras(
 
 
 def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Intrinsics:
-    """Return the intrinsics of a camera of `camera_of` for images of the size of `like`, which are the known ones."""
+    """Return `like` if the intrinsics are `known`, else those of COLMAP's `camera`, for images of the size of `like`."""
     if known:
         return like
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
@@ -68,7 +68,7 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Int
 def write_database(
     folder: Path, camera: pycolmap.Camera, x_px: Sequence[Float[ndarray, "_ 2"]], geometries: Geometries
 ) -> Path:
-    """Write a database of images of one camera, their keypoints and their verified matches; return its path."""
+    """Write a COLMAP database of images of one camera, their keypoints (px) and verified matches; return its path."""
     with closing(pycolmap.Database.open(folder / "database.db")) as db:
         db.write_camera(camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -87,12 +87,12 @@ def write_database(
 
 
 def rows_of(model: pycolmap.Reconstruction) -> list[int]:
-    """Return the rows of a model's images."""
+    """Return the rows of the images that a model has registered, ascending."""
     return sorted(image_id - 1 for image_id in model.reg_image_ids())
 
 
 def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarray, "m 4 4"]:
-    """Return recon_from_camera of mapped images."""
+    """Return recon_from_camera of the model's images `rows`."""
     mapped = [model.image(row + 1).cam_from_world() for row in rows]
     if not mapped:
         return np.zeros((0, 4, 4))
@@ -102,7 +102,7 @@ def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarr
 def reconstruction_of(
     model: pycolmap.Reconstruction, rows: Sequence[int], intrinsics: Intrinsics
 ) -> Reconstruction:
-    """Return the cameras and tracks of a model's images at `rows`."""
+    """Return the cameras and tracks of the model's images `rows` as a reconstruction with these intrinsics."""
     return Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=poses_of(model, rows),
@@ -113,7 +113,7 @@ def reconstruction_of(
 
 
 def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
-    """Return all observations of the points by images `image_ids`, in pixels of images of `size`."""
+    """Return the tracks of a model in the images `image_ids`, in pixels of images of `size` (width, height)."""
     camera = model.camera(model.image(image_ids[0]).camera_id)
     original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
     seen = observations(model, image_ids)
@@ -129,7 +129,10 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return (row of `image_ids`, row of the image's keypoints, row of the points by id) of each observation."""
+    """Return image, keypoint and point of each observation, as row of `image_ids`, row in the image, and row of points.
+
+    Points are in the order of their ids.
+    """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [
         (row_of[element.image_id], element.point2D_idx, point)
@@ -146,9 +149,9 @@ def triangulated_model(
     largest_px: float = 4.0,
     refinements: int = 5,
 ) -> pycolmap.Reconstruction:
-    """Return a model of fixed cameras, by row, with points from all verified matches; the same bits for the same input.
+    """Return a model of fixed cameras, by row, with points triangulated from all verified matches of the database.
 
-    Points with a reprojection error above `largest_px` are left out.
+    Points with a reprojection error above `largest_px` are removed. The same input gives the same bits.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -174,10 +177,10 @@ def triangulated_model(
 def adjust_robustly(
     model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = ENOUGH, scale_px: float = 0.5
 ) -> None:
-    """Adjust all cameras and points under a Cauchy loss of this scale, for COLMAP's least squares lets mismatches pull.
+    """Adjust all cameras and points of a model under a Cauchy loss of scale `scale_px`.
 
-    It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views). A relative change of the
-    cost of less than `enough` ends it.
+    `enough` is the relative change of the cost that ends the adjustment. In COLMAP's plain least squares mismatches
+    distort the result; the loss halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -196,10 +199,10 @@ def adjust_robustly(
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Silence COLMAP's log, which it writes to stderr through glog, but for fatal errors.
+    """Suppress COLMAP's log on stderr except for fatal errors, and restore Python's handler of SIGTERM.
 
-    Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
-    know of it: what Python has for the signal is set again, and glog's handler is gone for good.
+    The import of pycolmap installs glog's handler of SIGTERM, which prints a page of C++ frames and of which Python has
+    no record. Setting Python's handler again removes it.
     """
     on_termination = signal.getsignal(signal.SIGTERM)
     # Python sets signals in its main thread alone, and none that a host program in C handled before it.

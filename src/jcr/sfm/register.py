@@ -1,4 +1,4 @@
-"""Registration of new images in a reconstruction: triangulated features, then the absolute pose of each camera."""
+"""Registration of new images in a reconstruction: features are triangulated, then each camera's pose is computed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,28 +15,28 @@ from jcr.geometry import across_lines
 from jcr.records import Intrinsics, Reconstruction
 
 GATE_PX = 3.0
-"""Reprojection error beyond which an observation is a mismatch."""
+"""Reprojection error, px, above which an observation is a mismatch."""
 MIN_PARALLAX = np.radians(1.5)
-"""Least angle between the rays of a point."""
+"""Least angle, rad, between the rays of a point."""
 MIN_POINTS = 30
-"""Least number of points that agree on a pose; fewer agree by chance on repeated patterns."""
+"""Least number of points that must agree on a pose; fewer can agree by chance on repeated patterns."""
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """Features of one image."""
+    """SIFT features of one image."""
 
     x_px: Float[ndarray, "k 2"]
-    """Pixels of the original image, distorted."""
+    """Keypoints in the original image, distorted, px."""
     rays: Float[ndarray, "k 2"]
-    """(x/z, y/z), undistorted."""
+    """Undistorted directions x/z, y/z of the keypoints."""
     descriptors: Float32[ndarray, "k 128"]
     """Descriptors of unit length."""
 
 
 @dataclass(frozen=True)
 class KnownImages:
-    """Images of one camera with known poses, and their features."""
+    """Images of one camera with known poses and intrinsics, and their features."""
 
     camera: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
@@ -49,22 +49,22 @@ class KnownImages:
         camera: Intrinsics,
         recon_from_camera: Float[ndarray, "m 4 4"],
     ) -> "KnownImages":
-        """Find the features of images with known poses."""
+        """Find the features of images with known poses and intrinsics `camera`."""
         return cls(camera, recon_from_camera, tuple(features(image, camera) for image in images))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedPoints:
-    """Features of a new image on whose point two or more rays of images with known poses agree."""
+    """Features of a new image that match images of known poses, with points triangulated from two or more of those."""
 
     known: KnownImages
     x_px: Float[ndarray, "n 2"]
-    """Pixels of the new image's features."""
+    """Keypoints of the new image, one per point, px."""
     points: Float[ndarray, "n 3"]
     spread: Float[ndarray, "n 3 3"]
-    """Covariance of the points for rays of 1 rad noise."""
+    """Covariance of the points in the recon frame per rad² of variance of the rays."""
     point: Int[ndarray, " c"]
-    """Point of each observation in the known images."""
+    """Row in `points` of the point of each observation in the known images."""
     row: Int[ndarray, " c"]
     row_x_px: Float[ndarray, "c 2"]
 
@@ -76,9 +76,9 @@ class Registration:
     pose: CameraPose
     points_in_recon: Float[ndarray, "p 3"]
     x_px: Float[ndarray, "p 2"]
-    """Pixels of the new image."""
+    """Keypoints of the new image, one per point, px."""
     row: Int[ndarray, " k"]
-    """Image of known pose of each further observation."""
+    """Row of the known image of each observation there."""
     row_x_px: Float[ndarray, "k 2"]
     row_point: Int[ndarray, " k"]
 
@@ -88,9 +88,9 @@ def register(
     older: Sequence[UInt8[ndarray, "h w 3"]],
     new: Sequence[UInt8[ndarray, "h w 3"]],
 ) -> list[CameraPose | int]:
-    """Return the camera of each new image in the recon frame, or the number of points that it shares where too few.
+    """Return the camera pose of each new image in the recon frame, or the number of points it shares if too few.
 
-    `older` are the images of the reconstruction's rows, in their order; all are of one camera.
+    `older` are the images of the reconstruction's rows, in their order. All images are of one camera.
     """
     camera = reconstruction.intrinsics
     known = KnownImages.of(older, camera, reconstruction.recon_from_camera)
@@ -99,7 +99,7 @@ def register(
 
 
 def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFeatures:
-    """Return the SIFT features of an image of these intrinsics."""
+    """Return the SIFT features of an image with these intrinsics, found at the working size."""
     scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
     size = round(intrinsics.width * scale), round(intrinsics.height * scale)
     found, descriptors = detect(grey_of(image, size))
@@ -110,7 +110,7 @@ def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFea
 
 
 def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
-    """Match the features of a new image with those of known images, and triangulate them from these."""
+    """Match the features of a new image with those of known images, and triangulate them from the known images."""
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
     feature = np.concatenate([mine for mine, _ in of_row])
     row = np.repeat(np.arange(len(of_row)), [len(mine) for mine, _ in of_row])
@@ -138,7 +138,11 @@ def registration(
     focal: Literal["given", "free"] = "given",
     gate_px: float = GATE_PX,
 ) -> Registration | int:
-    """Return the pose on which the shared points agree, or their number where fewer than MIN_POINTS do."""
+    """Return the pose on which the shared points agree, or the number of points that agree if below MIN_POINTS.
+
+    `camera` are the new image's intrinsics, whose focal length is held or free; `gate_px` is the largest reprojection
+    error of an inlier.
+    """
     known, std_px, pose = shared.known, 1.0, None
     if len(shared.points) < MIN_POINTS:
         return len(shared.points)
@@ -176,9 +180,10 @@ def triangulated_features(
     gate: float,
     n: int,
 ) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"], Bool[ndarray, " n"]]:
-    """Return the point of each feature, its covariance for rays of 1 rad noise, and whether two rays agree on it.
+    """Return for each of `n` features its point, its covariance per rad² of ray noise, and whether two rays agree on it.
 
-    Observation c is ray `seen[c]` (x/z, y/z) of image `row[c]` for `feature[c]` < n; `gate` (rad) excludes mismatches.
+    Observation c is the ray `seen[c]` (x/z, y/z) of image `row[c]` to the feature `feature[c]`. Rays that miss their
+    point by more than `gate` (rad) are mismatches.
     """
     rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
     direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])

@@ -1,9 +1,9 @@
 """Least-squares matching of the observations of a track with one of them, its reference.
 
-Gruen, "Adaptive least squares correlation", 1985, with the derivatives of the reference (inverse composition; Baker and
-Matthews, IJCV 2004), under the warp of a plane that faces the cameras, a free affine part, gain and offset. Of three
-sizes of the patch the one with the smallest variance counts (Förstner, "On the geometric precision of digital
-correlation", 1982).
+Method: Gruen, "Adaptive least squares correlation", 1985, with derivatives of the reference (inverse composition; Baker
+and Matthews, IJCV 2004). The warp is that of a plane that faces the cameras, with a free affine part, gain and offset.
+Three sizes of the patch are tried; the one with the smallest variance is used (Förstner, "On the geometric precision of
+digital correlation", 1982).
 """
 
 import os
@@ -23,25 +23,28 @@ from jcr.geometry import inverse
 from jcr.records import Intrinsics, Tracks
 
 MOST_PX = 4.0
-"""An observation farther from its keypoint is another feature; COLMAP, too, keeps none that is farther off."""
+"""Largest distance, px, of an aligned observation from its keypoint; farther away is another feature, as in COLMAP."""
 LEAST_CORRELATION = 0.9
+"""Least correlation of an aligned patch with the reference."""
 KEYPOINT_STD_PX = 0.3
-"""Standard deviation of a keypoint, and largest one of an aligned observation, px."""
+"""Standard deviation of a keypoint, px, and the largest one of an aligned observation."""
 _REDUCED = (4, 2, 1)
-"""Sizes of the patch: of the images reduced so much. Each starts where the one before it ended."""
+"""Factors by which the images are reduced, which set the size of the patch; each level starts from the result of the one
+before."""
 _RADIUS, _WINDOW = 7, 4.5
-"""Pixels: of the patch, and the standard deviation of its weights."""
+"""Half of the patch's side, and standard deviation of its weights, in pixels of the reduced image."""
 _STEPS, _SETTLED_PX = 15, 0.01
+"""Largest number of Gauss-Newton steps, and shift (px) below which they end."""
 _BEND_AT_PX = 6.0
-"""Distance from the reference's keypoint at which derivatives of the warp are taken."""
+"""Distance, px, from the reference's keypoint at which the warp is sampled for its derivatives."""
 _FREE = 8
-"""Unknowns: shift x y, gain, offset, affine part by rows."""
+"""Number of unknowns: shift x and y, gain, offset, and the affine part row by row."""
 _STEEPEST = 5.0
-"""Scale from one image to another beyond which the warp is none."""
+"""Largest scale from one image to another; a larger one means that the warp is invalid."""
 _POINTS_AT_ONCE = 256
-"""Tracks that a thread aligns in one go."""
+"""Number of tracks that a thread aligns at a time."""
 _FLAT = 1e-3
-"""Standard deviation, in grey levels, of a patch without texture."""
+"""Standard deviation, in grey levels, below which a patch has no texture."""
 
 
 def align_tracks(
@@ -50,10 +53,10 @@ def align_tracks(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> Tracks:
-    """Align observations to their track's reference and return the tracks with standard deviations.
+    """Align observations to their track's reference, and return the tracks with standard deviations.
 
-    The images are of the size of `intrinsics`, to which the tracks belong; rows of cameras and images are those of the
-    tracks. The reference is the observation that shows the surface at the median scale. It stays where it is.
+    `greys` are the images in the order of the cameras. Images, tracks and `intrinsics` are of one size. The reference is
+    the observation that shows the surface at the median scale, and stays where it is.
     """
     order = np.lexsort((tracks.image, tracks.point))
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
@@ -69,7 +72,7 @@ def align_tracks(
     )
 
     def align(level: UInt8[ndarray, "m h2 w2"], job: tuple[Any, ...], first: int) -> None:
-        """Align some tracks; each thread writes to the observations of its own."""
+        """Align the tracks from `first` on; each thread writes only to observations of its own tracks."""
         some = slice(first, first + _POINTS_AT_ONCE)
         _align_all(level, image, ends[first : some.stop + 1], reference[some], *job)
 
@@ -100,9 +103,9 @@ def align_tracks(
 
 
 def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
-    """Return the mean direction of the cameras that see each point, the normal of its plane, of any length.
+    """Return the sum of unit vectors from each point to its cameras, the normal of the point's plane.
 
-    Planes through neighbouring points gave the same: the affine part is free.
+    Planes through neighbouring points gave the same result, because the affine part is free.
     """
     toward = recon_from_camera[tracks.image, :3, 3] - tracks.points_in_recon[tracks.point]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
@@ -118,7 +121,10 @@ def _scales(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> Float[ndarray, " k"]:
-    """Pixels² of each observation that a unit of area of its plane covers, times the square of the normal's length."""
+    """Return the image area (px²) per unit area of the point's plane, for each observation.
+
+    It is multiplied by the length of the plane's normal, which is the same for all observations of a point.
+    """
     camera_from_recon = inverse(recon_from_camera)[image]
     x_in_camera = _x_in_b(camera_from_recon, x_in_recon)
     by_recon = by_point(intrinsics, x_in_camera) @ camera_from_recon[:, :3, :3]
@@ -135,10 +141,11 @@ def _warps(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Float[ndarray, "k 2 2"], Float[ndarray, "k 2 3"]]:
-    """Affine part and bend: (u, v) from the reference's keypoint is affine·(u, v) + bend·(u², uv, v²) from the other.
+    """Return affine part A and bend B of each observation's warp, from offsets (u, v) px at the reference's keypoint.
 
-    By central differences; the bend is of perspective and distortion. Where the plane is seen from the side or from
-    behind, both are 0, with which nothing is aligned.
+    The offset in the observation's image is A·(u, v) + B·(u², uv, v²), by central differences; B comes from perspective
+    and distortion. Both are 0 where the plane is seen at a grazing angle or from behind; such observations are not
+    aligned.
     """
     recon_from_reference = recon_from_camera[image[of_reference]]
     camera_from_recon = inverse(recon_from_camera)[image]
@@ -169,9 +176,9 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
 @compiled
 @no_type_check
 def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
-    """Move `warp` (centres, affine parts, bends) of all observations but the references to where they are aligned.
+    """Align all observations except the references: update `warp` (centres, affine parts, bends) and `variance_px`.
 
-    What is aligned has a variance (px²) afterwards; the rest keeps infinity.
+    The variance (px²) of an observation that could not be aligned stays infinite.
     """
     offsets, window = _window(_RADIUS)
     wide, _ = _window(_RADIUS + 1)
@@ -213,7 +220,7 @@ def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, mo
 @compiled
 @no_type_check
 def _window(radius):
-    """Offsets (n,2) of the pixels of a patch, row by row, and their weights, whose sum is 1."""
+    """Return the offsets (n,2) of the pixels of a patch, row by row, and their weights, whose sum is 1."""
     side = 2 * radius + 1
     index = np.arange(side * side)
     offsets = np.stack((index % side - radius, index // side - radius), axis=1).astype(np.float64)
@@ -224,7 +231,7 @@ def _window(radius):
 @compiled
 @no_type_check
 def _patch(grey, x_px, affine, bend, offsets, patch):
-    """Write the greys at the warped offsets; whether the image holds all of them."""
+    """Write the greys at the warped offsets to `patch`, and return whether the image contains all of them."""
     for k in range(len(offsets)):
         u = offsets[k, 0]
         v = offsets[k, 1]
@@ -241,9 +248,9 @@ def _patch(grey, x_px, affine, bend, offsets, patch):
 @compiled
 @no_type_check
 def _smooth(grey, x, y):
-    """Interpolate the image by a cubic B-spline with the pixels as coefficients, which blurs by 0.58 px.
+    """Return the grey at x, y by a cubic B-spline with the pixels as coefficients, which blurs by 0.58 px.
 
-    Without the blur the interpolation would be rougher between pixels than on them and pull towards one of the two.
+    Without this blur, interpolation would smooth differently on pixels and between them, which biases positions.
     """
     column = int(x)
     row = int(y)
@@ -262,10 +269,10 @@ def _smooth(grey, x, y):
 @compiled
 @no_type_check
 def _template(around, offsets, window, template, pull):
-    """Write the reference patch less its mean, and `pull` (n,8), what a grey too high does to each unknown.
+    """Write the reference patch minus its mean to `template`, and the unknowns' change per grey to `pull` (n,8).
 
-    Its standard deviation is returned. A patch whose texture does not fix the unknowns pulls without bound: its
-    variance rejects it.
+    Returns the standard deviation of the patch. Where the texture does not determine the unknowns, `pull` is very large,
+    and the resulting variance rejects the patch.
     """
     side = 2 * _RADIUS + 3
     mean = 0.0
@@ -297,7 +304,7 @@ def _template(around, offsets, window, template, pull):
 @compiled
 @no_type_check
 def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
-    """Gauss-Newton steps of `x_px` and `affine`; the correlation where they settle, -1 where they do not."""
+    """Update `x_px` and `affine` by Gauss-Newton; return the correlation at convergence, -1 without convergence."""
     step = np.empty(_FREE)
     for _ in range(_STEPS):
         if not _patch(grey, x_px, affine, bend, offsets, patch):

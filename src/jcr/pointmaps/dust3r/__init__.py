@@ -1,1 +1,1 @@
-"""DUSt3R and MASt3R: network, weights, and prediction of pairs."""
+"""DUSt3R and MASt3R: network, weights, and prediction of the pointmaps of image pairs."""

@@ -1,4 +1,4 @@
-"""The DUSt3R and MASt3R back ends: prediction of pairwise pointmaps, global alignment, refinement."""
+"""The DUSt3R and MASt3R back ends: prediction of pairwise pointmaps, global alignment, refinement by matches."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +21,8 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
 
 MAX_BATCH = {"cpu": 1, "cuda": 16}
-"""Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
+"""Number of pairs in a batch by device. A larger one does not help a CPU, whose cores one pair of 768 tokens keeps busy.
+Number of pairs in a batch by device. A larger one does not help a CPU, whose cores one pair of 768 tokens keeps busy."""
 
 
 def reconstruct_dust3r(
@@ -57,9 +58,10 @@ def predict_pairs(
     edges: Int[ndarray, "e 2"],
     progress: Progress | None = None,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
-    """Predict the pointmaps of pairs: one encoder pass per image, one decoder pass per ordered pair; and notes.
+    """Predict the pointmaps of the image pairs `edges`; return them with notes for the user.
 
-    Where CUDA runs out of memory the batch is halved. Raises InputError where the memory does not suffice for one pair.
+    The encoder runs once per image, and the decoder once per ordered pair. The batch is halved when CUDA runs out of
+    memory; InputError is raised when one pair does not fit.
     """
     report = progress or silent
     features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
@@ -107,7 +109,7 @@ def _in_batches(
     sizes: list[int],
     report: Callable[[float], None],
 ) -> None:
-    """Do `work` on all rows in batches of the last of `sizes`, to which half of it is added where memory ends."""
+    """Call `work` on all rows in batches of the last size in `sizes`; half of it is appended when memory runs out."""
     done = 0
     while done < count:
         rows = np.arange(done, min(done + sizes[-1], count))

@@ -1,8 +1,8 @@
 """Network of DUSt3R (Wang et al., CVPR 2024): pointmaps of two images in the first camera's frame.
 
-Encoder and decoders are those of CroCo v2 (Weinzaepfel et al., ICCV 2023), the head is linear or a dense prediction
-transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are the keys of the published state dicts.
-Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
+Encoder and decoders are those of CroCo v2 (Weinzaepfel et al., ICCV 2023). The head is linear or a dense prediction
+transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are the keys of the published state dicts. Shapes: b images
+or pairs, n tokens = h/16 · w/16, c channels.
 """
 
 import re
@@ -23,12 +23,12 @@ Rotary = Float[Tensor, "2 n 2 frequencies"]
 
 
 class EncodedImages(NamedTuple):
-    """Encoded images, independent of the images they are paired with."""
+    """Output of the encoder for a batch of images; it does not depend on how images are paired."""
 
     tokens: Tensor
-    """Tokens of the encoder (b,n,c)."""
+    """Encoder tokens (b,n,c)."""
     grid: tuple[int, int]
-    """Rows and columns of tokens."""
+    """Numbers of rows and columns of tokens."""
 
 
 class Pointmap(NamedTuple):
@@ -40,7 +40,7 @@ class Pointmap(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Fields of a published configuration; one that this network does not cover raises ValueError."""
+    """Fields of a published configuration; a value that this network does not support raises ValueError."""
 
     enc_embed_dim: int = 768
     enc_depth: int = 12
@@ -77,9 +77,9 @@ class Config:
 
 
 class Dust3r(nn.Module):
-    """Network, built from the fields of a published configuration (`Config`).
+    """Network of DUSt3R or MASt3R, built from the fields of a published configuration (`Config`).
 
-    Raises ValueError for a configuration that this network does not cover, TypeError for an unknown field.
+    Raises ValueError for a configuration that is not supported, TypeError for an unknown field.
     """
 
     def __init__(self, **fields: Any) -> None:
@@ -89,9 +89,9 @@ class Dust3r(nn.Module):
         self.rope_base = float(config.pos_embed.removeprefix("RoPE"))
         self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
         self.mixed_precision: bool | None = None
-        """Whether encoder, decoder and heads use bfloat16; None: where the device is CUDA."""
+        """True if encoder, decoder and heads use bfloat16; None: only on CUDA."""
         self.is_metric = False
-        """Whether its points are meant to be in metres."""
+        """True if the predicted points are in metres."""
 
         self.patch_embed = PatchEmbed(enc_dim)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
@@ -115,11 +115,11 @@ class Dust3r(nn.Module):
     def forward(
         self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Return pointmaps of images in [-1, 1] whose height and width are multiples of 16, portrait included."""
+        """Return the pointmaps of image pairs in [-1, 1]; height and width are multiples of 16, portrait included."""
         return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
-        """Return the features of images in [-1, 1]; each image is encoded once for all its pairs."""
+        """Return the encoder tokens of images in [-1, 1]; each image is encoded once for all its pairs."""
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
                 f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
@@ -134,7 +134,7 @@ class Dust3r(nn.Module):
             return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
-        """Return pointmaps of both images in the first camera's frame; (1, 2) does not give (2, 1)."""
+        """Return the pointmaps of both images in the first camera's frame; swapped arguments give other predictions."""
         with self._autocast(features1.tokens):
             rotary1, rotary2 = (
                 rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
@@ -164,7 +164,7 @@ class Dust3r(nn.Module):
 
 
 def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: torch.device) -> Rotary:
-    """Return cosines and sines of position · base^(−2k/D), D = head_dim/2 (RoPE, Su et al. 2021, per axis)."""
+    """Return cosines and sines of position · base^(−2k/D) for frequency k, D = head_dim/2 (RoPE, Su et al. 2021)."""
     position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
     exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)
     angle = position[..., None] * base**-exponent
@@ -183,7 +183,7 @@ def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b 
 
 
 class PatchEmbed(nn.Module):
-    """A token per 16x16 patch."""
+    """Embedding of each 16x16 patch of an image as a token."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -204,14 +204,14 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
-        """Return tokens after attention to each other."""
+        """Return the self-attention of the tokens x, whose position embeddings are `rotary`."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         out = F.scaled_dot_product_attention(rotate(q, rotary), rotate(k, rotary), v)
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
 class CrossAttention(nn.Module):
-    """Multi-head attention of one image's tokens to the other's."""
+    """Multi-head attention of one image's tokens to those of the other image."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -237,7 +237,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(int(dim * ratio), dim)
 
     def forward(self, x: Tokens) -> Tokens:
-        """Return the tokens after the perceptron."""
+        """Return the output of the perceptron for each token."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -251,7 +251,7 @@ class EncoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
-        """Return the tokens after the block."""
+        """Return the tokens after the block; `rotary` are their position embeddings."""
         x = x + self.attn(self.norm1(x), rotary)
         return x + self.mlp(self.norm2(x))
 
@@ -267,35 +267,38 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the tokens x after the block, which reads the tokens y."""
+        """Return the tokens x after the block, which attends to the other image's tokens y."""
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
 
 
 def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
-    """Return points and confidence from a head's four channels: the length d of xyz becomes exp(d) − 1."""
+    """Return points and confidence from a head's four channels x, y, z, c.
+
+    The vector (x, y, z) of length d is scaled to the length exp(d) − 1; the confidence is 1 + exp(c).
+    """
     xyz, c = raw.float().permute(0, 2, 3, 1).split([3, 1], -1)
     length = xyz.norm(dim=-1, keepdim=True)
     return Pointmap(xyz * (length.expm1() / length.clamp(min=1e-8)), 1 + c[..., 0].exp())
 
 
 class LinearHead(nn.Module):
-    """A 16x16 block of raw outputs from each token of the last layer."""
+    """Linear head: each token of the last layer gives the four raw outputs of its 16x16 pixels."""
 
     def __init__(self, dec_dim: int) -> None:
         super().__init__()
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmap of a view from its layers of tokens."""
+        """Return the pointmap of an image from the tokens after each layer; `grid` is rows and columns of tokens."""
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
 
 
 class DptHead(nn.Module):
-    """Head of the dense prediction transformer (Ranftl et al. 2021)."""
+    """Head of the dense prediction transformer (Ranftl et al. 2021), which reads the tokens of four layers."""
 
     def __init__(self, enc_dim: int, dec_dim: int, dec_depth: int) -> None:
         super().__init__()
@@ -303,12 +306,12 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmap of a view from its layers of tokens."""
+        """Return the pointmap of an image from the tokens after each layer; `grid` is rows and columns of tokens."""
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
 class Dpt(nn.Module):
-    """Token grids of four depths to one map at pixel resolution, fused from the coarsest up."""
+    """Fusion of the token grids of four layers into one map at pixel resolution, from the coarsest to the finest."""
 
     def __init__(self, dims: Sequence[int], width: int = 256) -> None:
         super().__init__()
@@ -329,7 +332,7 @@ class Dpt(nn.Module):
         )
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
-        """Return the raw map at pixel resolution."""
+        """Return the four raw outputs of each pixel from the token grids of four layers."""
         x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -337,7 +340,7 @@ class Dpt(nn.Module):
 
 
 class Scratch(nn.Module):
-    """Four levels, finest first, brought to one width and fused."""
+    """Fusion of four feature maps, finest first, after their channels are brought to one number."""
 
     def __init__(self, pyramid: Sequence[int], width: int) -> None:
         super().__init__()
@@ -347,7 +350,7 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
     def forward(self, levels: list[Tensor]) -> FeatureMap:
-        """Return the fused map."""
+        """Return the fused feature map, at twice the resolution of the finest one."""
         level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
@@ -357,9 +360,9 @@ class Scratch(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Refine the sum of a level and its coarser ones, and double the resolution.
+    """Refinement of the sum of a feature map and the coarser ones, with twice the resolution as output.
 
-    `resConfUnit1` refines the level before it is added, which is done outside; the coarsest needs none.
+    `resConfUnit1` refines a feature map before the caller adds it; the coarsest map needs no such refinement.
     """
 
     def __init__(self, width: int) -> None:
@@ -383,5 +386,5 @@ class ResidualUnit(nn.Module):
         self.conv2 = nn.Conv2d(width, width, 3, 1, 1)
 
     def forward(self, x: FeatureMap) -> FeatureMap:
-        """Return the map after the unit."""
+        """Return x plus the output of the two convolutions."""
         return x + self.conv2(F.relu_(self.conv1(F.relu(x))))

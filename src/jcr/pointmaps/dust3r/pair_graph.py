@@ -1,4 +1,4 @@
-"""Pairs of images that a network sees."""
+"""Choice of the image pairs whose pointmaps a network predicts."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,13 +8,14 @@ from jcr.estimation.closed_form import motions
 from jcr.features.pairs import NEIGHBOURS, near_pairs
 
 FEW_IMAGES = 12
-"""Number of images up to which every pair is predicted (132)."""
+"""Largest number of images for which every pair is predicted (132 ordered pairs)."""
 
 
 def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
-    """Return every pair of few images, in both orders; of more the pairs of near viewpoints and of successive images.
+    """Return the pairs of images to predict, in both orders: all pairs of up to FEW_IMAGES images.
 
-    Successive images join neighbourhoods that share no pair.
+    With more images, these are the pairs of near viewpoints, and of successive images, which connect separate groups of
+    viewpoints.
     """
     count = len(base_from_gripper)
     if count <= FEW_IMAGES:
@@ -30,6 +31,6 @@ def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
 
 
 def window_pairs(count: int, size: int) -> Int[ndarray, "e 2"]:
-    """Return the pairs of images at most `size` apart in the order of the capture, in both orders."""
+    """Return the pairs of images at most `size` apart in the capture's order: (i, j) with i > j, then each reversed."""
     edges = np.argwhere(np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool))
     return np.concatenate([edges, edges[:, ::-1]])

@@ -1,4 +1,4 @@
-"""Loading of published weights: config.json and model.safetensors in a folder."""
+"""Loading of published weights of DUSt3R and MASt3R: config.json and model.safetensors in a folder."""
 
 import functools
 import json
@@ -15,9 +15,9 @@ from jcr.pointmaps.dust3r.network import Dust3r
 
 
 def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
-    """Load a network from a folder, or from a .safetensors beside its config.json.
+    """Load a network from a folder, or from a .safetensors file next to its config.json.
 
-    The licence is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
+    The licence is printed on stderr. Raises InputError for files that are missing, damaged or of another network.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -47,7 +47,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """Return the network of a configuration with its tensors, shared with the file that they are mapped from."""
+    """Return the network of a configuration with the tensors `state`, which share the memory of the mapped file."""
     mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
     config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")
@@ -72,10 +72,10 @@ def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> D
 
 @functools.cache
 def _announce(note: str) -> None:
-    """Write the source and licence of weights to stderr, once per process and source."""
+    """Write the source and licence of weights to stderr, once per process and note."""
     sys.stderr.write(f"{note}\n")
 
 
 def _line(error: BaseException) -> str:
-    """Return the first sentence of a message, on one line."""
+    """Return the first sentence of an error's message, on one line."""
     return " ".join(str(error).split()).split(". ")[0][:160] or type(error).__name__

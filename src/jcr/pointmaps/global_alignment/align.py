@@ -21,46 +21,46 @@ from jcr.progress import Progress, silent
 from jcr.records import Intrinsics
 
 PIXELS = 2048
-"""Pixels per image, the most confident of as many equal cells."""
+"""Number of pixels used per image: the most confident one of each of as many equal cells."""
 LEAST_PIXELS = 50
-"""Least number of pixels per image: several for each coarse cell of the correlation of residuals."""
+"""Least number of pixels per image: several in each coarse cell by which the correlation of residuals is measured."""
 DEPTH_CHUNK = 4096
-"""Pixels at a time, so that the arrays of a chunk stay in the cache."""
+"""Number of pixels processed at a time, so that their arrays stay in the cache."""
 CONTRADICTION = 4.0
-"""A pair whose residual is this many times the median one is named to the user."""
+"""Ratio of a pair's residual to the median residual above which the user is told of the pair."""
 USELESS = 0.2
-"""Residual of the middle pair, relative to the distance, of pairs that do not belong together."""
+"""Median residual of the pairs, relative to the distance, above which the pairs do not belong together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
-    """One reconstruction from pairwise pointmaps: a camera and a depth map per image, a scale per pair.
+    """Camera pose and depth map of each image, and scale of each pair, from pairwise pointmaps.
 
-    The recon frame is the camera frame of image 0; its unit is the geometric mean of the pairs' own units, so
-    metric predictions give metres.
+    The recon frame is the camera frame of image 0. Its unit is the geometric mean of the pairs' own units, so metric
+    predictions give metres.
     """
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     focal_px: tuple[float, float]
-    """fx, fy, common to all images."""
+    """Focal lengths fx, fy, common to all images."""
     principal_point_px: tuple[float, float]
     depth: Float[ndarray, "n h w"]
     """Depth along the optical axis, recon units."""
     confidence: Float[ndarray, "n h w"]
-    """Confidence of the network, averaged over the pairs, weighted by their agreement with this depth."""
+    """Network's confidence, averaged over the pairs and weighted by their agreement with this depth."""
     pair_scale: Float[ndarray, " e"]
-    """σ_e: recon units per unit of the pair's pointmaps (paper eq. 1)."""
+    """Scale σ_e of each pair: recon units per unit of the pair's pointmaps (paper eq. 1)."""
     pair_residual: Float[ndarray, " e"]
-    """Typical distance of a pair's points from the reconstruction, relative to that from the camera."""
+    """Typical distance of a pair's points from the reconstruction, relative to their distance from the camera."""
     covariance: Float[ndarray, "r r"]
-    """Covariance of the steps of all cameras (translation, rotation), r = 6n; zero for image 0."""
+    """Covariance of the steps of all camera poses (translation, rotation), r = 6n; zero for image 0."""
     notes: tuple[str, ...] = ()
-    """Pairs that contradict the others and count little."""
+    """Messages about pairs that contradict the others and have little weight."""
     warnings: tuple[str, ...] = ()
-    """Faults of the alignment that the user must act on, such as pairs that agree on nothing."""
+    """Faults of the alignment that the user must act on, such as pairs that do not agree at all."""
 
     def x_in_camera(self) -> Float[ndarray, "n h w 3"]:
-        """Return the points of all pixels in their cameras' frames, float32."""
+        """Return the point of every pixel in its own camera's frame, float32."""
         _, height, width = self.depth.shape
         pinhole = Intrinsics(*self.focal_px, *self.principal_point_px, width, height)
         return rays(pinhole).astype(np.float32) * self.depth[..., None]
@@ -69,12 +69,11 @@ class Alignment:
 def global_align(
     pairs: Path | str | PairPredictions, pixels: int = PIXELS, progress: Progress | None = None
 ) -> Alignment:
-    """Estimate cameras, focal length, depths and pair scales from pairwise pointmaps, or from their npz file.
+    """Estimate camera poses, focal length, depths and pair scales from pairwise pointmaps, or from their npz file.
 
-    `pixels` of each image are used. The principal point and the ratio fy / fx are those of the predictions' intrinsics;
-    without these they are the image's middle and 1. The focal length is that of the pointmaps.
-
-    Raises InputError for a file that cannot be used, for images that no chain of pairs joins, and for too few pixels;
+    `pixels` is the number of pixels used per image. The focal length is estimated from the pointmaps. The principal
+    point and the ratio fy / fx are those of the predictions' intrinsics; without these they are the image's middle and
+    1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and too few pixels;
     RejectedError where the pointmaps do not determine the cameras.
     """
     predictions = pairs if isinstance(pairs, PairPredictions) else read_pairs(Path(pairs))
@@ -86,7 +85,7 @@ def global_align(
 
 
 def _check_connected(predictions: PairPredictions) -> None:
-    """Raise InputError naming the images that no chain of pairs joins to the first."""
+    """Raise InputError with the names of images that no chain of pairs connects to the first pair's."""
     count, edges = predictions.image_count, predictions.edges
     if len(edges) == 0:
         raise InputError("the predictions have no pair; predict at least one")
@@ -100,7 +99,7 @@ def _check_connected(predictions: PairPredictions) -> None:
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the alignment of a solution in its own recon frame, with the depth of every pixel."""
+    """Return the alignment of a solution with the depth of every pixel."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

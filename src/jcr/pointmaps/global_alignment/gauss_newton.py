@@ -1,8 +1,9 @@
 """Global alignment by Gauss-Newton on a few thousand pixels per image (paper, eq. 1).
 
-The first view of a pair stands in its camera's own frame; the pair's pose P_e is its first camera's but for an error
-whose spread is estimated over all pairs. Depths and these errors are eliminated (Schur complement; Triggs et al.,
-"Bundle adjustment: a modern synthesis", 2000, section 6). Unknowns are steps of cameras, log focal and log pair scales.
+A pair's first view lies in its camera's own frame. Its second view is displaced by an error of the network, the pair's
+error, whose standard deviation is estimated over all pairs. Depths and pair errors are eliminated (Schur complement;
+Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6). The remaining unknowns are steps of camera
+poses, log focal length and log pair scales.
 """
 
 from dataclasses import dataclass, replace
@@ -28,64 +29,65 @@ from jcr.pointmaps.global_alignment.residuals import (
 )
 
 COARSE_PIXELS = 300
-"""Pixels per image of the first stage, which comes within the noise at a seventh of the cost."""
+"""Number of pixels per image in the first stage, whose error is within the noise at a seventh of the cost."""
 COARSE_TOLERANCE = 1e-3
 FINE_TOLERANCE = 1e-4
-"""Largest last step (rad, or relative), a tenth of the noise that predictions leave."""
+"""Largest last step (rad, or relative), a tenth of the noise of the predictions."""
 ITERATIONS = 30
 START_SPREAD = 0.01
-"""Initial spread of the pairs' errors, relative to the depth and in radians."""
+"""Initial standard deviation of the pairs' errors, relative to the depth and in radians."""
 LEAST_SPREAD = 1e-5
 GAUGE_WEIGHT = 1e3
-"""Weight of the fixed sum of the log pair scales, over the information of the pointmaps on one of them."""
+"""Weight that fixes the sum of the log pair scales, as a multiple of the mean information on one of them."""
 NORMAL_SQUARE_MEDIAN = 0.455
-"""Median of the square of a unit normal."""
+"""Median of the square of a standard normal variable."""
 
 UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentSolution:
-    """The result of Gauss-Newton."""
+    """Result of Gauss-Newton: state, covariance, and noise of the pointmaps."""
 
     state: AlignmentState
     covariance: Float[ndarray, "r r"]
-    """Covariance of the cameras' steps, r = 6n, from the equations of the last step; zero for the first camera."""
+    """Covariance of the camera poses' steps, r = 6n, at the last step; zero for the first camera."""
     images: list[ImageObservations]
     noise: list[ResidualSpread]
-    """Noise of the pointmaps of each image."""
+    """Spread of the residuals of each image's pointmaps."""
     pair_spread: Float[ndarray, "6"]
-    """Standard deviation per axis of the pairs' errors: translation, rotation."""
+    """Standard deviations of the pairs' errors: three of the translation, three of the rotation."""
     settled: bool
-    """Whether the last step was small enough."""
+    """True if the last step was smaller than the tolerance."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageEquations:
-    """Equations of one image without its depths and its pairs' errors, and what gives their steps.
+    """Gauss-Newton equations of one image after elimination of its depths and pair errors, and the terms of their steps.
 
-    Local unknowns are relative twists, pair scales and the focal. Twists are those of geometry.twist_from_step: points
-    of an image move with its camera, so that only the difference of the twists of image and observer shows.
+    The c local unknowns are one twist per second view (camera relative to observer), the log scales of the pairs, and
+    the log focal length. Twists are those of geometry.twist_from_step. Only the difference of the twists of camera and
+    observer changes a residual.
     """
 
     hessian: Float[ndarray, "c c"]
     gradient: Float[ndarray, " c"]
     selection: csr_array
-    """Matrix from a step of all unknowns to the local unknowns."""
+    """Matrix from a step of all unknowns to a step of the local unknowns."""
     gain: Float[ndarray, "t c"]
     offset: Float[ndarray, " t"]
-    """The pairs' errors (recon axes) step by gain · step + offset."""
+    """Constant of the step of the pairs' errors (recon axes), gain · (local step) + offset."""
     axes: Float[ndarray, "n 6 6"]
-    """Adjoint of the observers: twists in recon axes to twists in theirs."""
+    """Adjoint of each observer: maps twists in recon axes to twists in the observer's axes."""
     error_variance: Float[ndarray, "n 6"]
-    """Variances of the pairs' errors where the cameras are given, in the observers' axes."""
+    """Variances of the pairs' errors given the cameras, in the observers' axes."""
     depth_hessian: Float[ndarray, " m"]
     depth_gradient: Float[ndarray, " m"]
     coupling: Float[ndarray, "c m"]
 
 
 def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
-    """Estimate cameras, focal length, pair scales and the depths of about `pixels` pixels per image."""
+    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image."""
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
@@ -100,11 +102,11 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
 def gauss_newton(
     images: list[ImageObservations], state: AlignmentState, pair_spread: Float[ndarray, "6"], tolerance: float
 ) -> AlignmentSolution:
-    """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
+    """Solve for cameras, focal length, pair scales and depths by Gauss-Newton until no step exceeds `tolerance`.
 
-    The weights, and the spread of the pairs' errors, are measured again in each iteration, and depths and pairs' errors
-    eliminated: neither is a problem for least_squares.py. The first camera and the product of the pair scales are fixed.
-    Raises RejectedError where the pointmaps do not determine the unknowns.
+    The tolerance is in rad, or relative. Each iteration measures the weights and the spread of the pairs' errors again
+    and eliminates depths and pair errors, which least_squares.py does not support. The first camera and the product of
+    the pair scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
     """
     focal = 6 * len(images)
     for iteration in range(1, ITERATIONS + 1):
@@ -154,7 +156,7 @@ def _after_step(
     equations: list[ImageEquations],
     step: Float[ndarray, " p"],
 ) -> tuple[AlignmentState, Float[ndarray, "e 6"]]:
-    """Return the state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
+    """Return the state after a step of the unknowns that were not eliminated, and the variances of the pairs' errors."""
     log_depth, pair_error = [], state.pair_error.copy()
     variance = np.zeros_like(pair_error)
     for o, before, e in zip(images, state.log_depth, equations, strict=True):
@@ -182,10 +184,11 @@ def _after_step(
 def _spread(
     error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
 ) -> Float[ndarray, "6"]:
-    """Estimate the spread of the pairs' translations and rotations from the errors under the spread `before`.
+    """Estimate the standard deviations of the pairs' errors from these errors and their variances.
 
-    The evidence fixed point σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30),
-    with medians in place of the sums: pairs that are altogether wrong do not count.
+    `before` are the standard deviations under which the errors were estimated. The update is the evidence fixed point σ²
+    = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians in place of the sums, so
+    that entirely wrong pairs do not count.
     """
     determined = 1.0 - np.median((variance / before**2).reshape(-1, 2, 3), axis=(0, 2))
     squared = np.median((error**2).reshape(-1, 2, 3), axis=(0, 2)) / NORMAL_SQUARE_MEDIAN
@@ -199,11 +202,10 @@ def image_equations(
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> ImageEquations:
-    """Return the Gauss-Newton equations of one image's pointmaps with residuals `r` of spread `noise`.
+    """Return the Gauss-Newton equations of one image's pointmaps, with residuals `r` and their spread `noise`.
 
-    With v the change of a modelled point, the change of (across, along) has the squared norm
-    vᵀ (α I + β x̂ x̂ᵀ) v, α = w_across/|x|², β = w_along/|x|² − α. Raises LinAlgError where the errors of the pairs cannot
-    be eliminated.
+    If v is the change of a modelled point, the weighted squared change of (across, along) is vᵀ (α I + β x̂ x̂ᵀ) v, with
+    α = w_across/|x|² and β = w_along/|x|² − α. Raises LinAlgError where the pairs' errors cannot be eliminated.
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
     # Of mean 1, so that the hessian is the information in the pointmaps.
@@ -256,7 +258,10 @@ def _eliminated(
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> dict[str, ndarray]:
-    """Return the equations without the errors of the pairs, whose twists come first, and what gives their steps."""
+    """Return the equations after elimination of the pairs' errors, and the terms that give the steps of these errors.
+
+    The twists of the second views come first in the rows and columns of `hessian`.
+    """
     n, count = o.second_count, 6 * o.second_count
     axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))
     twists = np.arange(count).reshape(n, 6)
@@ -277,7 +282,7 @@ def _eliminated(
 
 
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
-    """Return the matrix from a step of all unknowns to the local unknowns of an image's equations."""
+    """Return the matrix from a step of all unknowns to a step of the local unknowns of an image's equations."""
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)

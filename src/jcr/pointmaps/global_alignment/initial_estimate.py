@@ -12,7 +12,10 @@ from jcr.pointmaps.global_alignment.residuals import AlignmentState
 
 
 def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> AlignmentState:
-    """Estimate the state to a few per cent: every image's own depth, chained along the pairs that agree best."""
+    """Estimate the state to a few per cent: depths from each image's first views, cameras along the best-agreeing pairs.
+
+    `edges` are the image rows (first, second) of each pair.
+    """
     focal = _focal(images)
     depth, unit = [], np.zeros(len(edges))
     first_from_second, log_ratio, cost = (
@@ -44,9 +47,9 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
 
 
 def _focal(images: list[ImageObservations]) -> float:
-    """Estimate fx: the median over the first views of pixel radius over tangent of the angle off the axis.
+    """Estimate fx as the median, over the first views, of pixel radius / tangent of the angle off the optical axis.
 
-    Raises RejectedError where no first view shows it.
+    Raises RejectedError where no first view has points in front of its camera.
     """
     ratios = []
     for o in images:
@@ -62,9 +65,10 @@ def _focal(images: list[ImageObservations]) -> float:
 
 
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:
-    """Return the median depth of each pixel over the pairs whose first image this is, and the log scale of each pair.
+    """Return the depth of each pixel in the image's own unit, and the log scale of each pair that has the image first.
 
-    An image that is first in no pair has its depth by resection from the view with most inliers.
+    The depth is the median over these pairs. Without such a pair, it comes from resection by the second view with most
+    inliers.
     """
     if len(o.pair) > o.second_count:
         forward = np.maximum(o.direction[o.second_count :, 2], 1e-6).astype(np.float64)
@@ -89,10 +93,10 @@ def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"]
 def _similarities(
     o: ImageObservations, focal: float, depth: Float[ndarray, " m"], unit: Float[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"], Float[ndarray, " n"]]:
-    """Register an image's own points to its second views (Umeyama 1991, weights by Geman-McClure).
+    """Register an image's own points to its second views (Umeyama 1991, with Geman-McClure weights).
 
-    Returns first_from_second, the log of the ratio of the second image's unit to the first's, and the median distance
-    after the fit, relative to the distance of the points. `unit` are the log units of the pairs.
+    Returns first_from_second, the log ratio of the second image's unit to the first's, and the median residual relative
+    to the distance of the points. `unit` are the log units of the pairs.
     """
     n = o.second_count
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth
@@ -111,10 +115,10 @@ def _similarities(
 def _contradiction(
     edges: Int[ndarray, "e 2"], first_from_second: Float[ndarray, "e 3 3"], images: int
 ) -> Float[ndarray, " e"]:
-    """Return the angle of each pair's rotation from the composition over a third image (rad); 0 where there is none.
+    """Return the angle (rad) of each pair's rotation from compositions over a third image; 0 without a third image.
 
-    A pair whose two pointmaps fit each other but not the scene is seen by nothing else. Of all ways around,
-    the first quartile counts: with a third of the pairs wrong, most ways around a right one are wrong too.
+    It detects a pair whose two pointmaps fit each other but not the scene. The result is the first quartile over the
+    third images: if a third of the pairs are wrong, so are most compositions around a correct pair.
     """
     rotation = np.full((images, images, 3, 3), np.nan)
     first, second = edges.T
@@ -134,7 +138,10 @@ def _chain(
     log_ratio: Float[ndarray, " e"],
     cost: Float[ndarray, " e"],
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"]]:
-    """Chain cameras and log units of the images along the minimum spanning tree (Prim) from image 0."""
+    """Return recon_from_camera and log unit of each image, chained along the minimum spanning tree (Prim) from image 0.
+
+    `log_ratio` is the log of the second image's unit over the first's; `cost` is the weight of a pair in the tree.
+    """
     count = int(edges.max()) + 1
     recon_from_camera, log_scale = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count)
     reached = np.arange(count) == 0

@@ -10,26 +10,27 @@ from jcr.errors import InputError
 from jcr.pointmaps.pairs import PairPredictions
 
 CELL_SIDE = 4
-"""Residuals are correlated over an image; their cell means on a 4x4 grid measure by how much."""
+"""Number of cells along each side of the image; residuals are correlated over an image, and their cell means measure by
+how much."""
 POOR = 0.2
-"""Share of a good pixel's weight below which a cell's best pixel is left out."""
+"""Least weight of a cell's best pixel, relative to the 90 % quantile over the cells; a cell below it is left out."""
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Predictions with the fixed parameters of their alignment."""
+    """Pairwise predictions with the fixed parameters of their alignment."""
 
     predictions: PairPredictions
     principal_point_px: tuple[float, float]
-    """x, y on the pointmaps' grid, pixel (0, 0) being a centre."""
+    """Principal point x, y on the pointmaps' grid; pixel (0, 0) is the centre of the top-left pixel."""
     aspect: float
     """Ratio fy / fx."""
     log_weight: bool
-    """Whether confidences follow DUSt3R, from 1 up with weight log C; else they are weights."""
+    """True if confidences C are at least 1 as in DUSt3R, with weight log C; otherwise they are weights."""
 
     @classmethod
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
-        """Return the problem of some predictions; the principal point is the middle without their intrinsics."""
+        """Return the problem of the predictions; without intrinsics, the principal point is the middle of the grid."""
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
         middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)
@@ -41,39 +42,39 @@ class AlignmentProblem:
         return np.log(np.maximum(confidence, 1.0)) if self.log_weight else confidence
 
     def observe_all(self, count: int) -> "list[ImageObservations]":
-        """Gather all pointmaps at about `count` pixels of every image."""
+        """Return the pointmaps of all pairs at about `count` pixels of every image."""
         return [observe(self, k, pixels) for k, pixels in enumerate(_choose_pixels(self, count))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageObservations:
-    """Pointmaps of one image, seen from the cameras of other images (`second` views) and from its own.
+    """Pointmaps of one image at m pixels, in k pairs: predicted in other cameras' frames (`second` views) or its own.
 
-    The `k` pointmaps come second views first. Components run before pixels, float32, for speed.
+    The second views come first among the k pointmaps. Arrays are float32 with pixels as the last axis, for speed.
     """
 
     image: int
     second_count: int
     """Number of second views."""
     pixel_offset: Float[ndarray, "2 m"]
-    """x, y minus the principal point, y divided by fy/fx: over fx they are the ray at unit depth."""
+    """Pixel x, y minus the principal point, with y divided by fy/fx; divided by fx it is the ray at unit depth."""
     cell: Float[ndarray, "m c"]
-    """1 where pixel m lies in coarse cell c."""
+    """Indicator: 1 where pixel m lies in coarse cell c, else 0."""
     pair: Int[ndarray, " k"]
     observer: Int[ndarray, " k"]
-    """The image in whose camera frame the pointmap is."""
+    """Image in whose camera frame each pointmap is."""
     direction: Float[ndarray, "k 3 m"]
-    """Unit vectors to the predicted points, in the observer's camera frame."""
+    """Unit vectors from the observer to the predicted points, in the observer's camera frame."""
     log_range: Float[ndarray, "k m"]
-    """Log of the points' distance to the observer, in the pair's unit."""
+    """Log of the points' distance from the observer, in the pair's unit."""
     weight: Float[ndarray, "k m"]
 
 
 def _choose_pixels(problem: AlignmentProblem, count: int) -> list[Int[ndarray, " _"]]:
-    """Choose per image the most confident pixel of each of about `count` equal cells; return flat indices.
+    """Choose in each image the most confident pixel of each of about `count` equal cells; return flat indices.
 
-    Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
-    a pixel worth having (sky) are left out. Raises InputError for an image without any confidence.
+    Equal cells cover the whole field of view, which a ranking by confidence alone would not. Cells without a confident
+    pixel (sky) are left out. Raises InputError for an image without any confidence.
     """
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
@@ -103,7 +104,7 @@ def _choose_pixels(problem: AlignmentProblem, count: int) -> list[Int[ndarray, "
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-    """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
+    """Return the pointmaps of all pairs at `pixels` (flat indices) of one image."""
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))

@@ -1,11 +1,9 @@
-"""Residuals of pairwise pointmaps against a reconstruction, their weights, and the depth that they give each pixel.
+"""Residuals of pairwise pointmaps against a reconstruction, their weights, and the depth fitted to each pixel.
 
-Networks predict directions several times better than distances, so that each residual has two parts,
-
-    across = n − (n·x̂) x̂        along = log|x| − log|q| − log σ_e
-
-(x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction). Their variances
-are estimated from the residuals: per pointmap by their median, per kind of view by the correlation of neighbours.
+Networks predict directions several times better than distances, so that each residual has two parts, across = n − (n·x̂)
+x̂ and along = log|x| − log|q| − log σ_e. Here x is the modelled point relative to the observer and x̂ its direction; q
+is the predicted point, n its direction, and σ_e the pair's scale. The variances are estimated from the residuals: per
+pointmap by their median, per kind of view by the correlation of neighbouring residuals.
 """
 
 from dataclasses import dataclass
@@ -20,58 +18,58 @@ from jcr.pointmaps.global_alignment.observations import CELL_SIDE, ImageObservat
 ROBUST_WIDTH = 3.0
 """Standard deviations at which a residual's weight has fallen to a quarter (Geman-McClure)."""
 LEAST_NOISE = np.float32(1e-4)
-"""Least standard deviation; far below it the rounding of float32 sums would count as evidence."""
+"""Least standard deviation; far below it, rounding of float32 sums would count as information."""
 DEPTH_ITERATIONS = 2
-"""The initial median is within two per cent of the result."""
+"""Number of iterations of the depth fit; the initial median is within two per cent of the result."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentState:
-    """Unknowns of the alignment."""
+    """Unknowns of the alignment: camera poses, focal length, pair scales, pair errors and depths."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     log_focal: float
-    """Log of fx, px."""
+    """Log of fx in px."""
     log_pair_scale: Float[ndarray, " e"]
     pair_error: Float[ndarray, "e 6"]
-    """Twist (v, ω), in the axes of a pair's first camera, by which the network misplaced its second view."""
+    """Twist (v, ω) by which the network misplaced a pair's second view, in axes of the pair's first camera."""
     log_depth: list[Float[ndarray, " _"]]
-    """Log depths of the observed pixels of each image."""
+    """Log depths of the observed pixels of each image, recon units."""
 
 
 @dataclass(frozen=True)
 class ResidualSpread:
-    """Spread of the residuals of some pointmaps, `across` (rad per axis) and `along` (relative) the sight."""
+    """Standard deviations of the residuals of k pointmaps, across (rad per axis) and along (relative) the sight."""
 
     across: Float[ndarray, " k"]
     along: Float[ndarray, " k"]
     across_inflation: Float[ndarray, " k"]
-    """Factor by which neighbouring residuals going together widen the variance of their mean, at least 1."""
+    """Factor, at least 1, by which the correlation of neighbouring residuals increases the variance of their mean."""
     along_inflation: Float[ndarray, " k"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """The two parts of the residuals of one image's pointmaps, and the geometry they hang on (recon axes)."""
+    """Residuals of one image's pointmaps, across and along the line of sight, and their geometry in recon axes."""
 
     x_in_recon: Float[ndarray, "3 m"]
     depth_arm: Float[ndarray, "3 m"]
-    """Change of the modelled points per change of log depth: from the image's camera centre to them."""
+    """Derivative of the modelled points by log depth: the vector from the image's camera centre to the point."""
     focal_arm: Float[ndarray, "3 m"]
-    """Change of the modelled points per change of log focal: toward the optical axis at constant depth."""
+    """Derivative of the modelled points by log focal length: towards the optical axis at constant depth."""
     toward: Float[ndarray, "k 3 m"]
-    """Unit vectors from the observer to the modelled points, x̂."""
+    """Unit vectors x̂ from the observer to the modelled points."""
     distance: Float[ndarray, "k m"]
     across: Float[ndarray, "k 3 m"]
     across_squared: Float[ndarray, "k m"]
-    """Squared chord between the directions: grows up to a rotation by 180°, as |across| does not."""
+    """Squared chord between predicted and modelled direction; unlike |across|, it grows up to an angle of 180°."""
     along: Float[ndarray, "k m"]
 
 
 def depth_residuals(
     o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]
 ) -> Residuals:
-    """Model one image's points at `log_depth` and compare them with every pointmap that shows them."""
+    """Return the residuals of one image's points at `log_depth` in all pointmaps that contain the image."""
     camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
     error = state.pair_error[o.pair]
     error[o.second_count :] = 0
@@ -108,9 +106,10 @@ def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray,
 
 
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[ResidualSpread]:
-    """Estimate the noise of every pointmap, per image: its own spreads and the inflations of its kind of view.
+    """Estimate the spread of the residuals of every pointmap of each image.
 
-    A spread is at least a third of the usual one of its kind, so that no pair outweighs all others by a lucky fit.
+    The standard deviations are the pointmap's own, but at least a third of the median of its kind of view (first or
+    second), so that no pair dominates by a lucky fit. The inflations are the median of the kind of view.
     """
     own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
     is_second = [np.arange(len(o.pair)) < o.second_count for o in images]
@@ -124,7 +123,7 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
 
 
 def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
-    """Estimate spreads per pointmap from medians, and inflations from the agreement within cells; fields of Noise."""
+    """Return standard deviations of each pointmap by medians, inflations by cell means; rows as in ResidualSpread."""
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
     weight = o.weight * geman_mcclure_weights(r, ResidualSpread(across, along, across, along))
@@ -146,7 +145,7 @@ def _inflation(
 
 
 def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray, " m"]:
-    """Return the median over the pairs of the predicted depth, of first views alone where the image has any."""
+    """Return the median of the predicted depth over the image's first views, or over all views if it has none."""
     n, camera = o.second_count, state.recon_from_camera[o.image]
     scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
     if n < len(o.pair):
@@ -161,9 +160,9 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
 def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`, and their mean weight.
+    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`; return it with a mean weight.
 
-    Every pointmap is independent and counts by its agreement and its noise.
+    The pointmaps count as independent, weighted by agreement and noise.
     """
     log_depth, weight = np.log(initial_depth(o, state)), o.weight
     for _ in range(DEPTH_ITERATIONS):
