@@ -234,7 +234,7 @@ def _single_tags(
         if ids is None:
             return []
         numbers, counts = np.unique(ids, return_counts=True)
-        # Two tags of one number are no landmark: which is which?
+        # Two tags with one number cannot be distinguished.
         twice = set(numbers[counts > 1].tolist())
         return [
             Sighting(int(number), (0, 1, 2, 3), corners, x_px.reshape(4, 2).astype(np.float64) - HALF_PIXEL)

@@ -67,7 +67,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
             sizes.append(tuple(sorted(meta.shape[:2], reverse=True)))
     if len(sizes) < FEWEST:
         return None
-    # Where the border of a board leaves the frame, it is found smaller.
+    # A board that is partly outside of the image is detected as smaller.
     across, down = max(set(sizes), key=lambda size: (sizes.count(size), size))
     return f"chessboard:{across}x{down}:SIDE"
 

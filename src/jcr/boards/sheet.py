@@ -40,7 +40,7 @@ def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
     kind, *parts = spec.split(":")
     if kind not in ("charuco", "chessboard"):
         raise InputError(f"jcr board {spec}: prints charuco:… and chessboard:…; choose one of these")
-    inner = int(kind == "chessboard")  # which is named by its inner corners
+    inner = int(kind == "chessboard")  # a chessboard is named by its inner corners
     across, down = (int(text) + inner for text in parts[0].split("x"))
     square_mm = 1e3 * float(parts[1])
     width, height, page = square_mm * across, square_mm * down, PAPERS_MM[paper]

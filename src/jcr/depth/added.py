@@ -123,14 +123,14 @@ def _contradicted(
         u, v, z, inside = _pixels(apply(other_from_recon, points_in_recon[row][known[row]]), pinhole)
         return v, u, inside & (z < (1 - CONTRADICTION) * nearest[v, u])
 
-    # Seen through: the later view's surface lies behind the point, all around its pixel.
+    # The later view sees through the point: its surface lies behind the point, at all pixels around.
     gone = np.zeros(known[earlier].shape, bool)
     gone[known[earlier]] = before(earlier, later)[2]
-    # In the way: points of the later view lie before the earlier one's surface, all around their pixel.
+    # Points of the later view lie in front of the earlier view's surface, at all pixels around.
     v, u, in_the_way = before(later, earlier)
     hits = np.zeros(gone.shape, np.float32)
     np.add.at(hits, (v[in_the_way], u[in_the_way]), 1.0)
-    # The later view's points may be sparser than the earlier's pixels, but one alone proves nothing.
+    # Two such points among 3x3 pixels suffice: the later view may be coarser, but a single point may be noise.
     return (gone | (cv2.blur(hits, (3, 3), borderType=cv2.BORDER_CONSTANT) * 9 >= 2)) & known[earlier]
 
 

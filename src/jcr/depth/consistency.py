@@ -165,7 +165,7 @@ def _compare_depths(typing, sums, compared, place, rays, rest):
         centre, tolerance = _numbers(builder, given[4])
         there = z * depth
         agrees = inside & (depth > 0.0) & (abs(there - here) < tolerance * here)
-        # The point moves along the other's ray until it has the other's depth; its z here follows.
+        # Inverse depth in image i of the point that has the other image's depth on the other image's ray.
         moved = there / (centre * there - centre * here + 1.0)
         through = inside & sees & (there < here * (1.0 - SEEN_THROUGH))
         dx, dy = ((rows[n][2] - at * rows[2][2]) / z for n, at in enumerate((x, y)))

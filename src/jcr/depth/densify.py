@@ -38,7 +38,7 @@ def densify(
         return reconstruction
     options = options or DepthOptions()
     names = np.array([capture.images[row] for row in reconstruction.image_index])
-    order = np.argsort(names, kind="stable")  # so that the order of the frames changes nothing
+    order = np.argsort(names, kind="stable")  # the result does not depend on the order of the images
     place = np.argsort(order)
     cameras = reconstruction.recon_from_camera[order]
     tracks = replace(reconstruction.tracks, image=place[reconstruction.tracks.image])
@@ -168,7 +168,7 @@ def dense_pointmaps(
         threads=threads,
         report=lambda done: report("dense depth", 0.7 + 0.3 * done),
     )
-    # In the precision of depth.npz, so that a run that reads the file gives the same map.
+    # Values are rounded as in depth.npz, so that a run that reads the file gives the same map.
     depth = (1 / inverse_depth.astype(np.float64)).astype(np.float32)
     precise = depth, std.astype(np.float16), confidence.astype(np.float16)
     return pointmaps_of(*precise, reason, colors, recon_from_camera, pinhole)

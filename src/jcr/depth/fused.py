@@ -88,7 +88,7 @@ def fused_depth(
         there = matched | filled
         _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
         filled &= (count >= np.minimum(needed, agreeing)) & (count > 2 * through)
-        # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it shows that.
+        # Beside outlines, two images may agree on the nearer depth; a third image that sees the plane contradicts it.
         through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
         matched &= both | (through == 0)
         report(1.0)

@@ -72,7 +72,7 @@ class _Level:
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
-        k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
+        k = tuple(grid(self.pinhole))  # a tuple, which the loops keep in registers
         return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
@@ -132,7 +132,7 @@ def match_depth(
         try:
             return match(i, space)
         finally:
-            spaces.put(space)  # after an error too, or the other threads wait for the buffer without end
+            spaces.put(space)  # after an error too, or other threads would wait for the buffer forever
 
     results = []
     with ThreadPoolExecutor(threads) as pool:

@@ -113,7 +113,7 @@ def evened(
     found = np.zeros(m + 1)
     for _ in range(8 if len(rows) else 0):
         weight = 1 / np.maximum(np.abs(right - design @ found), 0.02)
-        # The overall exposure is free, and nothing is known of an image that no other shows.
+        # The small term fixes the overall exposure, and images that share no point with others.
         normal = (design * weight[:, None]).T @ design + 1e-3 * weight.mean() * np.eye(m + 1)
         found = np.linalg.solve(normal, (design * weight[:, None]).T @ right)
     return np.stack(
@@ -141,16 +141,16 @@ def planar_prior(
     """
     k, (depths, colors) = grid(pinhole), surfaces
     label, count = colour_regions(colors[i])
-    # The support plane as p with p·x = 1 in the camera; 0 where it runs through the camera.
+    # The support plane as p with p·x = 1 in the camera frame; 0 if it contains the camera centre.
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -recon_from_camera[:3, :3].T @ support[:3] / offset if offset else np.zeros(3)
     planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
         label, count, inverse_depth, matched, rays(pinhole), plane, ON_PLANE, i
     )
     pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1) - middle[label]
-    # Mahalanobis distance from the pixels that carry the region's plane.
+    # Mahalanobis distance from the pixels that support the region's plane.
     away = np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", pixel, shape[label], pixel), 0))
-    # Patches of shade and print on the support plane that carry no plane of their own.
+    # Shadows and prints on the support plane are small regions without a plane of their own.
     size = np.bincount(label.ravel(), minlength=count)
     lonely = _beside(label, on_support) & (inliers == 0) & (fixed < FEWEST) & (size < PATCH * label.size)
     planes[lonely] = plane
@@ -161,10 +161,10 @@ def planar_prior(
     points = np.where(asked, predicted, np.float32(0))
     same, unlike, through = colours_agree(i, points, depths, colors, *view, k, SAME_COLOUR)
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
-    # Where one image alone looks besides this one, it must agree, and the depth must rest on more than a colour.
+    # Where only one other image sees the point, it must agree, and a match or the support plane must confirm it.
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)
     holds |= alone & on_support[label]
-    # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
+    # On top of an object the plane would lie too low, and colours would differ along its outline in other views.
     holds &= ~(lonely & (np.bincount(label.ravel(), holds.ravel()) / size < WHOLE))[label]
     wrong = asked & (inliers >= STRONG * fixed)[label] & (np.abs(predicted / inverse_depth - 1) > OFF_PLANE)
     std = rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))

@@ -36,7 +36,7 @@ def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"],
     index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
     second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
-    # Numbers of 16 bits are sorted in a fifth of the time.
+    # Sorting 16-bit numbers takes a fifth of the time.
     order = np.argsort((65535 * weight.clip(0, 1)).astype(np.uint16), kind="stable")
     root = _joined(first[order], second[order], weight[order], h * w)
     is_root = root == np.arange(h * w)

@@ -158,7 +158,7 @@ def _common_rotation(
         return None
     gripper = np.stack([motion[key][:3, :3] for key in keys])
     camera = np.stack([reading.rotation for _, reading, _ in passing])
-    # A wrong angle that passed by chance has an axis of its own; readings of one pair share its one vote.
+    # A wrong motion that passed by chance has another axis. Motions of one pair count as one agreeing pair.
     found = rotation_of_x(gripper, camera, np.array([1.5 * tolerance for _, _, tolerance in passing]))
     if found is None or np.linalg.eigvalsh(found.covariance)[-1] > SURE_STD**2:
         return None
@@ -183,7 +183,7 @@ def rotation_of_x(
     order = order[across[order] > 0.02]
     if not len(order):
         return None
-    if len(order) > MAX_HYPOTHESES:  # spread over good and less good: the best may all be of one wrong pair
+    if len(order) > MAX_HYPOTHESES:  # evenly over the ranking: the best ones may all contain one wrong pair
         order = order[np.linspace(0, len(order) - 1, MAX_HYPOTHESES).astype(int)]
     a, b = (np.stack([of[first[order]], of[second[order]]], 2) for of in (axis_a, axis_b))
     a, b = (np.concatenate([of, np.cross(of[..., 0], of[..., 1])[..., None]], 2) for of in (a, b))
@@ -203,7 +203,7 @@ def rotation_of_x(
         agreeing = size < tolerance
         if agreeing.sum() < 3:
             return None
-        # rotated → exp(w) rotated exp(-w): the residual, in the axes after rotated, changes by (rotatedᵀ − I) w.
+        # A step w of R_X changes `rotated` to exp(w) rotated exp(-w), and the residual by (rotatedᵀ − I) w.
         jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
         w = np.where(agreeing, 1 / (1 + (2 * size / tolerance) ** 2), 0.0)
         information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
@@ -239,9 +239,9 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
     relative = np.stack([x, np.cross(z, x), z]) @ base_from_camera
-    # Of a quaternion: 2 atan2(q_z, q_w), which is atan2 of twice these (Shepperd 1978).
+    # The twist of a quaternion is 2 atan2(q_z, q_w), which equals this expression (Shepperd 1978).
     twist = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-    # Most images as they are, for rotating costs sharpness.
+    # Most images keep their orientation, because rotation costs sharpness.
     common = np.cos(twist[:, None] - twist)
     return twist - twist[int(np.argmax(np.maximum(common - 0.9, 0).sum(1)))]
 

@@ -185,12 +185,12 @@ def matched(
         return None
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
-    # With COLMAP's own (0.25, 3, 0.999, 10000) it takes four times as long and finds 1 % more inliers.
+    # COLMAP's defaults (0.25, 3, 0.999, 10000) take four times as long and find 1 % more inliers.
     options.ransac.min_inlier_ratio = max(0.25, MIN_INLIERS / len(rows))
     options.ransac.dyn_num_trials_multiplier = 1.0
     options.ransac.confidence, options.ransac.max_num_trials = 0.99, 2000
     options.min_num_inliers = MIN_INLIERS
-    if known:  # a fundamental matrix bends itself to wrong matches, which an essential matrix cannot explain
+    if known:  # a fundamental matrix may fit wrong matches that no essential matrix fits
         options.min_E_F_inlier_ratio = 0.0
     x_i, x_j = (x_px[row] + HALF_PIXEL for row in key)
     found = pycolmap.estimate_two_view_geometry(camera, x_i, camera, x_j, rows.astype(np.uint32), options)

@@ -80,7 +80,7 @@ def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n
         x_px = project(view.intrinsics, x_in_camera[shown])
         shown[shown] = ((x_px > -0.5) & (x_px < size)).all(1)
         inside.append(shown)
-    counted = np.array(inside, np.float32)  # of 200 images 10⁷ numbers
+    counted = np.array(inside, np.float32)  # 10⁷ numbers for 200 images
     share = counted @ counted.T / np.maximum(counted.sum(1), 1)[:, None]
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))

@@ -45,7 +45,7 @@ def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[
     points, descriptors = sift.detectAndCompute(grey, None)
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
+    # The Hellinger distance replaces the Euclidean one (RootSIFT, Arandjelović and Zisserman 2012).
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
     return np.array([point.pt for point in points]), root
 
@@ -61,7 +61,7 @@ def matches(
     largest = cosine[row, best]
     mutual = largest == cosine.max(0)[best]  # argmax along columns takes 2.4 times as long
     cosine[row, best] = -1.0
-    # Distances of unit vectors.
+    # Distances of unit vectors from their cosines.
     nearest, next_nearest = (np.sqrt(np.maximum(2 - 2 * of, 0)) for of in (largest, cosine.max(1)))
     kept = np.flatnonzero(mutual & (nearest < FARTHEST) & (nearest < RATIO * next_nearest))
     return kept, best[kept]

@@ -105,7 +105,7 @@ class _Search:
         if not todo:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats)
-        if self.matcher.features.minds_roll:  # an image that is rotated brings keypoints of its own
+        if self.matcher.features.minds_roll:  # rotated images have added keypoints
             self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             if self._is_better(pair := self.matcher.pair(self.view, key, geometry)):
@@ -153,7 +153,7 @@ class _Search:
             return True
         old, angle = self.pairs[new.key][0], float(rotation_angle(self.motion[new.key][:3, :3]))
         first, second = (bool(agreeing_readings(pair, angle, self.systematic)) for pair in (new, old))
-        # The later one is of images rotated upright, whose keypoints all pairs share.
+        # The later geometry is preferred: its images are rotated upright, so that all pairs share their keypoints.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def gate(self) -> Gate:
@@ -255,12 +255,15 @@ def match_with_robot(
 def _believed(
     search: _Search, found: Gate, names: Sequence[str]
 ) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
-    """Return the pairs that the robot poses do not contradict, with notes and warnings about the others."""
+    """Return the pairs to be mapped, with notes and warnings about the others.
+
+    These are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
+    """
     notes, warnings = tuple[str, ...](), tuple[str, ...]()
     stale = _contradicted_by_all(found, search.motion)
     believed = {pair.key for pair in found.confirmed}
     believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
-    # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
+    # With given intrinsics, undecided pairs are dropped: nothing confirms their matches.
     believed |= set() if search.matcher.known else {pair.key for pair in found.undecided}
     count, total = len(found.contradicted), len(found.contradicted) + len(found.confirmed)
     if count > WORTH_SAYING * total:
@@ -283,7 +286,7 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
     confirmed = {row for pair in found.confirmed for row in pair.key}
     stale = set()
     for row in {row for pair in found.contradicted for row in pair.key} - confirmed:
-        # By how much the gripper would have to be rotated for each pair; sound pairs ask for the same.
+        # Rotation of the gripper pose that would make each pair agree; correct pairs need the same rotation.
         corrections = []
         for pair in found.contradicted:
             if row in pair.key and (set(pair.key) - {row}) & confirmed:

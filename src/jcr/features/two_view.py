@@ -38,7 +38,7 @@ class TwoViewMotion:
     def angle_std(self) -> float:
         """Return the standard deviation of the angle of rotation, rad."""
         covariance = self.covariance[:3, :3]
-        if np.trace(self.rotation) > 2.999999:  # of no rotation the axis is any
+        if np.trace(self.rotation) > 2.999999:  # without rotation the axis is undefined
             return float(np.sqrt(np.trace(covariance) / 3))
         values, vectors = np.linalg.eigh(self.rotation + self.rotation.T)
         axis = vectors[:, int(np.argmax(values))]
@@ -161,7 +161,7 @@ def _least_squares_motion(
             tolerance=ENOUGH,
         )
         at, normal = found.unknowns, found.normal
-    # Matches of one detector share errors with their neighbours: no more than a hundred count as independent.
+    # Errors of neighbouring matches are correlated: at most a hundred matches count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
     covariance = np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5))
     return TwoViewMotion(*at, covariance, sigma)

@@ -65,7 +65,7 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
         ),
     )
     network.load_state_dict(read_weights("xfeat.pt"))
-    # The file holds XFeat as well; the thresholds are constants that the module computes itself.
+    # The file contains XFeat, too; the thresholds are constants that the module computes itself.
     of_matcher = {
         name.removeprefix("matcher."): value
         for name, value in read_weights("xfeat-lighterglue.pt").items()
@@ -243,5 +243,5 @@ def _prepared(
 
 def _one_thread() -> None:
     """Limit torch to one thread within this thread; several would wait for each other after every operation."""
-    torch.get_num_threads()  # Torch sets the number of a thread when it is first used there, and not again.
+    torch.get_num_threads()  # Torch sets its number of threads at its first use in a thread, which this call triggers.
     threadpool_limits(1, user_api="openmp")

@@ -205,7 +205,7 @@ def in_view(
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
     x += camera_from_base[:, None, :3, 3]
-    # No point is projected from nearer than NEAREST.
+    # Depths below NEAREST are clipped before projection.
     ahead = np.concatenate([x[..., :2], np.maximum(x[..., 2:], np.float32(NEAREST))], -1)
     u, v = np.moveaxis(project(zoomed(level.grid, cameras.zoom), ahead), -1, 0)
     seen = (x[..., 2] > NEAREST) & (u >= 0) & (u <= level.grid.width - 1)
@@ -275,7 +275,7 @@ def equations(
                 a[i, ..., 6 * i : 6 * i + 6] = by_target[i]
                 a[i, at, :, of_host] += by_host[i].swapaxes(1, 2)
             a[..., -1] = by_focal
-        # One point's rows together.
+        # Reorder to one block of 3n rows per point.
         a, q, r = (x.swapaxes(0, 1).reshape(len(x[0]), 3 * n, -1) for x in (a, by_log_depth, residual))
         b = (a * q).sum(1).astype(np.float64)
         flat = a.reshape(-1, p)
@@ -309,7 +309,7 @@ def _linearised(
         x, u, v, seen = in_view(level, cameras, some)
         residual, by_u, by_v = (_sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
         residual = residual - some.color
-        # Geman and McClure's weight.
+        # Weight of the Geman-McClure loss.
         weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
         root = np.sqrt(weight, dtype=np.float32)[..., None]
         x_in_host = _in_host(level, cameras, some).astype(np.float32)

@@ -89,7 +89,7 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
 
     They are rotations about the common viewing direction, and tilts of it.
     """
-    # Directions evenly over the sphere (Fibonacci's spiral).
+    # Directions distributed evenly over the sphere (Fibonacci spiral).
     k = np.arange(600) + 0.5
     height, around = 1 - 2 * k / len(k), np.pi * (1 + 5**0.5) * k
     flat = np.sqrt(1 - height**2)

@@ -59,7 +59,7 @@ def reconstruct_any_view(
     report = progress or silent
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
     report("reconstruct", 0.0)
-    with redirect_stdout(sys.stderr):  # packages print there, and stdout is for the command's result
+    with redirect_stdout(sys.stderr):  # packages print to stdout, which is for the command's result
         maps = load(weights.path, device)(Views(images.colors, images.pinhole))
     report("reconstruct", 1.0)
     maps = usable_pointmaps(maps, backend)

@@ -66,9 +66,9 @@ def load(weights: Path, device: str) -> Predict:
 
 def build(name: str) -> nn.Module:
     """Return the network of a named configuration with random weights; raise KeyError for an unknown name."""
-    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # else the package prints its layers
+    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # otherwise the package prints its layers
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of its configuration's library
+        warnings.simplefilter("ignore")  # warnings of the configuration's library
         from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
         from depth_anything_3.registry import MODEL_REGISTRY  # type: ignore[import-not-found]
 
@@ -80,7 +80,7 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
-    # Half the time on a GPU, and what the package does there; on a CPU half precision is no faster.
+    # Half precision halves the time on a GPU, as in the package; on a CPU it is no faster.
     half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
     with torch.inference_mode(), half:
         answer = network(normalised(colors, device)[None], None, None)

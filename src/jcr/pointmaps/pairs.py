@@ -79,7 +79,7 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
             if file.zip is not None:
                 require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
             arrays = dict(file)
-        # NumPy hands out the bytes of what does not begin as an array does.
+        # NumPy returns raw bytes for members that are no arrays.
         if strangers := [name for name, array in arrays.items() if not isinstance(array, ndarray)]:
             raise ValueError(f"{strangers[0]} in it is not an array")
         return arrays

@@ -186,7 +186,7 @@ def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
         return [given], True, warnings
-    # EXIF's 35 mm focal length if there is one, then usual ones.
+    # The 35 mm equivalent focal length of EXIF comes first if there is one, then usual ones.
     width, height = capture.image_size
     with Image.open(capture.folder / capture.images[0]) as opened:
         exif = opened.getexif().get_ifd(ExifTags.IFD.Exif)
@@ -343,10 +343,10 @@ def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpt
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
     pipeline.extract_colors = False
-    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    # A first pair may distort unknown intrinsics so that no third image fits; other pairs are then tried.
     pipeline.multiple_models, pipeline.max_num_models = not known, 3
     pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
-    pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
+    pipeline.num_threads = mapper.num_threads = 1  # the order of sums over threads changes the last bits
     pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
     if known:
         pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False

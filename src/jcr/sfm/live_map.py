@@ -61,7 +61,7 @@ class LiveMap:
             self._features.remove(row)
             self._matcher.image_removed(row)
             self._names.remove(name)
-            self._model = None  # Its images are named by their rows.
+            self._model = None  # The model names images by their rows, which have changed.
         for name in capture.images:
             if name not in self._names:
                 self._features.add(new[name])

@@ -205,7 +205,7 @@ def quiet_colmap() -> Iterator[None]:
     no record. Setting Python's handler again removes it.
     """
     on_termination = signal.getsignal(signal.SIGTERM)
-    # Python sets signals in its main thread alone, and none that a host program in C handled before it.
+    # Python can set signal handlers only in its main thread, and not those of a host program in C (None).
     if on_termination is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_termination)
     before = pycolmap.logging.minloglevel

@@ -146,14 +146,14 @@ def registration(
     known, std_px, pose = shared.known, 1.0, None
     if len(shared.points) < MIN_POINTS:
         return len(shared.points)
-    for _ in range(2):  # the known images have the noise that is found in the new one
+    for _ in range(2):  # the noise estimated in the new image is used for the known images
         covariance = (std_px / known.camera.fx) ** 2 * shared.spread
         pose = absolute_pose(shared.x_px, shared.points, camera, covariance, gate_px, focal)
         if pose is None or pose.inlier.sum() < MIN_POINTS:
             return 0 if pose is None else int(pose.inlier.sum())
         std_px = pose.std_px
     assert pose is not None
-    # Observations of the known images count where their point projects.
+    # Observations in known images are kept if they are near the projections of their points.
     rotation, centre = (
         part[shared.row] for part in (known.recon_from_camera[:, :3, :3], known.recon_from_camera[:, :3, 3])
     )
@@ -191,12 +191,12 @@ def triangulated_features(
     across = across_lines(direction)
     point, kept, weight = np.zeros((n, 3)), np.ones(len(row), bool), np.ones(len(row))
     normal = np.zeros((n, 3, 3))
-    for _ in range(3):  # later without those that missed, and by how far each camera was
+    for _ in range(3):  # later rounds exclude mismatches and weight by the distances of the cameras
         normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
         weighted = weight[kept, None, None] * across[kept]
         np.add.at(normal, feature[kept], weighted)
         np.add.at(right, feature[kept], np.einsum("cij,cj->ci", weighted, center[kept]))
-        # With one ray, or parallel ones, the depth is open; the small term keeps it finite.
+        # With one ray or parallel rays the depth is undetermined; the small term keeps it finite.
         normal += 1e-9 * np.eye(3)
         point = np.linalg.solve(normal, right[..., None])[..., 0]
         in_camera = np.einsum("cji,cj->ci", rotation, point[feature] - center)

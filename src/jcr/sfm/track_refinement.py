@@ -92,7 +92,7 @@ def align_tracks(
         start_px[aligned] = (aligned_px[aligned] + 0.5) / factor - 0.5
         start_affine[aligned] = affine[aligned]
         found[better], variance[better] = start_px[better], variance_px[better]
-    # A reference has the harmonic mean of the variances of those aligned to it.
+    # The variance of a reference is the harmonic mean of those of the observations aligned to it.
     aligned = variance < KEYPOINT_STD_PX**2
     count = np.bincount(of_reference, aligned, len(variance))[reference]
     inverse_sum = np.bincount(of_reference, aligned / variance, len(variance))[reference]
@@ -209,7 +209,7 @@ def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, mo
                     deviation, most_px
                 )  # fmt: skip
                 if correlation > LEAST_CORRELATION:
-                    # Both patches have noise: the difference of two of unit variance has 2 (1 − correlation).
+                    # Both patches have noise: their difference has the variance 2 (1 − correlation) deviation².
                     noise = 2 * max(1 - correlation, 1e-6) * deviation * deviation
                     along_x = affine[0, 0] * affine[0, 0] + affine[1, 0] * affine[1, 0]
                     across = affine[0, 0] * affine[0, 1] + affine[1, 0] * affine[1, 1]
@@ -295,7 +295,7 @@ def _template(around, offsets, window, template, pull):
                 jacobian[k, 4 + 2 * i + j] = jacobian[k, i] * offsets[k, j] / _WINDOW
     weighted = jacobian * window.reshape((-1, 1))
     normal = jacobian.T @ weighted
-    for i in range(_FREE):  # what is singular is held by next to nothing
+    for i in range(_FREE):  # a tiny term for singular directions
         normal[i, i] += 1e-9 * normal[i, i] + 1e-12
     pull[:] = weighted @ np.linalg.inv(normal)
     return deviation

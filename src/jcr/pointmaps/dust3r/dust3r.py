@@ -41,13 +41,13 @@ def reconstruct_dust3r(
     edges = pairs_to_predict(capture.base_from_gripper)
     predictions, notes = predict_pairs(network, images, capture.images, edges, progress)
     del network
-    give_back()  # its memory
+    give_back()  # the memory of the network
     notes = (weights.note, *notes)
     try:
         maps = align_pairs(predictions, images, progress)
         maps = replace(maps, notes=(*notes, *maps.notes))
         return reconstruct_pointmaps(capture, images, maps, backend, progress)
-    except RejectedError as error:  # the weights and their licence belong to a rejection, too
+    except RejectedError as error:  # a rejection also names the weights and their licence
         raise error.with_more(*notes) from None
 
 

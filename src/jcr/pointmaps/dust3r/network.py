@@ -55,7 +55,7 @@ class Config:
     output_mode: str = "pts3d"
     depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf"))
     conf_mode: Sequence[object] = ("exp", 1, float("inf"))
-    # How the published network was trained: these change nothing here.
+    # Settings of the published training, without effect here.
     img_size: object = None
     patch_embed_cls: str = "PatchEmbedDust3R"
     landscape_only: bool = False
@@ -94,7 +94,7 @@ class Dust3r(nn.Module):
         """True if the predicted points are in metres."""
 
         self.patch_embed = PatchEmbed(enc_dim)
-        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # used only in pre-training
         self.enc_blocks = nn.ModuleList(
             EncoderBlock(enc_dim, config.enc_num_heads, config.mlp_ratio) for _ in range(config.enc_depth)
         )

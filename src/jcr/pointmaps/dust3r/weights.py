@@ -33,7 +33,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
         config, state = dict(json.loads(config_path.read_text("utf-8"))), load_file(tensors)
     except (SafetensorError, OSError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged ({_line(error)}); fetch it again") from None
-    # MASt3R is this network with one more head, for matching, which we do without; its points are metric.
+    # MASt3R is this network with a further head for matching, which is not used; its points are metric.
     mast3r = [key for key in state if ".head_local_features." in key]
     network = _build(config, {key: state[key] for key in state if key not in mast3r}, path)
     network.is_metric = bool(mast3r)

@@ -112,7 +112,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
                 observe(problem, k, chunk), state, solution.noise[k]
             )
 
-    # numpy lets go of the interpreter during its loops, so threads share the cores.
+    # numpy releases the interpreter lock during its loops, so that threads use all cores.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.map(settle, range(count)), start=1):
             progress("align pairs", done / count)

@@ -115,7 +115,7 @@ def gauss_newton(
         ]
         noise = measure_noise(images, misfit)
         try:
-            # The residuals of an image, which are most of the memory, go as its equations come.
+            # The residuals of an image, most of the memory, are freed as soon as its equations exist.
             equations = [
                 image_equations(o, misfit.pop(0), own, state, pair_spread)
                 for o, own in zip(images, noise, strict=True)
@@ -146,7 +146,7 @@ def gauss_newton(
                 pair_spread=pair_spread,
                 settled=settled,
             )
-        del equations  # or they would stay until the next ones are complete
+        del equations  # otherwise both these and the next equations would be in memory
     raise AssertionError
 
 
@@ -162,9 +162,9 @@ def _after_step(
     for o, before, e in zip(images, state.log_depth, equations, strict=True):
         local_step = e.selection @ step
         pair_step = e.gain @ local_step + e.offset
-        # An error of a pair moves its view as a step of its observer does.
+        # An error of a pair moves its second view as a step of its observer does.
         local_step[: pair_step.size] -= pair_step
-        # A far step of a pixel without parallax must not take it behind or beyond the scene.
+        # Clip the step: a pixel without parallax must not move far off the scene.
         depth_step = -(e.depth_gradient + local_step.astype(np.float32) @ e.coupling) / e.depth_hessian
         log_depth.append(before + np.clip(depth_step, -0.5, 0.5))
         second_pairs = o.pair[: o.second_count]
@@ -208,13 +208,13 @@ def image_equations(
     α = w_across/|x|² and β = w_along/|x|² − α. Raises LinAlgError where the pairs' errors cannot be eliminated.
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
-    # Of mean 1, so that the hessian is the information in the pointmaps.
+    # The confidence weights are scaled to mean 1, so that the hessian is the information of the pointmaps.
     robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
     w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
     w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
     alpha = w_across / r.distance**2
     beta = w_along / r.distance**2 - alpha
-    # The directions in which a point moves: by the twist (I, −[X]), the focal and its depth.
+    # Derivatives of a point by the twist (I, −[X]), the log focal length and its log depth.
     v = np.zeros((8, *r.x_in_recon.shape), np.float32)
     v[(0, 1, 2), (0, 1, 2)] = 1.0
     v[3:6] = skew(np.eye(3)) @ r.x_in_recon
