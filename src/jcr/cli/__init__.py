@@ -1,8 +1,8 @@
-"""The command line: one class a command, whose module is imported only when that command is asked for.
+"""Command line: one class per command, whose module is imported only when the command runs.
 
 The docstring of a command's class is the help (with examples), the docstrings of its fields are the help of its options,
-and `main` returns the exit status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output`
-(output.py): with --json its result is one JSON object on stdout, with --quiet nothing but errors and warnings comes on
+and `main` returns the exit status: 0 done, 2 wrong input, 3 rejected, 1 a bug. Each command has an `output`
+(output.py): with --json the result is one JSON object on stdout; with --quiet only errors and warnings are printed on
 stderr.
 """
 
@@ -49,7 +49,7 @@ GROUPS = {
         "prepare.docs": "print the pages of the manual",
     },
 }
-"""Commands by their group, each after its module, and what they do."""
+"""Commands and their descriptions by group; a key is MODULE.COMMAND."""
 MODULES = {name: module for group in GROUPS.values() for module, name in (key.split(".") for key in group)}
 COMMANDS = {key.split(".")[1]: about for group in GROUPS.values() for key, about in group.items()}
 
@@ -86,21 +86,21 @@ _DISK = {
     errno.ELOOP: "a link leads back to itself; put a file or a folder there",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-"""Remedies of faults of the machine, by the number of the error."""
+"""Remedies of operating-system errors that the user can correct, by errno."""
 
 
 LONGEST_LINE = 2000
-"""Characters of a message."""
+"""Largest number of characters of an error message."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run one command and exit with its status, without the second in which Python takes its modules apart."""
+    """Run one command and exit with its status at once; Python's own clean-up of modules would take a second."""
     # Threads that wait by spinning gain nothing on small matrices; with torch's they cost a run two of fifteen seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
+        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal cannot print ±
     status = dispatch(sys.argv[1:] if arguments is None else arguments)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_closed_streams() -> None:
-    """Open closed standard streams to nowhere; the next file would get their number, and be written to."""
+    """Open closed standard streams to nowhere; otherwise the next opened file would receive their output."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -160,7 +160,7 @@ def _dispatched(arguments: Sequence[str]) -> int:
 
 
 def command(name: str) -> Any:
-    """Return the class of a command's arguments: `add-camera` is AddCameraCommand."""
+    """Return the class of a command, whose fields are its arguments: `add-camera` is AddCameraCommand."""
     kind = name.title().replace("-", "") + "Command"
     return getattr(import_module(f"jcr.cli.{MODULES[name]}"), kind)
 
@@ -176,14 +176,14 @@ def dispatch(arguments: Sequence[str]) -> int:
     except RejectedError as error:
         return _fail(3, str(error))
     except BrokenPipeError:
-        _write_no_more()  # whoever read our output has seen enough
+        _write_no_more()  # the reader of the output closed it
         return 0
     except OSError as error:
         if error.errno not in _DISK:
             raise
         if error.filename is None:
             _write_no_more()
-        # Of a renaming the second name is what it would have replaced.
+        # If a file could not be renamed, filename2 is the file that would have been replaced.
         named = error.filename2 or error.filename or "the output"
         return _fail(2, f"{named}: {error.strerror}; {_DISK[error.errno]}")
     except MemoryError as error:
@@ -195,13 +195,13 @@ def dispatch(arguments: Sequence[str]) -> int:
 
 
 def _write_no_more() -> None:
-    """Write nothing to standard output from now on, not even at exit."""
-    with contextlib.suppress(OSError):  # no file, where tests read it
+    """Discard standard output from now on, also at exit."""
+    with contextlib.suppress(OSError):  # in tests stdout is no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Test whether Ctrl-C is behind an error; libraries that it interrupts while they load raise errors of their own."""
+    """Test whether Ctrl-C caused an error; libraries that are interrupted while loading raise errors of their own."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -211,6 +211,6 @@ def _interrupted(error: BaseException | None) -> bool:
 
 def _fail(status: int, message: str) -> int:
     line = printable(" ".join(message.split()))
-    # What files hold is quoted in messages, and a name may have a million letters.
+    # Messages quote the content of files, in which a name may have a million letters.
     sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
     return status

@@ -1,4 +1,4 @@
-"""`jcr capture`: takes a capture live, image by image, with advice on the next pose."""
+"""Command `jcr capture`: take a capture live, image by image, with advice on the next pose."""
 
 import os
 import sys
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 class CaptureCommand:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
-    An image is taken when the arm rests, and kept if it is sharp and nothing moves. The calibration is made meanwhile:
-    after each image it is printed how exact it is, what is wrong, and the pose that helps most. OUT/result is the
+    An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the calibration is
+    updated, and its accuracy, its faults and the next pose that helps most are printed. OUT/result is the
     calibration of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
-    buttons to take, retake and remove images, to undo that, and to finish; the same words can be typed.
+    buttons to take, retake and remove images, to undo, and to finish; the same commands can be typed.
 
     for example:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -88,7 +88,7 @@ class CaptureCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Take a capture, or list the arms."""
+        """Take a capture, or list the arms; return the exit status."""
         if self.robot == "list":
             arms = [arm_named(name) for name in ROBOT_NAMES]
             lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
@@ -101,7 +101,7 @@ class CaptureCommand:
 
 
 def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
-    """Take images until there are enough, or the calibration is as accurate as required; calibrate all of them."""
+    """Take images until the user ends or `--until-accurate` is met; calibrate with all; return the exit status."""
     from jcr.live.calibration import LiveCalibration
     from jcr.live.folder import LiveFolder
     from jcr.live.server import LOOPBACK, LiveServer
@@ -119,7 +119,7 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
     answers: list[Answer] = []
 
     def tell(answer: Answer, lines: list[str]) -> None:
-        """Print lines, and keep the answer for --json."""
+        """Print the lines of an answer, and keep the answer for --json."""
         answers.append(answer)
         _print("\n".join(lines))
 
@@ -146,7 +146,7 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
 def _conclude(
     arguments: CaptureCommand, facts: dict[str, Any], result: "RunResult | None", requirement_met: bool
 ) -> int:
-    """Print the result and the next command; return 3 where it is rejected or not what `--until-accurate` requires."""
+    """Print the result and the next command; return 3 if the calibration is rejected or misses `--until-accurate`."""
     from jcr.calibration.words import summary
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
@@ -176,7 +176,7 @@ def _print(text: str) -> None:
 def _source(
     arguments: CaptureCommand, session: LiveSession, states: States | None, server: "LiveServer"
 ) -> Callable[[], None]:
-    """Return the function that requests images where `--poses` says; read typed commands."""
+    """Return the function that takes images at the poses of `--poses`; start reading typed commands."""
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():
         _print(HELP)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jcr.pipeline.verify import Verification
 
 UNLIKELY = 1e-3
-"""Largest p-value of a difference that the reported errors do not explain."""
+"""p-value below which the reported errors do not explain a difference."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class CheckCommand:
 
 
 def read_arguments(read: ReadOptions) -> list[str]:
-    """Return the arguments that give the options of reading a capture, as far as they are not the default."""
+    """Return the command-line arguments for those options of reading a capture that are not the default."""
     given = list[str]()
     for option in fields(read):
         value = getattr(read, option.name)
@@ -101,7 +101,7 @@ def read_arguments(read: ReadOptions) -> list[str]:
 def _check_lines(
     command: CheckCommand, capture: Capture | PosePairs, read: ReadOptions, found: "Examination"
 ) -> list[str]:
-    """Return the verdict with its cause and remedy, or with what a calibration is expected to reach."""
+    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, proposed poses."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
 
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"
@@ -134,7 +134,7 @@ def _check_lines(
 
 
 def _expected(images: int, found: "Examination") -> list[str]:
-    """Return the accuracy that the calibration is expected to report, and how well poses and images agree."""
+    """Return lines on the accuracy that a calibration is expected to reach, and on how poses and images agree."""
     from jcr.pipeline.check import QUICK
 
     lines, fitted = list[str](), found.hand_eye
@@ -159,7 +159,7 @@ def _expected(images: int, found: "Examination") -> list[str]:
 
 
 def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str, Any]:
-    """Return the result of the check for JSON."""
+    """Return the result of the check as the content of --json."""
     from jcr.calibration.record import as_json, mm_and_deg
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
@@ -289,7 +289,7 @@ class VerifyCommand:
 
 
 def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
-    """Return the verdict on one camera, the remedy, the drift with its standard deviation, and warnings."""
+    """Return the lines on one camera: verdict, remedy, drift with its standard deviation, warnings."""
     drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
     mm, mm_std = (numbers(1e3 * part[:3], 2) for part in (found.offset, found.std))
     deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
@@ -309,7 +309,7 @@ def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
 
 
 def _drift_facts(found: "Verification") -> dict[str, object]:
-    """Return the result on one camera for JSON."""
+    """Return the result for one camera as the content of --json."""
     same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes", "how")}
     return same | {
         "cause": found.cause if found.moved else None,
@@ -343,7 +343,7 @@ class TouchCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the verdict, then each error beside what was expected."""
+        """Print the verdict, then the error at each point with its expected standard deviation."""
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)

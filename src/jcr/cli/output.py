@@ -1,4 +1,4 @@
-"""Output of every command: its result on stdout, all else on stderr."""
+"""Output of every command: the result on stdout, everything else on stderr."""
 
 import io
 import json
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Output:
-    """Options of the output."""
+    """Options of a command's output."""
 
     json: bool = False
     """Print the result as one JSON object."""
@@ -18,7 +18,7 @@ class Output:
     """Print only errors and warnings on stderr: no progress, no notes."""
 
     def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
-        """Print the result at once: `facts`, arrays as lists, with --json, else the lines for people."""
+        """Print the result: with --json `facts` as one JSON object (arrays as lists), otherwise the `lines`."""
         shown = [json.dumps(facts, default=lambda array: array.tolist())] if self.json else lines
         sys.stdout.writelines(f"{line}\n" for line in shown)
         sys.stdout.flush()
@@ -26,14 +26,14 @@ class Output:
 
 @dataclass(frozen=True)
 class VerboseOutput(Output):
-    """Output of a command that leaves out details."""
+    """Options of the output of a command that prints details only with --verbose."""
 
     verbose: bool = False
     """Print the details as well: what uncertainty comes from, images left out, notes, p-values."""
 
 
 class Quiet(io.TextIOWrapper):
-    """Stderr with --quiet: what is written to it is not seen, but for warnings, which go where all went before."""
+    """Stderr with --quiet: text is discarded, except warnings, which `warn` writes to the stream `before`."""
 
     def __init__(self, nowhere: io.BufferedWriter, before: Any) -> None:
         super().__init__(nowhere, encoding="utf-8")
@@ -41,11 +41,11 @@ class Quiet(io.TextIOWrapper):
 
 
 def warn(text: str) -> None:
-    """Print what asks the user to act on stderr, with --quiet too."""
+    """Print a warning that the user must act on, on stderr, also with --quiet."""
     stream = sys.stderr.before if isinstance(sys.stderr, Quiet) else sys.stderr
     stream.write(f"warning: {text}\n")
 
 
 def numbers(values: Iterable[float], digits: int, sign: str = "") -> str:
-    """Return numbers with so many decimals in one line; `sign` "+": positive ones have a sign."""
+    """Return numbers with this many decimals in one line; `sign` "+" writes the sign of positive numbers too."""
     return " ".join(f"{value:{sign}.{digits}f}" for value in values)

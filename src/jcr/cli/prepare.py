@@ -1,4 +1,4 @@
-"""Commands around a calibration: board, models and docs."""
+"""Commands that are not part of a calibration: board, docs and models."""
 
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,7 +17,8 @@ from jcr.reconstruct import BACKENDS, weights_command
 
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
-"""Folders of pages. Those of results are named with their folder, as other pages have the same names."""
+"""Folders of the manual's pages. Pages in `results` are named with their folder, because other pages have the same
+names."""
 SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
@@ -38,7 +39,7 @@ class BoardCommand:
     board: Annotated[str, tyro.conf.Positional] = "charuco:8x5:0.030:0.022:DICT_4X4_50"
     """charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, lengths in metres."""
     paper: Literal["a4", "a3", "a2", "letter"] = "a4"
-    """Paper, the long side across."""
+    """Paper size; the long side is horizontal."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
@@ -81,10 +82,10 @@ class DocsCommand:
 
 
 def pages() -> dict[str, Path]:
-    """Return the file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
+    """Return the file of each page of the manual by its name for `jcr docs`; empty if no page is installed."""
     found = list(CHECKOUT.rglob("*.md"))
     if not (CHECKOUT / "conf.py").is_file():
-        with suppress(PackageNotFoundError):  # run from source files alone
+        with suppress(PackageNotFoundError):  # when run from source files, without installation
             installed = [Path(str(file.locate())) for file in files(DISTRIBUTION) or []]
             found = [
                 file for file in installed if file.suffix == ".md" and f"doc/{DISTRIBUTION}/" in str(file)
@@ -97,7 +98,7 @@ def pages() -> dict[str, Path]:
 
 
 def page(name: str) -> str:
-    """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError without such a page."""
+    """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError if no page has it."""
     found = pages()
     if name not in found:
         there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
@@ -115,7 +116,7 @@ def title(path: Path) -> str:
 class ModelsCommand:
     """List the back ends with their licences, and what is installed on this machine; or download weights.
 
-    Those that `--backend auto` may try come first, in its order. Listing downloads nothing.
+    The back ends that `--backend auto` may try come first, in that order. Listing downloads nothing.
 
     for example:
       jcr models
@@ -163,7 +164,7 @@ class ModelsCommand:
         return 0
 
     def _get(self) -> int:
-        """Download the weights of a back end, or of a hub id, check them, and put them where runs look for them."""
+        """Download the weights of a back end or hub id, check them, and store them where runs look for them."""
         with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
         name = self.name
         row = BACKENDS.get(name or "")

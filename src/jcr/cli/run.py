@@ -189,7 +189,7 @@ class AddCameraCommand:
 
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
-    """Return the options of the stages among a command's arguments, `chosen` ones in their place."""
+    """Return the options of a run's stages from a command's arguments; options in `chosen` replace them."""
     from jcr.result import RunOptions
 
     given = {
@@ -199,7 +199,7 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
 
 
 def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progress) -> Any:
-    """Return what `read` reads of the capture of a command; the frames of a recording are put in the run folder."""
+    """Return the capture of a command, read by `read`; frames of a recording are extracted to the run folder."""
     from jcr.files import locked
     from jcr.result import CAPTURE
 
@@ -211,7 +211,7 @@ def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progr
 def looked_at(
     path: Path, options: ReadOptions, read: Callable[..., Any], progress: Progress, **more: Any
 ) -> Iterator[Any]:
-    """Yield what `read` reads of the capture at a path; the frames of a recording vanish afterwards."""
+    """Yield the capture at a path, read by `read`; extracted frames of a recording are deleted afterwards."""
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
         yield read(path, options, into=scratch, progress=progress, **more)
 
@@ -219,9 +219,9 @@ def looked_at(
 def _run(
     command: CalibrateCommand, capture: Capture, options: "RunOptions", progress: Progress
 ) -> "RunResult":
-    """Run a capture, and print the calibration as soon as it stands.
+    """Run a capture, and print the calibration as soon as it is finished, before depth and map.
 
-    Where no back end found anything, calibration.json has the reason.
+    If no back end found a reconstruction, the result is the run folder, whose calibration.json states the reason.
     """
     from jcr.pipeline.run import run
     from jcr.pipeline.selection import NothingFoundError
@@ -246,15 +246,15 @@ def _run(
 
 
 def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
-    """Print the summary as soon as the calibration stands, with what was noted when the capture was read.
+    """Print the summary of a calibration, and the notes from reading the capture.
 
-    With --json all comes at the end.
+    With --json nothing is printed here, because `show` prints the whole result.
     """
     from jcr.calibration.words import MOST_LINES, summary
 
     if not output.json:
         others = 0 if result.cameras is None else len(result.cameras.cameras)
-        most = MOST_LINES - others - 1  # a line of the caller
+        most = MOST_LINES - others - 1  # one line is left to the caller
         lines = summary(result.calibration, most).splitlines()
         notes = [line for note in capture.notes for line in labelled("Note", note)]
         lines += notes[: max(most - 2 - len(lines), 0)]
@@ -263,10 +263,10 @@ def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: 
 
 
 def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
-    """Print the lines after the summary, and return the exit status: 3 where it or a further camera is rejected.
+    """Print the lines after the summary; return the exit status: 3 if the calibration or a further camera is rejected.
 
-    These are further cameras, `more` lines, the report and the next command; with --verbose the details; with --json
-    everything at once.
+    The lines are further cameras, `more`, the report and the next command, and with --verbose the details. With --json
+    the whole result is printed as one object.
     """
     from jcr.calibration.words import details
 
@@ -287,7 +287,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
 
 
 def _camera_in_words(camera: "CameraPlacement") -> str:
-    """Return the verdict on a further camera, with its uncertainty or the reason, in one line."""
+    """Return one line on a further camera: its verdict, and its uncertainty or the reason of its rejection."""
     if camera.doubt is not None or camera.uncertainty is None:
         return f"{camera.name}: REJECTED: {camera.doubt}"
     stds = camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg
@@ -299,7 +299,7 @@ def _camera_in_words(camera: "CameraPlacement") -> str:
 
 
 def _line(rank: int, row: "BatchRow") -> str:
-    """Return the line of a row of a batch."""
+    """Return the line of one capture in the table of a batch."""
     std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
     used = f"{row.used:3d}/{row.images:<3d}"
     return f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}".rstrip()

@@ -25,15 +25,15 @@ CONFIGURATION = (
     tyro.conf.PositionalMetavarFromFieldName,
     tyro.conf.DisallowNone,
 )
-"""Conversion of the fields of a command's `Arguments` to options."""
+"""Settings of tyro for the conversion of a command's fields to options."""
 WIDEST = 120
-"""Columns of the paragraphs of the help, on a wider terminal too."""
+"""Largest width of the help's paragraphs in columns, also on a wider terminal."""
 SHELLS = ("bash", "zsh", "tcsh", "fish")
-"""Shells that tyro writes a completion script for."""
+"""Shells for which tyro writes a completion script."""
 
 
 def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
-    """Return the record that a command line makes; raise InputError of one line where it makes none."""
+    """Parse the arguments of a command into its record; raise InputError with a one-line message if they are wrong."""
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, record, program, arguments)} ({program} --help)")
@@ -44,9 +44,9 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
 
 @contextmanager
 def _wrapped_paragraphs() -> Iterator[None]:
-    """Wrap the paragraphs of the help at words; tyro 1.0 prints each as one line."""
+    """Wrap the paragraphs of the help at words while the context is active; tyro 1.0 prints each as one line."""
     width, output = min(shutil.get_terminal_size().columns, WIDEST), sys.stdout
-    # By these two tyro chooses the characters of its boxes, and colours.
+    # These two attributes decide which box characters and colours tyro uses.
     like_output = {"encoding": output.encoding, "isatty": output.isatty}
     printed = type("Help", (io.StringIO,), like_output)()
     try:
@@ -55,7 +55,7 @@ def _wrapped_paragraphs() -> Iterator[None]:
     finally:
         lines = printed.getvalue().split("\n")
         wrapped = (textwrap.fill(line, width) if line[:1].isalpha() else line for line in lines)
-        if printed.getvalue():  # an output without room fails even for nothing
+        if printed.getvalue():  # writing even an empty text fails on a full disk
             output.write("\n".join(wrapped))
 
 
@@ -87,7 +87,7 @@ def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, argum
         case _errors.UnrecognizedArgs(tokens=[first, *_]):
             return f"{first!r}: one argument too many for {program}"
         case _errors.InvalidChoice(argument=argument, value=value):
-            choices = sorted(set(event.choices) - {"None"})  # which stands for none given
+            choices = sorted(set(event.choices) - {"None"})  # None stands for an omitted option
             like = did_you_mean(value, choices)
             return f"invalid choice {value!r} for {argument.display_name()}{like}; choose from {', '.join(choices)}"
         case _errors.BadValue(argument=argument) | _errors.InstantiationFailure(argument=argument) if (
@@ -104,7 +104,7 @@ def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, argum
 
 
 def _flags(record: Any) -> Iterator[str]:
-    """Yield the options of a record of arguments, those of nested records included."""
+    """Yield the options (--NAME) of a record of arguments, also those of nested records."""
     if is_dataclass(record):
         hints = get_type_hints(record)
         for field in fields(record):

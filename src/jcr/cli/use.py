@@ -93,7 +93,7 @@ class ExportCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Write the file and print its path; 3 where the calibration is rejected, and nothing was written."""
+        """Write the file and print its path, or list the formats; RejectedError gives status 3."""
         from jcr.export.formats import FORMATS, write_run
         from jcr.export.ros import static_transform_publisher
 
@@ -139,13 +139,13 @@ class QueryCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Answer for every point, in the order of the input."""
+        """Query the map at every point, and write or print the answers in the order of the input."""
         from jcr.scene.map_file import load_map
 
         scene = load_map(self.out)
         x_in_base = read_points(self.points)
         sample = scene.query(x_in_base, self.unknown)
-        # Eight-bit colours, as the points had them; outside of the workspace there is none.
+        # Eight-bit colours, as in the point cloud; 0 outside of the workspace.
         colors = np.nan_to_num(sample.color * 255).round().astype(np.uint8).T
         columns = [*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T]
         columns += [*colors, sample.label]
@@ -165,7 +165,7 @@ class QueryCommand:
 
 
 def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
-    """Write the answers as .npy or .csv."""
+    """Write the answers of a query as .npy or .csv, by the ending of the path."""
     if path.suffix == ".npy":
         buffer = io.BytesIO()
         np.save(buffer, np.asarray(rows))
@@ -177,7 +177,7 @@ def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
-    """Points (n,3) in metres from .csv, .npy or .ply; raises InputError where the file is none of these."""
+    """Read points (n,3) in metres from .csv, .npy or .ply; raise InputError if the file is none of these."""
     from jcr.capture.plain_files import read_lines, read_npy, split_cells
 
     if not path.is_file():
@@ -209,7 +209,7 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
 
 def _finite(column: ndarray) -> list:
-    """Return the column for JSON, with None in place of NaN."""
+    """Return a column as a list for JSON, in which None replaces NaN."""
     if column.dtype.kind != "f":
         return column.tolist()
     return [None if np.isnan(value) else round(float(value), 6) for value in column]
@@ -231,12 +231,12 @@ class MeasureCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the sizes; 3 when the calibration they rest on is rejected."""
+        """Print the sizes of the objects; raise RejectedError (status 3) if the calibration is rejected."""
         from jcr.pipeline.run import measure
         from jcr.result import load_run
 
         measured = measure(self.out)
-        # Metres, base frame, one sigma; `on_plane` is a flag for each point of the cloud.
+        # Metres, base frame, one sigma; `on_plane` is left out because it has a value for each point of the cloud.
         support = {name: value for name, value in vars(measured.support).items() if name != "on_plane"}
         facts = {"support": support, "objects": [vars(size) for size in measured.objects]}
         self.output.result(sizes_lines(measured), facts)
@@ -246,7 +246,7 @@ class MeasureCommand:
 
 
 def sizes_lines(measured: "Measurement") -> list[str]:
-    """Return a line for the plane and a line for each object, in millimetres."""
+    """Return the lines of a measurement: one for the support plane, and one for each object, in mm."""
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]
     lines = [
@@ -292,7 +292,7 @@ class ViewCommand:
         """Serve the page until Ctrl-C."""
         from jcr.result import load_run
 
-        run = load_run(self.out)  # raises at once where there is none
+        run = load_run(self.out)  # raises an InputError at once if there is no run
         for package in ("viser", "torch"):
             extra(package, "view", "jcr view")
         from jcr.viewer.viewer import Viewer, open_server

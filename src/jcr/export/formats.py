@@ -31,17 +31,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """Row of the table."""
+    """One export format: a row of the table of formats."""
 
     name: str
     file: str
-    """Default name in OUT/export; ends with / for a folder."""
+    """Default file name in OUT/export; ends with / if the format is a folder."""
     about: str
     writer: str
-    """Module and function of this package, imported when it is called, because torch and pycolmap take seconds. Those
-    of `ros` return a text; the others take the path to write first."""
+    """Module and function in jcr.export that write the format, as MODULE.FUNCTION. The module is imported on use,
+    because torch and pycolmap take seconds. Functions of `ros` return a text; the others take the path to write as
+    first argument."""
     contents: str
-    """Attributes of `Run` that the writer takes."""
+    """Attributes of `ExportedRun` that are passed to the writer, separated by spaces."""
 
 
 _TABLE = """
@@ -83,11 +84,11 @@ def export_run(
 def write_run(
     out: Path, format: ExportName, path: Path | None, options: ExportOptions
 ) -> "tuple[ExportedRun, ExportFormat, Path]":
-    """Write a run folder in a format; return the run, the row of the table and the path.
+    """Write a run in an export format; return the exported run, the row of the format and the written path.
 
-    Raises InputError for a format that does not exist, options that it cannot serve, a run that lacks what it needs,
-    and a path with other content unless `options` overwrite it; RejectedError for a calibration that is rejected,
-    unless `options` force it.
+    Raises InputError for an unknown format, for options that do not fit, for a run that lacks the data of the format,
+    and for a path with other content unless `options.overwrite` is set. Raises RejectedError if the calibration is
+    rejected, unless `options.force` is set.
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
@@ -126,7 +127,7 @@ def write_run(
 
 
 class ExportedRun:
-    """Run folder with export options; only the data that a format needs are read."""
+    """Run folder with export options; the properties read only the data that a format needs."""
 
     def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:
         self.options, self.run, self.path = options, RunResult(out), path
@@ -137,19 +138,19 @@ class ExportedRun:
             )
         self.camera = None if options.camera is None else self._camera(options.camera)
         self.doubt = self.calibration.doubt
-        """Reason for the rejection of the calibration, or of the chosen camera; None where it is accepted."""
+        """Reason why the calibration or the chosen camera is rejected; None if accepted."""
         if self.doubt is None and self.camera is not None:
             self.doubt = self.camera.doubt
 
     @property
     def notes(self) -> dict[str, str]:
-        """Provenance of data in the base frame."""
+        """Notes for files with data in the base frame: frame, unit, version, reason of a rejection."""
         ros.require_frame_name(self.options.base_frame)
         return provenance(self.options.base_frame, self.doubt)
 
     @property
     def mount(self) -> ros.CameraMount:
-        """Mount of the exported camera, under the frame names of the options."""
+        """Mount of the exported camera, with the frame names that the options give."""
         options, found = self.options, self.calibration
         if self.camera is not None:
             mount = self._mount_of(self.camera, options.child_frame)
@@ -180,7 +181,10 @@ class ExportedRun:
 
     @property
     def others(self) -> list[ros.CameraMount]:
-        """Accepted further cameras (with `force` also rejected ones) and arms; none where one camera is chosen."""
+        """Mounts of the run's further cameras and arms; empty if the options choose one camera.
+
+        Rejected cameras are included only with `options.force`.
+        """
         cameras = self.run.cameras
         if cameras is None or self.camera is not None:
             return []
@@ -196,16 +200,16 @@ class ExportedRun:
 
     @property
     def cloud(self) -> "PointCloud":
-        """Content of cloud.ply."""
+        """Point cloud of the run, from cloud.ply."""
         return read_cloud(self.run.out / CLOUD)
 
     @property
     def scene(self) -> "SceneMap":
-        """Content of map.safetensors."""
+        """Map of the run, from map.safetensors."""
         return load_map(self.run.out)
 
     def _camera(self, name: str) -> "CameraPlacement":
-        """Return a further camera by its name; raise InputError where it was not placed."""
+        """Return a further camera of the run by its name; raise InputError if the run has no pose of it."""
         cameras = self.run.cameras
         for camera in () if cameras is None else cameras.cameras:
             if camera.name == name and camera.parent_from_camera is not None:
@@ -215,7 +219,7 @@ class ExportedRun:
         )
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
-        """Return the mount of a further camera."""
+        """Return the mount of a further camera; `child` is the name of its camera frame."""
         intrinsics = camera.intrinsics
         matrix = np.array(camera.parent_from_camera)
         return self._named(camera.mount, child, matrix, camera.doubt, intrinsics, camera.arm)
@@ -229,7 +233,10 @@ class ExportedRun:
         intrinsics: "Intrinsics | None" = None,
         arm: str | None = None,
     ) -> ros.CameraMount:
-        """Return a mount on the base or the gripper; the frames of another arm have its name in front."""
+        """Return the mount of frame `child` on the base or the gripper.
+
+        `arm` is the name of another arm, which is put before the names of its frames.
+        """
         of_arm = "" if arm is None else f"{arm}_"
         base, effector = of_arm + self.options.base_frame, of_arm + self.options.parent_frame
         return ros.CameraMount(
@@ -244,10 +251,10 @@ class ExportedRun:
 
     @property
     def views(self) -> "PosedImages":
-        """Registered images in the base frame.
+        """Registered images with their camera poses in the base frame.
 
-        The cameras are those of the reconstruction, transformed as one rigid body: they agree with each other to a
-        fraction of a pixel, which the gripper poses of most arms do not.
+        The camera poses are those of the reconstruction after one similarity transform, so they agree with each other
+        to a fraction of a pixel. Poses computed from the gripper poses of most arms do not.
         """
         from jcr.export.views import PosedImages
 

@@ -1,4 +1,4 @@
-"""Export formats, options and provenance, apart from the writers, for the help of the command line."""
+"""Export formats, their options and the notes in exported files, without the writers, so that help loads fast."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ ExportName = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Frames, resolution and images of an exported file; a format uses those that concern it."""
+    """Frames, resolution and images of an exported file; each format uses the options that concern it."""
 
     parent_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "tool0"
     """The gripper frame whose poses the capture contains."""
@@ -54,6 +54,6 @@ class ExportOptions:
 
 
 def provenance(frame: str, doubt: str | None = None) -> dict[str, str]:
-    """Return notes of one line each: frame, unit and version of a file, and the reason of a rejected calibration."""
+    """Return notes for a file, one line each: frame, unit, version, and the reason if the calibration is rejected."""
     about = {"frame": frame, "unit": "m", "made_by": f"jcr {__version__}"}
     return about if doubt is None else about | {"warning": f"REJECTED: {' '.join(doubt.split())}"}

@@ -1,6 +1,6 @@
 """Camera frames as text for ROS tools: tf2 launch files, URDF, easy_handeye2, MoveIt, camera_info.
 
-Every text names its frames, its units, the intrinsics that belong to it, and the reason of a rejection.
+Every text contains the names of its frames, its units, the intrinsics of the camera, and the reason of a rejection.
 """
 
 import re
@@ -29,29 +29,30 @@ _DISTORTIONS = {
     "fisheye": "equidistant",
 }
 ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
-"""REP-103: the root link has x forward, y left, z up; the optical frame z forward, x right, y down."""
+"""Transform from a camera's optical frame (z forward, x right, y down) to its root link (x forward, y left, z up), as
+in REP-103; both have one origin."""
 
 _FRAME_NAME = re.compile(r"(?!.*--)[A-Za-z0-9_][A-Za-z0-9_/.\-]*")  # two hyphens would end an XML comment
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMount:
-    """Camera frame (or another arm's base) fixed to its parent frame.
+    """Frame of a camera, or of another arm's base, and its transform to the parent frame to which it is fixed.
 
-    Construction raises InputError for invalid frame names, and where parent and child have the same name.
+    Construction raises InputError for invalid frame names, and if parent and child have the same name.
     """
 
     parent: str
     child: str
     parent_from_child: Float[ndarray, "4 4"]
     base: str = BASE
-    """Base of the arm that carries the parent frame; the parent of a fixed camera."""
+    """Base frame of the arm that carries the parent frame; it is itself the parent of a fixed camera."""
     effector: str = PARENT
-    """Gripper frame of that arm, for formats that name it beside a fixed camera."""
+    """Gripper frame of the arm, for formats that require one also for a fixed camera."""
     doubt: str | None = None
-    """Reason of the rejection; None for an accepted calibration."""
+    """Reason why the calibration is rejected; None if it is accepted."""
     intrinsics: Intrinsics | None = None
-    """Intrinsics that the transform belongs to; None where they are unknown."""
+    """Intrinsics with which the transform was estimated; None if unknown."""
 
     def __post_init__(self) -> None:
         """Check the frame names."""
@@ -62,12 +63,12 @@ class CameraMount:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the parent is the base of the robot."""
+        """True if the parent frame is the base of the robot, as for a fixed camera."""
         return self.parent == self.base
 
 
 def require_frame_name(name: str) -> None:
-    """Raise InputError for a name that tf2 or XML would not accept."""
+    """Raise InputError for a frame name that tf2 or XML would not accept."""
     if not _FRAME_NAME.fullmatch(name):
         raise InputError(f"frame {name!r}: write letters, digits, _ . - and /, and no / in front")
 
@@ -75,8 +76,9 @@ def require_frame_name(name: str) -> None:
 def on_root(
     mount: CameraMount, root: str, root_from_optical: Float[ndarray, "4 4"] = ROOT_FROM_OPTICAL
 ) -> CameraMount:
-    """Return the mount of the root link of a camera driver's own frames, since a frame can have one parent only.
+    """Return the mount of the root link of a camera driver's frames instead of the optical frame.
 
+    The driver already publishes a parent of the optical frame, and a frame can have only one. The result is
     parent_from_root = parent_from_optical · inverse(root_from_optical).
     """
     if root in (mount.parent, mount.child):
@@ -85,7 +87,7 @@ def on_root(
 
 
 def static_transform_publisher(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """Return the ROS 2 command that publishes the transform."""
+    """Return the shell command that publishes the transform in ROS 2."""
     arguments = _publisher_arguments(parent, child, parent_from_child)
     return f"ros2 run tf2_ros static_transform_publisher {' '.join(arguments)}"
 
@@ -97,7 +99,7 @@ def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
 
 
 def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
-    """Return a ROS 2 launch file (XML) that publishes the transform, and those of further cameras and arms."""
+    """Return a ROS 2 launch file (XML) that publishes the transforms of the mount and of further cameras and arms."""
     nodes = []
     for k, one in enumerate((mount, *others)):
         arguments = " ".join(_publisher_arguments(one.parent, one.child, one.parent_from_child))
@@ -139,9 +141,9 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
-    """Return a URDF with one root: a fixed joint for each camera and further arm.
+    """Return a URDF with a fixed joint for each camera and further arm, and with a single root link.
 
-    Where cameras on a gripper and in the base are both present, a floating joint stands for the arm between them.
+    If there are cameras on a gripper and fixed cameras, a floating joint stands for the arm between base and gripper.
     """
     every = (mount, *others)
     joints = [
@@ -169,7 +171,7 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
 
 
 def _joint(parent: str, child: str, origin: str | None = None) -> str:
-    """Return a URDF joint: fixed, or floating without an origin."""
+    """Return a URDF joint: fixed with the element `origin`, or floating if `origin` is None."""
     placed = "" if origin is None else f"    {origin}\n"
     return f"""  <joint name="{child}_joint" type="{"floating" if origin is None else "fixed"}">
     <parent link="{parent}"/>
@@ -179,7 +181,7 @@ def _joint(parent: str, child: str, origin: str | None = None) -> str:
 
 
 def easy_handeye2(mount: CameraMount, name: str) -> str:
-    """Return a .calib file, which easy_handeye2 reads from ~/.ros2/easy_handeye2/calibrations/NAME.calib."""
+    """Return the text of a .calib file, which easy_handeye2 reads as ~/.ros2/easy_handeye2/calibrations/NAME.calib."""
     content = {
         "parameters": {
             "name": name,
@@ -201,9 +203,9 @@ def easy_handeye2(mount: CameraMount, name: str) -> str:
 
 
 def camera_info(mount: CameraMount) -> str:
-    """Return the intrinsics as camera_info_manager reads them; pixels, (0, 0) is the centre of the first one.
+    """Return the intrinsics as YAML for camera_info_manager, in pixels; (0, 0) is the centre of the first pixel.
 
-    Raises InputError where the intrinsics are unknown.
+    Raises InputError if the intrinsics are unknown.
     """
     if (intrinsics := mount.intrinsics) is None:
         raise InputError(
@@ -228,7 +230,7 @@ def camera_info(mount: CameraMount) -> str:
 
 
 def notes(mount: CameraMount) -> list[str]:
-    """Return the first lines of every file: frames, units, intrinsics, and the reason of a rejection."""
+    """Return the comment lines at the start of every file: frames, units, intrinsics, and the reason of a rejection."""
     lines = [f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"]
     if (given := mount.intrinsics) is not None:
         coefficients = zip(COEFFICIENTS[given.model], given.distortion, strict=True)
@@ -241,7 +243,7 @@ def notes(mount: CameraMount) -> list[str]:
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
-    """Return the arguments of static_transform_publisher."""
+    """Return the arguments of static_transform_publisher as a list."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
     numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]
@@ -249,27 +251,27 @@ def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarr
 
 
 def _quat_xyzw(a_from_b: Float[ndarray, "4 4"]) -> list[float]:
-    """Return the rotation as a quaternion with w >= 0."""
+    """Return the rotation of a transform as quaternion x, y, z, w with w >= 0."""
     return Rotation.from_matrix(a_from_b[:3, :3]).as_quat(canonical=True).tolist()
 
 
 def _number(value: float) -> str:
-    """Return a number with twelve digits after the point and no exponent."""
+    """Return a number as text with twelve decimals and no exponent."""
     return f"{value:.12f}"
 
 
 def _comments(mount: CameraMount, *more: str) -> str:
-    """Return the notes as comments of YAML or Python."""
+    """Return the notes of a mount and the lines `more` as comments of YAML or Python."""
     return "\n".join(f"# {' '.join(line.split())}" for line in [*notes(mount), *more])
 
 
 def _xml_comment(*lines: str) -> str:
-    """Return lines as an XML comment, in which two hyphens would end it."""
+    """Return lines as one XML comment; consecutive hyphens, which would end it, are separated."""
     text = "; ".join(" ".join(line.split()) for line in lines)
     return f"  <!-- {re.sub('-(?=-)', '- ', text)} -->"
 
 
 def _yaml(mount: CameraMount, content: Mapping[str, Any], *more: str, flow: bool | None = None) -> str:
-    """Return content as YAML below the notes."""
+    """Return YAML text: the notes of a mount and `more` as comments, then the content."""
     body = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=flow, width=110)
     return f"{_comments(mount, *more)}\n{body}"

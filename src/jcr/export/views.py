@@ -1,4 +1,4 @@
-"""Images with their camera poses in the base frame: for splats, radiance fields and COLMAP."""
+"""Export of images with their camera poses in the base frame, for Gaussian splats, radiance fields and COLMAP."""
 
 import json
 import shutil
@@ -30,19 +30,19 @@ _ORIENTATION = 0x0112
 
 @dataclass(frozen=True, kw_only=True)
 class PosedImages:
-    """Registered images of a capture, with their cameras and tracked points in the base frame."""
+    """Registered images of a capture, with the camera poses and tracked points in the base frame."""
 
     folder: Path
     """Folder of the capture."""
     images: tuple[str, ...]
-    """Paths relative to that folder."""
+    """Paths of the m images, relative to `folder`."""
     base_from_camera: Float[ndarray, "m 4 4"]
     base_from_gripper: Float[ndarray, "m 4 4"]
-    """Reported gripper poses."""
+    """Gripper poses as reported by the robot, one per image."""
     intrinsics: Intrinsics
     tracks: Tracks
     points_in_base: Float[ndarray, "p 3"]
-    """Points of the tracks (m)."""
+    """Positions (m) of the p points of `tracks`."""
 
 
 def write_nerfstudio(
@@ -50,8 +50,8 @@ def write_nerfstudio(
 ) -> None:
     """Write transforms.json, images/ and points.ply (initial points of a splat) into a new folder.
 
-    Cameras are camera-to-world with OpenGL's axes (x right, y up, z backward). nerfstudio rotates, shifts and scales
-    the scene unless called with `--orientation-method none --center-method none --auto-scale-poses False`.
+    The matrices are base_from_camera with OpenGL's camera axes (x right, y up, z backward). nerfstudio rotates, shifts
+    and scales the scene unless called with `--orientation-method none --center-method none --auto-scale-poses False`.
     """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
@@ -69,7 +69,7 @@ def write_nerfstudio(
 
 
 def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
-    """Return the camera model of transforms.json and its parameters."""
+    """Return camera model and intrinsics for transforms.json; raise InputError if nerfstudio lacks the model."""
     if intrinsics.model in ("rational", "thin_prism"):
         raise InputError(f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort")
     plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
@@ -91,7 +91,7 @@ def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
 
 
 def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
+    """Write the images and a COLMAP model with all tracks (sparse/0, binary and text) into a new folder."""
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
         model = _colmap_model(views, names, intrinsics)
@@ -107,7 +107,7 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
 
 
 def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) -> pycolmap.Reconstruction:
-    """Return the COLMAP model of the images with these names and intrinsics, tracks included."""
+    """Return a COLMAP model with the camera poses in the base frame, the given names and intrinsics, and all tracks."""
     if intrinsics.model == "thin_prism":
         raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
     model = pycolmap.Reconstruction()
@@ -118,7 +118,7 @@ def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) 
     if intrinsics != views.intrinsics:
         x_px = project(intrinsics, unproject(views.intrinsics, x_px))
     inside = ((x_px >= -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
-    place = np.zeros(len(x_px), int)  # of each observation among those of its image
+    place = np.zeros(len(x_px), int)  # index of each observation within its image
     for row, name in enumerate(names):
         mine = inside & (views.tracks.image == row)
         place[mine] = np.arange(mine.sum())
@@ -136,7 +136,7 @@ def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) 
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:
-    """Copy, link or undistort the images into a new folder; return their names and the intrinsics that then hold."""
+    """Copy, link or undistort the images into a new folder; return their new names and intrinsics."""
     folder.mkdir()
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):
@@ -164,7 +164,7 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that becomes `folder` at the end; raise InputError where that is not empty."""
+    """Yield a temporary folder that is renamed to `folder` at the end; raise InputError if `folder` is not empty."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; name a new folder, or remove it first")
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
-"""Map in the formats of planners and of Rerun: OctoMap, voxel grid of distances, spheres, mesh of the surface.
+"""Export of the map for planners and Rerun: OctoMap, voxel grid of distances, spheres, mesh of the surface.
 
-The first three query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
+OctoMap, voxel grid and spheres are computed by queries, so they agree with `SceneMap.check_spheres` and
+`SceneMap.query`.
 """
 
 from pathlib import Path
@@ -31,13 +32,13 @@ _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo want
 def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write a binary OctoMap (.bt) with voxels of side `voxel_size` m, by default the map's cell.
 
-    A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
-    neither a surface nor anything unseen; all others are left out, which are unknown to OctoMap.
-    Raises InputError without pyoctomap, and where the voxels would be too many.
+    A voxel is occupied if its inscribed sphere touches a seen surface, and free if the sphere touches neither a surface
+    nor unseen space. All other voxels are left out, so OctoMap treats them as unknown. Raises InputError without
+    pyoctomap, and if there would be too many voxels.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, options.voxel_size)
-    # OctoMap's voxels lie between whole multiples of their side; those that the workspace holds are asked.
+    # OctoMap's voxels lie between multiples of their side; only those inside the workspace are queried.
     low, high = np.ceil(scene.box[0] / voxel - 1e-6), np.floor(scene.box[1] / voxel + 1e-6)
     centers = _centers(low * voxel, (high - low).astype(int), voxel).reshape(-1, 3)
     state = scene.check_spheres(centers, voxel / 2, unknown="report")
@@ -77,7 +78,7 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
 
 
 def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
-    """Write arrays and provenance as .npz, whole or not at all."""
+    """Write arrays and notes as .npz; an interrupted write leaves no partial file."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(
             stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()}
@@ -85,10 +86,10 @@ def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
 
 
 def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write spheres that hold solid space and reach at most `excess` m beyond it as .npz: `centers` (n,3), `radii` (n,).
+    """Write spheres (`centers` (n,3), `radii` (n,)) as .npz that cover solid space with at most `excess` m beyond it.
 
-    Unseen space counts as free by default. The default excess is two of the map's cells; space is sampled in steps of
-    a quarter of it.
+    Unseen space counts as free by default. The default excess is two cells of the map; space is sampled in steps of a
+    quarter of the excess.
     """
     unknown = options.unknown or "free"
     excess = 2 * scene.cell if options.excess is None else options.excess
@@ -103,8 +104,8 @@ def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
     """Write the seen surface with vertex colours as binary glTF.
 
-    Its vertices are those of the robot's frame, z up, as planners load them; glTF's own viewers take y for up and
-    show it lying on its side. Raises InputError where the map has no surface.
+    Vertices are in the robot's base frame with z up, as planners load them; viewers of glTF take y for up and show the
+    surface lying on its side. Raises InputError if the map has no surface.
     """
     vertices, faces, colors = surface_mesh(scene)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
@@ -115,13 +116,13 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the centres of a grid of voxels."""
+    """Return the voxel centres of a grid; `lower` is its corner and `count` its number of voxels along x, y, z."""
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """Return the voxels' side, by default the map's cell; raise InputError for no length or too many voxels."""
+    """Return a voxel's side (m), by default the map's cell; raise InputError if it is invalid or there are too many."""
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():
@@ -140,7 +141,10 @@ def write_rrd(
     scene: SceneMap,
     notes: dict[str, str],
 ) -> None:
-    """Write a .rrd; raise InputError without rerun-sdk, which is 500 MB and therefore an extra of its own."""
+    """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
+
+    Raises InputError without rerun-sdk, which is 500 MB and therefore an extra of its own.
+    """
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)
     intrinsics = views.intrinsics

@@ -1,4 +1,4 @@
-"""Measurement of objects on the support plane: height, footprint and box with standard deviations."""
+"""Measurement of the objects on the support plane: height, footprint and box with standard deviations."""
 
 from dataclasses import dataclass
 
@@ -13,62 +13,65 @@ from jcr.records import PointCloud
 from jcr.segments.tabletop import FEWEST, Support, fit_support
 
 SHARPEST = 0.0005
-"""Metres; heights are separated no finer than this, nor than twice the roughness of the plane."""
+"""Smallest width (m) over which heights are smoothed; twice the roughness of the plane if that is larger."""
 TOP_SHARE = 0.25
-"""Least density of a top as a share of the object's mean density along its height; stray points have less."""
+"""Smallest density of points at a top, as a share of the object's mean density over its height; stray points are
+sparser."""
 CELL = 0.003
-"""Side (m) of the cells in which the density of an object seen from above is counted."""
+"""Side (m) of the cells in which an object's points, seen from above, are counted."""
 EDGE_SHARE = 0.4
-"""Share of the median density seen from above, below which a cell holds wrong depths beside an outline."""
+"""Density of points seen from above, as a share of the median density, below which a cell holds only wrong depths
+beside an outline."""
 SIDE_SHARE = 0.005
-"""Share of the area seen from above that noise has put beyond each side."""
+"""Share of the area seen from above that is cut off at each side, because noise has put it there."""
 SAME_TOP = 0.05
-"""Largest jackknife deviation, as a share of the height, of a top that several images show."""
+"""Largest jackknife deviation, as a share of the height, of a top that several images confirm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSize:
-    """One object on the support plane; standard deviations are one sigma."""
+    """Size and position of one object on the support plane; standard deviations are one sigma."""
 
     label: int
     name: str
     points: int
     height: float
-    """Height of its top above the plane, metres."""
+    """Height (m) of the object's top above the plane."""
     height_std: float
     top_seen: bool
-    """Whether the top rests on no single image; else `height` is of what was seen, and it may be higher."""
+    """True if several images confirm the top; if False, the object may be higher than `height`."""
     footprint_in_base: Float[ndarray, "k 3"]
-    """Convex outline on the plane, metres, in order around it."""
+    """Convex outline of the object on the plane: k corners (m) in order."""
     base_from_box: Float[ndarray, "4 4"]
-    """Centre and axes of the smallest box around it that stands on the plane; z up, x the longer side."""
+    """Pose of the object's smallest box that stands on the plane: origin at the centre, z up, x along the longer
+    horizontal side."""
     box_size: Float[ndarray, "3"]
-    """Metres along the axes of that box."""
+    """Length, width and height (m) of the box, along its axes x, y, z."""
     box_std: Float[ndarray, "3"]
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """The support plane and what stands on it."""
+    """Support plane of a scene and the sizes of the objects on it."""
 
     support: Support
     objects: tuple[ObjectSize, ...]
-    """Largest footprint first."""
+    """Objects, sorted by footprint, largest first."""
 
 
 def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:
     """Measure all labelled objects above the support plane.
 
-    The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
-    sigma) of the calibration's scale. Standard deviations are the jackknife's over images (Efron and Stein
-    1981): depth errors go together within an image, so the number of points does not count. To it add the scale,
-    the spread of the top over the root of the number of images and how bent the table is, and at the sides half a
-    cell. Raises InputError when no plane carries the scene.
+    Label 0 and the support plane's own label are not objects. `scale_std` is the relative standard deviation of the
+    calibration's scale. Standard deviations come from a jackknife over images (Efron and Stein 1981), because depth
+    errors are correlated within an image. Added are the error of the scale, half a cell for the sides and, for the
+    height, the bend of the table and the spread of the top divided by the root of the number of images. Raises
+    InputError if no plane carries the scene.
     """
     support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
-    # Seen from the others alone, the plane lies a little higher or lower.
+    # Height of the plane without one image, for each image.
     off, shown_by = x_in_support[support.on_plane, 2], cloud.image[support.on_plane]
     n = len(cloud.camera_centers_in_base)
     total, count = np.bincount(shown_by, off, n), np.bincount(shown_by, minlength=n)
@@ -115,9 +118,10 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, given_rad: float | None = None
 ) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
-    """Return top and spread of its points, rotation to the longer side, centre, sides and outline of an object.
+    """Measure one object: height of its top, spread of the top, rotation, centre, side lengths, outline.
 
-    The rotation is estimated where it is not given.
+    Top and spread are in m above the plane. Rotation (rad, about z, from x to the longer side) is estimated if
+    `given_rad` is None. Centre, side lengths and the convex outline are in m in the plane.
     """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
@@ -137,16 +141,16 @@ def _shape(
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """Return the convex hull in single precision, which is exact enough near the origin."""
+    """Return the k corners of the convex hull; it is computed in single precision, exact enough near the origin."""
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
 
 
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
-    """Return the height of the top and the spread of its points.
+    """Return the height of an object's top (m) and the robust standard deviation of the heights around it (m).
 
-    Over the heights a flat top is a peak of the density and a round one a step. The highest peak that is no
-    scatter is taken, and the median of the heights around it. (A high quantile instead is lifted by the points
-    that stray above narrow tops, by 2 % and more.)
+    Over height, the density of points has a peak at a flat top and a step at a round one. The result is the median
+    height around the highest peak that is not scatter. A high quantile would be 2 % and more too large for narrow tops
+    with stray points above them.
     """
     width = max(2 * roughness, SHARPEST)
     step = width / 4
@@ -164,9 +168,9 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 
 
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
-    """Return the points without the thin fringe around them, and the share of a cell that each represents.
+    """Return the points (m) without the sparse fringe around them, and a weight for each: 1 / points in its cell.
 
-    Points are counted in the cells seen from above, with an empty cell all around.
+    Cells are squares of side CELL seen from above.
     """
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     count = np.zeros([rows.max() + 2 for rows in cell])
@@ -179,5 +183,5 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
 
 
 def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
-    """Return the rows of axes rotated from x and y."""
+    """Return two unit vectors as rows: the axes x and y rotated by `rotation_rad`."""
     return rotation_exp(np.array([0.0, 0.0, -rotation_rad]))[:2, :2]

@@ -1,4 +1,4 @@
-"""Options and result of segmentation, in a module of their own so that the command line's help imports no SciPy."""
+"""Options and result type of the segmentation, kept apart so that the help of the command line imports no SciPy."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -35,4 +35,4 @@ class SegmentOptions:
 
 
 LabelImages = tuple[Int[ndarray, "m h w"], tuple[str, ...]]
-"""Labels at the pointmaps' pixels, 0 = none, and the name of each label; label 0 is none."""
+"""Labels at the pixels of m pointmaps (0: no object), and the name of each label; the name of label 0 is "none"."""

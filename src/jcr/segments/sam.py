@@ -1,7 +1,7 @@
-"""Segments from Segment Anything 2: masks of every image, made into objects where they overlap in space.
+"""Segmentation by Segment Anything 2: masks of every image, merged into objects where they overlap in space.
 
-The network is `transformers`' Sam2Model (Ravi et al., "SAM 2: Segment Anything in Images and Videos", 2024).
-Its image processor needs torchvision, so images are prepared here.
+The network is `transformers`' Sam2Model (Ravi et al., "SAM 2: Segment Anything in Images and Videos", 2024). Its image
+processor needs torchvision, so images are prepared here.
 """
 
 import os
@@ -27,22 +27,23 @@ if TYPE_CHECKING:
     from transformers import Sam2Model
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Mean and standard deviation of RGB in [0, 1] that the network was trained with."""
+"""Mean and standard deviation of RGB values in [0, 1] by which the network's input is normalised."""
 SIDE_POINTS, BATCH = 16, 64
-"""Prompts on a side of the image, and prompts a forward pass."""
+"""Number of prompt points along each side of an image, and number of prompts per forward pass."""
 LEAST_QUALITY, LEAST_STABILITY = 0.7, 0.9
-"""The network's own estimate of a mask's overlap with the truth, and the mask's overlap with itself when the
-threshold moves by one up and down, as in the authors' automatic mask generator."""
+"""Smallest quality and stability of a mask. Quality is the network's estimate of the mask's overlap with the truth.
+Stability is the overlap of the masks with the threshold one higher and one lower, as in the authors' automatic mask
+generator."""
 SAME = 0.7
-"""Intersection over union of two masks of one image that are one mask."""
+"""Intersection over union above which two masks of one image are duplicates."""
 VOXEL = 0.01
-"""Side (m) of the cells in which masks of different images are compared."""
+"""Side (m) of the cells of space in which masks of different images are compared."""
 OVERLAP = 0.5
-"""Intersection over union, in the cells that both images see, of two masks that show one object."""
+"""Intersection over union, in the cells that both images see, above which masks of two images show one object."""
 
 
 def load_sam(weights: str) -> "Sam2Model":
-    """Load Segment Anything 2 by hub id or path; raise InputError where it is missing or damaged."""
+    """Load Segment Anything 2 from a hub id or path; raise InputError if the weights are missing or damaged."""
     extra("transformers", "sam", "--segments sam")
     from transformers import Sam2Model, logging
 
@@ -77,7 +78,7 @@ def sam_labels(
     hand_eye: Calibration,
     progress: Progress | None = None,
 ) -> LabelImages:
-    """Return labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
+    """Return labels at the pointmaps' pixels: masks of Segment Anything, merged into objects by overlap in space."""
     dense = reconstruction.dense
     images = steps(progress or silent, "segment anything", list(dense.colors))
     masks = [image_masks(model, image) for image in images]
@@ -87,9 +88,10 @@ def sam_labels(
 
 @torch.no_grad()
 def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "k h w"]:
-    """Return masks of everything that the network finds in one image, best first.
+    """Return the k masks that the network finds in one image, highest quality first, without duplicates.
 
-    Prompts are points on a regular grid; of the three masks for each, the one of highest quality is taken.
+    Prompts are points on a regular grid. The network gives three masks for each, of which the one of highest quality is
+    taken.
     """
     device = next(model.parameters()).device
     size = model.config.prompt_encoder_config.image_size  # pyright: ignore
@@ -119,7 +121,7 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
     area, shared = flat.sum(1), flat @ flat.T
     same = shared > SAME * (area[:, None] + area - shared)
     kept: list[int] = []
-    for k in range(len(masks)):  # without those that repeat an earlier one
+    for k in range(len(masks)):  # skip masks that repeat a better one
         if area[k] > 0 and not same[k, kept].any():
             kept.append(k)
     return masks[kept].cpu().numpy()
@@ -128,10 +130,11 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
 def merged(
     masks: list[Bool[ndarray, "_ h w"]], x_in_base: Float[ndarray, "m h w 3"], known: Bool[ndarray, "m h w"]
 ) -> LabelImages:
-    """Return labels (m,h,w) of the objects that the masks of m images show, 1 for the largest; 0 = none.
+    """Return labels (m,h,w) of the objects in m images, 1 for the largest, 0 for no object, and the labels' names.
 
-    Two masks of different images are one object when they fill the same cells of space, of those that both
-    images see. What one image alone shows is no object, where there are several images.
+    `masks` has the masks of each image, `x_in_base` the position of each pixel (m) and `known` the pixels with a
+    position. Two masks of different images show one object if they fill the same cells of space, counted in cells that
+    both images see. If there are several images, an object must appear in two or more.
     """
     low = x_in_base[known].min(0) if known.any() else np.zeros(3)
     cell = np.floor((x_in_base - low) / VOXEL).astype(np.int64)
@@ -162,7 +165,7 @@ def merged(
     rank[np.argsort(-size)[: (size > 0).sum()]] = np.arange(1, (size > 0).sum() + 1)
     labels = np.zeros(known.shape, np.int64)
     for row in np.argsort([-mask.sum() for of_image in masks for mask in of_image]):
-        # The smaller mask lies on the larger: a mug on the table.
+        # Smaller masks overwrite larger ones: a mug lies on the table.
         k = image_of[row]
         mask = masks[k][row - np.searchsorted(image_of, k)]
         if rank[group[row]] > 0:

@@ -1,4 +1,4 @@
-"""Segments of a scene: label images of the user (one PNG an image), geometry, or Segment Anything."""
+"""Segmentation of a scene by the user's label images (one PNG per image), by geometry, or by Segment Anything."""
 
 import json
 from pathlib import Path
@@ -17,14 +17,15 @@ from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
 
 MOST = 1024
-"""Largest number of labels; an image given by mistake has more."""
+"""Largest number of labels; an image that is no label image has more values."""
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
-    """Read the capture's `labels/NAME.png` (8 or 16 bit, the image's size, 0 = none); None where there are none.
+    """Read the capture's label images `labels/NAME.png` at the pointmaps' pixels; None if there are none.
 
-    `labels/names.json` may name them: {"1": "mug", …}. Raises InputError when the labels of a registered image
-    are missing or unreadable, have another size than the image, or go beyond 1023.
+    Label images have 8 or 16 bits and the image's size; 0 is no object. `labels/names.json` may name the labels: {"1":
+    "mug", …}. Raises InputError if the label image of a registered image is missing, unreadable, of another size, or
+    has labels beyond 1023.
     """
     folder = capture.folder / "labels"
     if not any(folder.glob("*.png")):
@@ -33,7 +34,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
     at_px = project(reconstruction.intrinsics, rays(reconstruction.dense.intrinsics)).astype(np.float32)
     labels = np.zeros(reconstruction.dense.confidence.shape, np.int64)
     for k, row in enumerate(reconstruction.image_index):
-        if row < len(capture):  # others were added to the run later
+        if row < len(capture):  # later rows are images that were added to the run
             label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
             labels[k] = cv2.remap(label, at_px[..., 0], at_px[..., 1], cv2.INTER_NEAREST, borderValue=0)
     count = int(labels.max()) + 1
@@ -42,7 +43,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read(path: Path, capture: Capture, image: str) -> UInt16[ndarray, "h w"]:
-    """Read the labels of an image; raise InputError where they are missing or do not fit it."""
+    """Read the label image of `image` from `path`; raise InputError if it is missing or does not fit the image."""
     if not path.is_file():
         raise InputError(
             f"{path}: not found; give labels for every image of the capture, or for none ({image})"
@@ -60,7 +61,7 @@ def _read(path: Path, capture: Capture, image: str) -> UInt16[ndarray, "h w"]:
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Read the names of labels; none without a file."""
+    """Read the names of labels from names.json; empty if there is no such file."""
     if not path.is_file():
         return {}
     try:
@@ -78,9 +79,10 @@ def image_labels(
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:
-    """Return labels at the pointmaps' pixels; None where geometry or nothing labels the cloud.
+    """Return labels at the pointmaps' pixels from label images or Segment Anything; None for other methods.
 
-    Raises InputError when label images are asked for and missing, or Segment Anything cannot be loaded.
+    With "auto" the result is None if the capture has no label images. Raises InputError if requested label images are
+    missing or Segment Anything cannot be loaded.
     """
     if options.segments in ("auto", "labels"):
         labels = read_labels(capture, reconstruction)
@@ -100,10 +102,9 @@ def image_labels(
 def label_cloud(
     cloud: PointCloud, options: SegmentOptions, support: Support | None = None
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """Return the cloud with labels from its geometry, where nothing else gave any, and notes for the user.
+    """Label a cloud without labels by its geometry, if the options allow it; return it with notes for the user.
 
-    `support` is found here where it is not given. Raises InputError when the tabletop was asked for and no plane
-    carries the scene.
+    `support` is fitted if it is None. Raises InputError if the option is "tabletop" and no plane carries the scene.
     """
     if options.segments not in ("auto", "tabletop") or len(cloud.label_names) > 1:
         return cloud, ()

@@ -1,4 +1,4 @@
-"""Segmentation by geometry: the support plane, and the objects on it."""
+"""Segmentation of a scene by geometry: the support plane, and the objects on it."""
 
 from dataclasses import dataclass, replace
 
@@ -17,41 +17,45 @@ from jcr.segments.options import TabletopOptions
 
 @dataclass(frozen=True)
 class Support:
-    """The plane that carries the scene."""
+    """Support plane of a scene, on which the objects stand."""
 
     base_from_support: Float[ndarray, "4 4"]
-    """Origin on the plane amid its points, z up, away from it towards the cameras."""
+    """Pose of the plane: origin on the plane amid its points, z normal to it, towards the cameras."""
     noise: float
-    """Robust one-sigma distance (m) of the plane's points from it."""
+    """Robust standard deviation (m) of the distances of the plane's points from the plane."""
     roughness: float
-    """Robust distance (m) from the surface of neighbouring points, which leaves the plane where the table is bent."""
+    """Robust standard deviation (m) of points about the median of their neighbourhood; unlike `noise`, a bent table
+    does not increase it."""
     on_plane: Bool[ndarray, " n"]
-    """Points of the cloud that lie on it."""
+    """Mask of the n points of the cloud that lie on the plane."""
 
 
 FEWEST, LEAST_SHARE = 30, 1e-3
-"""Points of an object, and share of all points."""
+"""Smallest number of points of an object, and smallest share of all points."""
 NOISE_REACH = 4.0
-"""Sigmas of the plane's noise within which a point is taken to lie on it."""
+"""Largest height of a point on the plane, in standard deviations of the plane's noise."""
 CLEARLY = 1.5
-"""Times the height from which points found an object that it must reach: noise comes just that far."""
+"""Multiple of the smallest height of an object that its highest points must exceed; noise reaches that height
+itself."""
 FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
-"""Points, and share of the median cell's, below which a cell of the map from above holds only stray points."""
+"""Smallest number of points of an occupied cell seen from above, and smallest share of the median cell's number. Cells
+with fewer points hold only stray points."""
 PATCH = 0.02
-"""Metres over which a table is taken for flat, however it is bent."""
+"""Side (m) of a patch of the table that counts as flat even if the table is bent."""
 LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
-"""Cosine to the base frame's z axis from which a plane is level, and how many times its points then count."""
+"""Smallest cosine between the normal of a level plane and the base frame's z axis, and factor by which the points of
+level planes count."""
 FEWEST_MEASURED = 1000
-"""Measured points from which a support plane is fitted without those that were filled in."""
+"""Smallest number of measured points for which the fit of the support plane ignores filled-in points."""
 PLANES, SAMPLE = 400, 20_000
-"""Planes through three random points that are tried, and points each is tried on."""
+"""Number of planes through three random points that are tried, and number of points on which each is tested."""
 
 
 def fit_support(cloud: PointCloud) -> Support:
-    """Fit the plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
+    """Fit the plane with most points that has all cameras on one side (RANSAC, then robust least squares).
 
-    What was filled in by planes is left out of the fit and its noise: it lies on planes by construction.
-    Raises InputError when no plane holds a tenth of the points.
+    Points filled in by plane priors are excluded from the fit and its noise, because they lie on planes by
+    construction. Raises InputError if no plane holds a tenth of the points.
     """
     draw = np.random.default_rng(0)
     filled = np.zeros(len(cloud.image), bool) if cloud.reason is None else cloud.reason == PRIOR
@@ -68,12 +72,12 @@ def fit_support(cloud: PointCloud) -> Support:
     offset = (normal * a).sum(1)
     side = np.sign(cloud.camera_centers_in_base @ normal.T - offset)
     one_sided = (np.abs(side.sum(0)) == len(side)) & (length[:, 0] > 1e-9)
-    # A table's points are spread about it by the noise of depth, which is larger the farther the cameras are.
+    # The noise of a table's points is the noise of depth, which grows with the distance of the cameras.
     far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[image], axis=1))
     count = np.zeros(PLANES, int)
-    for k in np.flatnonzero(one_sided):  # one by one, each stays in the processor's cache
+    for k in np.flatnonzero(one_sided):  # one at a time, so that the data stay in the processor's cache
         count[k] = np.count_nonzero(np.abs(some @ normal[k] - offset[k]) < 0.005 * far)
-    # A wall behind the table may be seen more; arms that stand upright are the rule.
+    # A wall behind the table may have more points; most arms stand upright, so level planes are preferred.
     level = np.abs(normal[:, 2]) > LEAST_LEVEL
     best = int((count * np.where(level, LEVEL_WEIGHT, 1)).argmax())
     if count[best] < 0.1 * len(some):
@@ -109,17 +113,17 @@ def fit_support(cloud: PointCloud) -> Support:
 
 
 def _noise(distance: Float[ndarray, " n"]) -> float:
-    """Return a robust standard deviation: 1.4826 times the median absolute deviation."""
+    """Return the robust standard deviation: 1.4826 times the median absolute deviation."""
     return float(1.4826 * np.median(np.abs(distance - np.median(distance))))
 
 
 def label_tabletop(
     cloud: PointCloud, options: TabletopOptions | None = None, support: Support | None = None
 ) -> PointCloud:
-    """Return the cloud with label 1 on the support plane and 2, 3, … on the objects that stand on it, largest first.
+    """Label the cloud: 1 for the support plane, 2, 3, … for the objects that stand on it, largest first.
 
-    Objects are separated seen from straight above: what lies over one another is one object, and so are objects
-    that touch. Raises InputError when no plane carries the scene.
+    Objects are separated as seen from straight above, so objects that touch or lie on one another are one object.
+    Raises InputError if no plane carries the scene.
     """
     options = options or TabletopOptions()
     support = support or fit_support(cloud)
@@ -131,7 +135,7 @@ def label_tabletop(
     object_of = np.zeros(len(height), int)
     if over.any():
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
-        # Two empty cells all around, the outermost one stands for all that lies farther out.
+        # Two empty cells on every side; points farther out are counted in the outermost one.
         low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
         # Connected cells that hold more than a few stray points.
         count = np.zeros(high - low + 1)
@@ -139,7 +143,7 @@ def label_tabletop(
         enough = max(FEWEST_IN_CELL, STRAY_SHARE * float(np.median(count[count > 0])))
         parts, _ = ndimage.label(count >= enough, np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
         place = tuple((np.clip(cell, low, high) - low).T)
-        # What is too low to found an object belongs to the one it lies under: its foot.
+        # Points too low to be an object by themselves belong to the object above them.
         part = np.where((height > noise) & (height < options.object_highest), parts[place], 0)
         beneath = np.asarray(ndimage.binary_dilation(parts > 0, np.ones((3, 3))), bool)
         bare = support.on_plane & ~beneath[place]
@@ -158,13 +162,14 @@ def _objects(
     bare: Bool[ndarray, " n"],
     options: TabletopOptions,
 ) -> Int[ndarray, " n"]:
-    """Return the object of each point, from 1 for the one with most points; 0 = none.
+    """Return the object of each point: 1 for the object with most points, 2, 3, … for the others, 0 for none.
 
-    `bare` are the points of the plane that lie beneath nothing.
+    `part` is the connected part of each point, seen from above, 0 for none. `bare` marks the points of the plane with
+    nothing above them.
     """
     part = _joined(part, x_in_support, options)
     count = np.bincount(part)
-    # What mostly stands beside the bare plane is background, such as a wall; what is too small is noise.
+    # A part mostly outside of the bare plane is background, such as a wall; a small part is noise.
     plane_xy = x_in_support[bare, :2]
     if bare.sum() < FEWEST or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < PATCH**2 / 12:
         raise InputError(
@@ -188,9 +193,10 @@ def _objects(
 def _joined(
     part: Int[ndarray, " n"], x_in_support: Float[ndarray, "n 3"], options: TabletopOptions
 ) -> Int[ndarray, " n"]:
-    """Join parts of one object: outlines that overlap, and small parts in the air close to a larger one.
+    """Return the part of each point after joining the parts of one object.
 
-    The two sides of a ring seen from either side, the far rim of a cup, its handle.
+    Joined are parts whose outlines overlap, such as the two sides of a ring, and small parts in the air close to a
+    larger one, such as a cup's handle.
     """
     count = np.bincount(part)
     count[0] = 0
