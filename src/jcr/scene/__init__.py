@@ -1,1 +1,1 @@
-"""Map of a scene: cloud, training, queries."""
+"""Map of a scene: point cloud, training of occupancy, colour and label fields, and queries."""

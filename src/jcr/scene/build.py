@@ -1,4 +1,4 @@
-"""Training of a map from a point cloud."""
+"""Construction of a map from a point cloud: grid of seen space, then training of the fields."""
 
 import math
 import time
@@ -22,9 +22,10 @@ from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
 from jcr.scene.train import NEAR, rows_inside, train, workspace_box, workspace_rays
 
 HIDDEN = 32
-"""Hidden units of a network."""
+"""Number of hidden units of a field's network."""
 OCCUPANCY_GRIDS, SURFACE_GRIDS = ((0, 4), (1, 2)), ((0, 4), (2, 4))
-"""(lattice of `feature_lattices`, features) in which occupancy and the properties of surfaces are interpolated."""
+"""Feature grids of the occupancy field and of the field of surface properties, each as (row of `feature_lattices`,
+features per node)."""
 
 
 def build_scene(
@@ -34,9 +35,10 @@ def build_scene(
     values: dict[str, Float[ndarray, "n d"]] | None = None,
     device: str = "cpu",
 ) -> SceneMap:
-    """Return the map of a cloud: seen space, and fields of occupancy, colour, label and any further `values` (n,d).
+    """Return the map of a cloud: seen space, and fields of occupancy, colour and label.
 
-    Raises InputError when hardly any point lies in the workspace, or a number is not finite.
+    `values` are other properties of the n points by name, each (n,d), for which fields are trained, too. Raises
+    InputError if fewer than 100 points lie in the workspace, or a number is not finite.
     """
     options = options or MapOptions()
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
@@ -51,7 +53,7 @@ def build_scene(
     report, start = progress or silent, time.perf_counter()
     with threads_of_one_core(torch.device(device)) as pool:
         report("what was seen", 0.0)
-        # Rays that end beyond the workspace cross it all the same.
+        # All points are used, because rays that end outside of the workspace may cross it.
         ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
         seen = carve(*ends, box, cell / 2, cloud.cleared, device)
         carved = time.perf_counter()
@@ -75,7 +77,7 @@ def build_scene(
             fields = Fields([occupancy, surface], lattices).to(device)
 
             def fit(field: Field) -> int:
-                """Train a field and return the number of steps."""
+                """Train a field on the rays, and return the number of steps."""
                 stage = f"map: {', '.join(field.heads)}"
                 return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
 
@@ -85,7 +87,7 @@ def build_scene(
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
-    """Return three lattices: four cells a step everywhere, one cell near surfaces, half a cell on them."""
+    """Return three lattices: spacing of four cells everywhere, of one cell near surfaces, of half a cell on surfaces."""
     hit = (seen.state & HIT) != 0
     nz, ny, nx = ((n // 2 + 3) // 4 for n in hit.shape)
     everywhere = torch.ones(nz, ny, nx, dtype=torch.bool, device=hit.device)
@@ -98,14 +100,14 @@ def feature_lattices(seen: SeenGrid) -> list[Lattice]:
 
 
 def threads_of_one_core(device: torch.device) -> Executor:
-    """Return a pool with a thread for each core, in which torch starts no further threads; one thread on a GPU.
+    """Return a pool with one thread per core, each of which computes in torch without other threads; for a GPU, one.
 
-    Torch's own threads wait for each other, spinning, after each of thousands of short operations: where another
-    process took one core, a training of one second lasted a minute. The limit holds in the pool's threads alone.
+    The threads inside torch wait for each other in a busy loop after every short operation. When another process used
+    one core, a training of one second therefore lasted a minute. The limit holds in the threads of this pool only.
     """
 
     def limit() -> None:
-        """Limit the calling thread."""
+        """Limit torch to one thread in the calling thread."""
         torch.zeros(1)  # torch sets its number of threads at a thread's first operation
         threadpool_limits(1, user_api="openmp")
 

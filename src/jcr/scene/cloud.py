@@ -15,14 +15,14 @@ from jcr.records import MATCHED, PRIOR, Capture, PointCloud, Reconstruction
 from jcr.scene.options import CloudOptions
 
 LEAST_SURE = 40.0
-"""Percent of the points that rest on matching alone, the least confident, to which the way counts as seen by no one:
-few images agree on them, and a depth that ends too deep is one of theirs. It takes a third of what is free and wrong."""
+"""Percentage of the points from matching alone, the least confident, whose rays show no free space: few images agree on
+them, and depths that are too large are among them. This removes a third of the space that is wrongly called free."""
 _COLUMNS = {
     **dict.fromkeys("xyz", "f4"),
     **dict.fromkeys(("red", "green", "blue"), "u1"),
     **{"label": "i4", "confidence": "f4", "margin": "f4", "image": "i4", "reason": "u1", "depth_std": "f4"},
 }
-"""Properties of a point; the last two of clouds with a reason and a standard deviation (m) for each depth."""
+"""Properties of a point in the PLY file and their types; `reason` and `depth_std` are written only if they are known."""
 _AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _FIRST = "comment jcr cloud in the base frame, metres"
@@ -36,16 +36,16 @@ def point_cloud(
     options: CloudOptions | None = None,
     label_names: tuple[str, ...] = ("none",),
 ) -> PointCloud:
-    """Return the confident points in the base frame, with colour, label, margin and the image of each.
+    """Return the confident points of the pointmaps in the base frame, with colour, label, margin and image of each.
 
-    `labels` (m,h,w) are segments at the pointmaps' pixels, 0 = none; `label_names` names them.
-    Raises InputError when no point passes the threshold.
+    `labels` (m,h,w) are rows of `label_names` at the pixels of the pointmaps, 0 = none. Raises InputError if no point
+    has enough confidence.
     """
     options = options or CloudOptions()
     dense = reconstruction.dense
     confidence = dense.confidence
     keep = confidence > 0
-    # Depths on a plane have passed tests of their own, and hardly any is wrong.
+    # Only points from matching alone are tested by percentile: other points passed tests of their planes.
     alone = keep if dense.reason is None else keep & (dense.reason == MATCHED)
     if options.confidence_threshold is not None:
         keep &= confidence >= options.confidence_threshold
@@ -89,10 +89,10 @@ def point_cloud(
 def _clears(
     reason: UInt8[ndarray, " n"], confidence: Float[ndarray, " n"], added: Bool[ndarray, " n"]
 ) -> Bool[ndarray, " n"]:
-    """Test which points show that the space before them is free: no priors, no doubtful matches.
+    """Test for each point whether the space between camera and point counts as free.
 
-    Images that were `added` to a run show what has changed, where the others contradict them: there no match is too
-    doubtful to say that a thing was taken away.
+    It does not for priors, nor for the LEAST_SURE percent of least confident matches. Matches in images `added` to a run
+    always count, because they show that an object was removed even if earlier images contradict them.
     """
     alone = (reason == MATCHED) & ~added
     least = np.percentile(confidence[alone], LEAST_SURE) if alone.any() else 0.0
@@ -105,11 +105,11 @@ def position_std(
     image: Integer[ndarray, " n"],
     x_in_recon: Float[ndarray, "n 3"],
 ) -> Float[ndarray, " n"]:
-    """Return the standard deviation (m) of each point in the worst direction, as far as the calibration causes it.
+    """Return the standard deviation (m) of each point along its worst direction, caused by errors of the calibration.
 
-    `recon_from_camera` and `x_in_recon` are metric. Where images were adjusted it is that of the scene in the base
-    frame. Of camera poses alone, a point that image i sees at x in its camera lies in the base frame at
-    base_from_gripper[i] · gripper_from_camera · x, and errs as X and the scale do.
+    `recon_from_camera` (m,4,4) and points `x_in_recon` (n,3) are in metres; `image` are rows of `recon_from_camera`.
+    After a bundle adjustment this is the uncertainty of the scene's pose in the base frame. Otherwise it follows from
+    the covariance of gripper_from_camera and scale, for the point's position in the camera of its image.
     """
     placed = hand_eye.uncertainty.scene
     if placed is not None:
@@ -124,10 +124,10 @@ def position_std(
 
 
 def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None = None) -> None:
-    """Write points with colour, label, confidence, margin (m) and image as binary PLY.
+    """Write a cloud as binary PLY: points with colour, label, confidence, margin (m) and image.
 
-    The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back;
-    `notes`, each of one line, are added to them.
+    Comments in the header hold the label names and camera centres, which `read_cloud` reads. `notes` are further
+    comments, one line per name and text.
     """
     columns = dict(zip(_COLUMNS, (*cloud.points_in_base.T, *cloud.color.T), strict=False))
     for name in list(_COLUMNS)[6:]:
@@ -152,7 +152,7 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """Read a cloud that `write_cloud` wrote; raise InputError for any other file."""
+    """Read a PLY file of `write_cloud`; raise InputError for any other file."""
     try:
         header, _, body = read_bytes(path).partition(b"end_header\n")
         lines = header.decode().splitlines()

@@ -1,4 +1,4 @@
-"""Signed distance to the nearest surface: an exact Euclidean distance transform of the learned field."""
+"""Signed distance to the nearest surface, by a Euclidean distance transform of the trained occupancy field."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +13,10 @@ from torch import Tensor
 from jcr.scene.fields import interpolate_grid
 
 BISECTIONS = 5
-"""Halvings of a grid edge in search of the surface: 0.3 mm at cells of 1 cm."""
+"""Number of bisections that locate the surface on a grid edge: to 0.3 mm for cells of 1 cm."""
 
 IsSolid = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]
+"""Function that tests which points (n,3) m of the base frame are in solid space."""
 
 
 @dataclass(frozen=True)
@@ -23,28 +24,31 @@ class DistanceGrid:
     """Signed distance (m, negative inside) and its gradient at the nodes of a regular grid."""
 
     lower: Float[Tensor, "3"]
+    """Position (m, base frame) of the first node, the lower corner of the grid."""
     cell: float
+    """Distance (m) between neighbouring nodes."""
     nodes: Float[Tensor, "nz ny nx"]
-    """The distance."""
+    """Signed distance (m) at the nodes."""
     gradients: Float[Tensor, "4 nz ny nx"]
-    """The distance again, then its derivatives along x, y and z; in memory node after node, as queries read it."""
+    """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Return distance and gradient (n,4), interpolated trilinearly at points (n,3) of the box."""
+        """Return distance (m) and its derivatives along x, y, z (n,4), interpolated at points (n,3) m of the box."""
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the distance (n,) alone, at points (n,3) of the box."""
+        """Return the distance (n,) m, interpolated at points (n,3) m of the box."""
         return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 
 def distance_grid(
     lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], is_solid: IsSolid, closed: bool
 ) -> DistanceGrid:
-    """Return the distances of grid nodes (nz,ny,nx) from the boundary of solid space; `closed`: so is all outside.
+    """Return the signed distances of grid nodes from the boundary of solid space.
 
-    Nodes beside the boundary carry the point of it that is nearest to them; every other node takes the distance
-    to the point of its nearest such node. Where there is no boundary at all, the distance is the box's diagonal.
+    The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` on. `closed`: the space outside of the
+    grid is solid, too. For each node next to the boundary the nearest boundary point is computed; every other node takes
+    the point of its nearest such node. Without any boundary, the distance is the diagonal of the grid.
     """
     node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
@@ -75,10 +79,10 @@ def distance_grid(
 def _boundary(
     lower: Float[Tensor, "3"], cell: float, solid: Bool[Tensor, "nz ny nx"], is_solid: IsSolid
 ) -> tuple[Float[ndarray, "3 nz ny nx"], Bool[ndarray, "nz ny nx"]]:
-    """Return offsets (cells; z, y, x) from nodes to their nearest boundary, and a mask of the nodes beside it.
+    """Return offsets (z, y, x in cells) from nodes to their nearest boundary points, and a mask of the nodes next to it.
 
-    Where the boundary cuts a node's edges at t_x, t_y and t_z, the plane through the cuts is nearest at n·d with
-    n_a = d / t_a and 1/d² = Σ 1/t_a², as fast marching starts (Adalsteinsson and Sethian 1999).
+    The boundary intersects the edges of a node at distances t_a along the axes a. The nearest point of the plane through
+    the intersections is n·d, with n_a = d / t_a and 1/d² = Σ 1/t_a² (Adalsteinsson and Sethian 1999).
     """
     inverse = np.zeros((3, *solid.shape), np.float32)
     for axis in range(3):

@@ -1,6 +1,6 @@
-"""The networks of the map: an encoding of position, one hidden layer, one linear head per property.
+"""Neural fields of the map: an encoding of the position, one hidden layer, and one linear head per property.
 
-Positions are metres of the base frame; each encoding scales them by itself.
+Positions are in metres of the base frame; the encodings scale them.
 """
 
 import math
@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 
 class Lattice(nn.Module):
-    """The nodes of a regular grid over the workspace, whose chosen few carry features.
+    """Regular grid over the workspace, with trainable features at selected nodes, such as those near surfaces.
 
-    Fine features are needed near surfaces only; all other nodes share row 0.
+    A table of features has one row for each selected node; all other nodes share row 0.
     """
 
     lower: Tensor
@@ -37,7 +37,7 @@ class Lattice(nn.Module):
 
     @classmethod
     def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
-        """Return the lattice whose nodes with features are the corners of the cells `near`."""
+        """Return the lattice whose selected nodes are the corners of the cells in the mask `near`."""
         corner = F.pad(near, (1, 1, 1, 1, 1, 1))
         for axis, n in enumerate(corner.shape):
             corner = corner.narrow(axis, 0, n - 1) | corner.narrow(axis, 1, n - 1)
@@ -45,7 +45,7 @@ class Lattice(nn.Module):
         return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
 
     def corners(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
-        """Return the rows (n,8) of the eight nodes around each point, and their trilinear weights (n,8)."""
+        """Return the feature rows (n,8) of the eight nodes around each point (n,3) m, and trilinear weights (n,8)."""
         nz, ny, nx = self.shape
         at = (x_in_base - self.lower) * (1.0 / self.cell)
         last = torch.tensor([nx - 2, ny - 2, nz - 2], dtype=torch.int32, device=at.device)
@@ -62,17 +62,17 @@ class Lattice(nn.Module):
 
 
 class Interpolate(torch.autograd.Function):
-    """Weighted sums of table rows; several times faster to differentiate than indexing or embedding_bag."""
+    """Differentiable weighted sum of table rows; its gradient is several times faster than that of embedding_bag."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-        """Return (features, n) from a table (k, features), rows (n,8) and weights (n,8)."""
+        """Return weighted sums (features, n) of rows of a table (k, features); `rows` and `weight` are (n,8)."""
         ctx.save_for_backward(table, rows, weight)
         return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
-        """Scatter the gradient to the rows, one feature at a time; and to the weights if they come from a query."""
+        """Return the gradients by table and weights, each only if needed; one feature is scattered at a time."""
         (gradient,) = gradients
         table, rows, weight = ctx.saved_tensors
         of_table = of_weight = None
@@ -93,14 +93,17 @@ def interpolate_grid(
     cell: float,
     x_in_base: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "k n"]:
-    """Return values at the nodes of a regular grid, interpolated trilinearly at points (n,3) of its box."""
+    """Return k values (k,n) of a regular grid, interpolated trilinearly at points (n,3) m of its box.
+
+    `table` holds the values at the nodes, `lower` is the position of the first node, `cell` the spacing (m).
+    """
     cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
     at = ((x_in_base - lower) * (2.0 / (cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
     return F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1)
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a layer initialised as torch.nn.Linear does, from a generator of its own."""
+    """Return a linear layer with the initial weights of torch.nn.Linear, drawn from `generator`."""
     layer, bound = cast(nn.Linear, nn.utils.skip_init(nn.Linear, inputs, outputs)), inputs**-0.5
     nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
     nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
@@ -108,7 +111,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.L
 
 
 class Field(nn.Module):
-    """Properties as functions of position: logits of occupancy and labels, plain values of other properties."""
+    """Network that returns properties at positions: logits of occupancy and labels, values of other properties."""
 
     frequency: Tensor
     center: Tensor
@@ -123,9 +126,10 @@ class Field(nn.Module):
         grids: Sequence[Sequence[int]] = (),
         generator: torch.Generator | None = None,
     ) -> None:
-        """Initialise the layers from `generator`: `heads` are properties and their numbers of outputs.
+        """Initialise the layers from `generator`; `heads` maps names of properties to their numbers of outputs.
 
-        The encoding has sinusoids of so many `frequencies`, or features of `grids`: (row of `lattices`, features).
+        `hidden` is the number of hidden units, `box` the workspace (m). The encoding is made of sinusoids of that number
+        of `frequencies`, or of interpolated features; `grids` lists (row of `lattices`, features per node).
         """
         super().__init__()
         self.about = {"heads": heads, "hidden": hidden, "frequencies": frequencies, "grids": grids}
@@ -142,7 +146,7 @@ class Field(nn.Module):
         self._dense: list[Tensor] | None = None
         self.hidden = linear(sum((n for _, n in grids), 6 * frequencies), hidden, generator)
         self.heads = nn.ModuleDict({name: linear(hidden, n, generator) for name, n in heads.items()})
-        # Mean and deviation of plain values, whose unit is anyone's: the heads learn them standardised.
+        # Heads of plain values, whose unit is arbitrary, learn them standardised by these means and deviations.
         self.standard = nn.ParameterDict(
             {
                 name: nn.Parameter(torch.tensor([[0.0], [1.0]]).repeat(1, n), requires_grad=False)
@@ -153,13 +157,13 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Take mean and deviation of the plain values from what is to be learnt, each (n, outputs)."""
+        """Set mean and standard deviation of the plain values to those of the training targets, each (n, outputs)."""
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
     def expand(self) -> None:
-        """Keep the trained features at every node: more memory, and answers three times as fast."""
+        """Store the trained features of every node in a dense grid: queries need more memory and a third of the time."""
         self._dense = [
             table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
             for table, lattice in zip(self.tables, self._lattices, strict=True)
@@ -167,11 +171,14 @@ class Field(nn.Module):
 
     @property
     def tables(self) -> nn.ParameterList:
-        """Features at the nodes of each lattice."""
+        """Trainable features of each lattice, (rows, features)."""
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Return the features (f,n) of points: of lattices, or sin and cos of 2^k·π·x (Mildenhall 2020, eq. 4)."""
+        """Return the encoding (f,n) of points (n,3) m: features of the lattices, or sinusoids.
+
+        The sinusoids are sin and cos of 2^k·π·x, for positions x scaled to [-1, 1] (Mildenhall 2020, eq. 4).
+        """
         if len(self.frequency):
             angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
             return torch.cat([angle.sin(), angle.cos()])
@@ -183,7 +190,7 @@ class Field(nn.Module):
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Return the outputs (n, outputs) of every head at points (n,3)."""
-        # Features first: with so few of them, this product and its gradients take half the time.
+        # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
         for name, head in self.heads.items():
@@ -195,7 +202,7 @@ class Field(nn.Module):
 
 
 class Fields(nn.Module):
-    """All fields of a map, one for all properties or one for each, and the lattices they share."""
+    """All fields of a map, each with one or several properties, and the lattices that they share."""
 
     of: Iterable[Field]
     """The fields."""
@@ -217,9 +224,9 @@ CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
 
 
 def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
-    """Return what `ask` returns for the rows of `columns`, called piece by piece and joined.
+    """Call `ask` for pieces of the rows of `columns`, and return its results joined to whole columns.
 
-    Gradients are kept where a column wants them. Without them, each core takes pieces of its own.
+    Gradients are computed if a column requires them. Otherwise the pieces are divided among the cores.
     """
     wanted = any(column.requires_grad for column in columns)
 

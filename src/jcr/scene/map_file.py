@@ -1,4 +1,4 @@
-"""File of a map; without torch, reading one raises InputError with the package to install."""
+"""Reading of map files; without torch, reading raises InputError that names the package to install."""
 
 import json
 from pathlib import Path
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 FILE = "map.safetensors"
 PACKAGES = "torch", "safetensors", "skimage"
-"""Packages that training, reading and meshing a map need."""
+"""Packages that are needed to train, read and mesh a map."""
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
-    """Load the map of a run folder (or a map file itself).
+    """Load the map of a run folder, or a map file, onto a device such as "cpu" or "cuda".
 
-    Raises InputError if there is none, if it is damaged, if another version of jcr wrote it, or if its packages are not
-    installed.
+    Raises InputError if there is no map, if it is damaged, if it has the format of another version of jcr, or if a
+    package is not installed.
     """
     path = Path(folder)
     path = path / FILE if path.is_dir() else path
@@ -47,6 +47,6 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """Raise InputError where one of `PACKAGES` is not installed."""
+    """Raise InputError if one of `PACKAGES` is missing; `what` needs them, and `otherwise` ends the message."""
     for package in PACKAGES:
         extra(package, "map", what, otherwise)

@@ -1,4 +1,4 @@
-"""Options of cloud and map, apart from the code that imports torch, for the help of the command line."""
+"""Options of cloud and map, separate from the code that imports torch so that the command-line help loads fast."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -1,4 +1,4 @@
-"""Published representation of a scene: a network for each property, trained as JCR (section IV-C) describes."""
+"""Published representation of a scene: one network per property, trained as in the JCR paper (section IV-C)."""
 
 import time
 
@@ -11,14 +11,14 @@ from jcr.scene.fields import Field
 from jcr.scene.train import rows_inside, workspace_box
 
 FREQUENCIES, HIDDEN, BATCH, RATE = 10, 256, 6144, 5e-3
-"""Frequencies of NeRF's encoding of position; hidden units; points a step; learning rate of Adam."""
+"""Number of frequencies of NeRF's position encoding; hidden units; points per training step; learning rate of Adam."""
 
 
 class PaperField(Field):
-    """Sinusoidal encoding, one hidden layer of 256 ReLU, one linear layer."""
+    """Field of one property: sinusoidal encoding, one hidden layer of 256 ReLU units, one linear layer."""
 
     def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
-        """Initialise the layers of one property from `generator`; positions are scaled by `box` (2,3) m."""
+        """Initialise the layers of the property `name` from `generator`; `box` (2,3) m scales the positions."""
         super().__init__({name: outputs}, HIDDEN, box, frequencies=FREQUENCIES, generator=generator)
 
 
@@ -30,10 +30,10 @@ def train_paper(
     box: np.ndarray | None = None,
     max_seconds: float = np.inf,
 ) -> dict[str, PaperField]:
-    """Return fields of occupancy, color and, where the cloud has several, label; `weighted` by confidence.
+    """Return trained fields of occupancy, color and, if the cloud has several labels, label.
 
-    Occupancy has the points as positives and as many uniform negatives of the workspace `box` (binary cross-entropy);
-    color takes the mean squared error, label the cross-entropy.
+    `weighted`: points weigh by their confidence. Occupancy is trained with the points as positives and as many negatives
+    drawn uniformly from the workspace `box` (binary cross-entropy); color by squared error, label by cross-entropy.
     """
     box = workspace_box(cloud, None) if box is None else box
     inside, start = rows_inside(cloud, box), time.perf_counter()

@@ -1,4 +1,4 @@
-"""Spheres that cover the collision shapes of a robot's URDF, and their positions for joint values."""
+"""Spheres that cover the collision shapes of a robot's URDF, and their positions at given joint values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,26 +22,32 @@ VOXELS = 100_000
 """Largest number of voxels in the bounding box of a shape."""
 
 JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
+"""Joint values (rad, or m of sliding joints) in the order of `RobotSpheres.joint_names`, or by joint name."""
 Joint = tuple[int, int, Float[ndarray, "4 4"], Float[ndarray, "3"], bool, int | None, float, float]
-"""Rows of parent and child link, parent_from_joint, axis, whether it slides, column of its joint values (None: fixed),
-and factor and offset of its value from the column's, for joints that mimic another one."""
+"""Joint of a URDF: row of its parent link, row of its child link, parent_from_joint, unit axis, whether it slides,
+column of its value (None: fixed), factor and offset. The value of a joint that mimics another one is factor times the
+column's value plus offset; factor is 1 and offset 0 for other joints."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpheres:
-    """Spheres fixed to links, and the joints, parents before children."""
+    """Robot as spheres that are fixed to its links, and the joints that move the links."""
 
     links: tuple[str, ...]
+    """Names of the links."""
     joint_names: tuple[str, ...]
-    """Joints that move, in the order of the URDF: the order of joint values."""
+    """Names of the independent joints in the order of the URDF, which is the order of joint values."""
     joints: tuple[Joint, ...]
+    """All joints, those of parent links before those of their children."""
     link: Int[ndarray, " s"]
     """Row of `links` that each sphere is fixed to."""
     centers_in_link: Float[ndarray, "s 3"]
+    """Centre (m) of each sphere in the frame of its link."""
     radii: Float[ndarray, " s"]
+    """Radius (m) of each sphere."""
 
     def without(self, names: tuple[str, ...]) -> "RobotSpheres":
-        """Return the robot without the spheres of some links; raise InputError for a link that it does not have."""
+        """Return the robot without the spheres of the named links; raise InputError for an unknown link."""
         if unknown := set(names) - set(self.links):
             raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
         kept = ~np.isin(self.link, [self.links.index(name) for name in names])
@@ -50,10 +56,10 @@ class RobotSpheres:
         )
 
     def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:
-        """Return sphere centres (…,s,3) in the frame of the robot's root link, for joint values (…,dof) rad or m.
+        """Return sphere centres (…,s,3) m in the frame of the robot's root link, for joint values (…,dof) rad or m.
 
-        Values are in the order of `joint_names`, or a mapping from these names to values (…). Raises
-        InputError for other names, another number of values, or one that is not finite.
+        The values are in the order of `joint_names`, or a mapping from these names to values (…). Raises InputError for
+        wrong names, a wrong number of values, or a value that is not finite.
         """
         names = ", ".join(self.joint_names)
         if isinstance(joint_values, Mapping):
@@ -81,10 +87,10 @@ class RobotSpheres:
 
 
 def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
-    """Load the robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
+    """Load the robot of a URDF file, with spheres that cover its collision shapes and exceed them by about `excess` (m).
 
-    Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. Raises InputError where the
-    file or a mesh of it cannot be read, or nothing is there to collide with.
+    Shapes are boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. Raises InputError if
+    the file or one of its meshes cannot be read, or if no link has a collision shape.
     """
     path = Path(urdf)
     if not path.is_file():
@@ -109,7 +115,7 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
     found = dict.fromkeys(links, 0)
     for node in graph.nodes_geometry:
         on = node
-        while on not in found:  # a mesh file may be a tree of its own
+        while on not in found:  # the shape may be in a tree of nodes of its mesh file, below the link
             on = graph.transforms.parents[on]
         link_from_shape, name = graph.get(frame_to=node, frame_from=on)
         found[on] += 1
@@ -133,7 +139,7 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
 
 
 def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
-    """Return the joints of a robot, parents before children."""
+    """Return the joints of a robot, parents before children; `links` are the names to whose rows the joints refer."""
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
         if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
@@ -160,12 +166,12 @@ def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple
 def spheres_of_shape(
     shape: "trimesh.Trimesh", link_from_shape: Float[ndarray, "4 4"], excess: float
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
-    """Return centres (s,3) in the link and radii (s,) m of spheres that together hold a solid shape.
+    """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
-    They stick out of it by at most `excess` (m) and half a voxel of the search: a sixth of the excess, for shapes up to
-    15 cm.
+    The spheres exceed the shape by at most `excess` (m) plus half a voxel, which is a sixth of the excess for shapes up
+    to 15 cm.
     """
-    from trimesh.primitives import Sphere  # half a second, and maps of captures without a URDF do without
+    from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 
     if isinstance(shape, Sphere):
         ball: Any = shape.primitive
@@ -183,12 +189,11 @@ def spheres_of_shape(
 def cover_with_spheres(
     distance: Float[ndarray, "x y z"], step: float, excess: float
 ) -> tuple[Integer[ndarray, "k 3"], Float[ndarray, " k"]]:
-    """Return grid indices of centres and radii (m) of spheres that hold every voxel that may touch solid space.
+    """Return the voxel indices of the centres, and radii (m), of spheres that contain every voxel touching solid space.
 
-    `distance` is the signed distance (m) from solid space at the voxels' centres, `step` the voxels' side. A sphere
-    about c of radius excess - d(c) reaches at most `excess` beyond solid space, because d changes by no more than
-    the way gone; solid space lies in voxels with d at most half their diagonal. The deepest voxel that is not
-    covered becomes the next centre; a voxel is covered where its whole cube is.
+    `distance` d is the signed distance (m) from solid space at the centres of voxels with side `step` (m). A sphere with
+    centre c and radius excess - d(c) exceeds solid space by at most `excess`. Greedy cover: the deepest voxel that is
+    not yet covered becomes the next centre; a voxel is covered if its whole cube is inside a sphere.
     """
     half = 0.5 * np.sqrt(3.0) * step
     left = distance <= half

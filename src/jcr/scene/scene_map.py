@@ -26,15 +26,16 @@ from jcr.scene.robot import JointValues, RobotSpheres, load_robot
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
-"""Answers to `unknown="report"`."""
+"""Results of the checks with `unknown="report"`."""
 
 Unknown = Literal["occupied", "free", "report"]
+"""Treatment of unseen space in a query: as solid, as empty, or reported as unknown."""
 FORMAT = "jcr.map/1"
 """Format of the file that `SceneMap.save` writes and map_file.py reads."""
 
 
 class Sample:
-    """Values of the map at n points, each computed when it is first used; arrays or tensors, as the points were."""
+    """Values of the map at n points, each computed at its first use; arrays for arrays of points, else tensors."""
 
     def __init__(
         self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], *, unknown: str, tensors: bool
@@ -43,32 +44,32 @@ class Sample:
 
     @property
     def occupancy(self) -> Any:
-        """Probability (n,) of solid space; in unseen space one half, or as `unknown` of the query chose."""
+        """Probability (n,) of solid space; in unseen space 1, 0 or 0.5 for unknown = "occupied", "free", "report"."""
         return self._occupancy_unknown[0]
 
     @property
     def unknown(self) -> Any:
-        """Mask (n,) of unseen points: no ray passed and no surface was seen, or outside of the workspace."""
+        """Mask (n,) of unseen points: no ray crossed their cell and no surface was seen, or outside of the workspace."""
         return self._occupancy_unknown[1]
 
     @property
     def distance(self) -> Any:
-        """Metres (n,) to the nearest surface, negative inside; NaN outside of the workspace."""
+        """Signed distance (n,) m to the nearest surface, negative inside solids; NaN outside of the workspace."""
         return self._distance_gradient[0]
 
     @property
     def gradient(self) -> Any:
-        """Gradient (n,3) of the distance: points away from the nearest surface; NaN outside of the workspace."""
+        """Gradient (n,3) of the distance, which points away from the nearest surface; NaN outside of the workspace."""
         return self._distance_gradient[1]
 
     @cached_property
     def color(self) -> Any:
-        """RGB (n,3) in [0, 1] of the colour field, trained on surfaces; NaN outside of the workspace."""
+        """RGB (n,3) in [0, 1] of the colour field, valid at surfaces; NaN outside of the workspace."""
         return self._answers(lambda x: (self._continuous("color", x).clamp(0.0, 1.0),))[0]
 
     @cached_property
     def label(self) -> Any:
-        """Row (n,) of the map's `label_names`; 0 = none, also in unseen space."""
+        """Label (n,) as row of the map's `label_names`; 0 = none, and in unseen space."""
         scene = self._map
 
         def label(x: Tensor) -> tuple[Tensor]:
@@ -80,26 +81,26 @@ class Sample:
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Further continuous properties (n,d) that the map was trained with; NaN outside of the workspace."""
+        """Other properties (n,d) that the map was trained with, by name; NaN outside of the workspace."""
         further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
         answers = self._answers(lambda x: tuple(self._continuous(name, x) for name in further))
         return dict(zip(further, answers, strict=True))
 
     @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
-        """Occupancy and unknown (n,)."""
+        """Values of `occupancy` (n,) and `unknown` (n,), which are computed together."""
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
             state = self._map.seen.at(x)
-            # Most of a workspace is unseen, where the field need not be evaluated.
+            # The field is evaluated at seen points only, because most of a workspace is unseen.
             unknown = state == 0
             occupancy = torch.where(unknown, unseen, 0.0)
             (seen,) = (~unknown).nonzero(as_tuple=True)
             if len(seen) == 0:
                 return occupancy, unknown
             inner = self._map.fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()
-            # A cell that was hit but not crossed lies behind the surface: it can be solid, never free.
+            # A cell that was hit but not crossed lies behind a surface: it can be solid or unknown, but not free.
             known = ((state[seen] & CROSSED) != 0) | (inner >= 0.5)
             occupancy = occupancy.index_put((seen,), torch.where(known, inner, unseen))
             return occupancy, unknown.index_put((seen,), ~known)
@@ -108,7 +109,7 @@ class Sample:
 
     @cached_property
     def _distance_gradient(self) -> tuple[Any, ...]:
-        """Distance (n,) and gradient (n,3)."""
+        """Values of `distance` (n,) and `gradient` (n,3), which are computed together."""
         grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
 
         def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,19 +119,19 @@ class Sample:
         return self._answers(distance_gradient)
 
     def _continuous(self, name: str, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n d"]:
-        """Return a property at points; NaN outside of the workspace."""
+        """Return the property `name` (n,d) at points (n,3) m; NaN outside of the workspace."""
         return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
-        """Return the answers at all points as tensors or arrays, as the points were."""
+        """Return the results of `ask` at all points, as tensors if the query had tensors, else as arrays."""
         answers = in_chunks(ask, self._x)
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 
 
 class SceneMap:
-    """Fields of a scene and what was seen of it, in the base frame.
+    """Map of a scene in the base frame: trained fields of its properties, and the grid of seen space.
 
-    All queries are batched and may come from several threads at once.
+    All queries take many points at once, and may come from several threads at the same time.
     """
 
     def __init__(
@@ -142,9 +143,9 @@ class SceneMap:
     ) -> None:
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
-        """Preset, steps and seconds of the training."""
+        """Facts about the training, as texts: preset, steps and seconds."""
         self.properties = tuple(name for field in fields.of for name in field.heads)
-        """Properties of the fields: occupancy, color, and label or further values where they were given."""
+        """Names of the properties: occupancy, color, and label and other values if the map was trained with them."""
         for field in fields.of:
             if "occupancy" in field.heads and len(field.tables):
                 field.expand()
@@ -153,12 +154,12 @@ class SceneMap:
 
     @property
     def box(self) -> Float[ndarray, "2 3"]:
-        """Lower and upper corner of the workspace in the base frame."""
+        """Lower and upper corner (m) of the workspace in the base frame."""
         return self.seen.box.double().cpu().numpy()
 
     @property
     def cell(self) -> float:
-        """Metres between the nodes of the distance grid, and of the features near surfaces."""
+        """Spacing (m) of the nodes of the distance grid, and of the features near surfaces."""
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
@@ -178,11 +179,11 @@ class SceneMap:
         return dict(zip(self.properties, answers, strict=True))
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
-        """Query the map at points (n,3) m; tensors are answered with (differentiable) tensors.
+        """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
 
-        `unknown` is how unseen places count in `occupancy` and `distance`: as solid, as empty,
-        or (report) as one half and as no surface. Raises InputError on a wrong shape or a value that is not
-        finite.
+        `unknown` selects how unseen space counts in `occupancy` and `distance`: "occupied" as solid, "free" as empty,
+        and "report" as occupancy 0.5 and, in the distance, as empty. Raises InputError for a wrong shape or a value that
+        is not finite.
         """
         x, tensors = self._points(x_in_base, "points", unknown), isinstance(x_in_base, Tensor)
         return Sample(self, x, unknown=unknown, tensors=tensors)
@@ -193,11 +194,11 @@ class SceneMap:
         radii: ArrayLike | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether spheres at (…,3) with radii (broadcast to …) in metres touch something.
+        """Test whether spheres collide: centres (…,3) m in the base frame, radii (m) that broadcast to (…).
 
-        With `unknown` "occupied" a sphere that reaches unseen space, or out of the workspace,
-        touches; with "free" only seen surfaces count; "report" answers FREE, OCCUPIED or UNKNOWN (0, 1, 2).
-        Raises InputError on a wrong shape, a value that is not finite or a negative radius.
+        With `unknown` "occupied", a sphere that reaches unseen space, or leaves the workspace, collides; with "free",
+        only seen surfaces count. "report" returns FREE, OCCUPIED or UNKNOWN (0, 1, 2) instead of booleans. Raises
+        InputError for a wrong shape, a value that is not finite or a negative radius.
         """
         centers = np.asarray(centers_in_base)
         if centers.ndim == 0 or centers.shape[-1] != 3:
@@ -224,10 +225,10 @@ class SceneMap:
         radii: ArrayLike | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether spheres swept from starts to ends (…,3) touch something; answers and raises as `check_spheres`.
+        """Test whether spheres collide while they move on lines from starts to ends (…,3) m; see `check_spheres`.
 
-        The sweep is checked at steps of half a cell, so an obstacle's corner may be overlooked by
-        r - sqrt(r² - (cell/4)²): 0.2 mm for a radius of 2 cm at the default cell.
+        Spheres are tested at steps of half a cell. A corner of an obstacle may therefore be inside the swept volume by
+        r - sqrt(r² - (cell/4)²) without being detected: 0.2 mm for a radius r of 2 cm and the default cell.
         """
         starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)
         if starts.ndim == 0 or starts.shape[-1] != 3 or starts.shape != ends.shape:
@@ -251,14 +252,13 @@ class SceneMap:
         base_from_robot: ArrayLike | None = None,
         ignore_links: tuple[str, ...] = (),
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
+        """Test whether a robot collides with the scene at joint values (…,dof); the result is that of `check_spheres`.
 
-        `robot` is a URDF file, which takes seconds to load, or what `jcr.load_robot` made of it: spheres
-        that cover the collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in
-        the URDF), or a mapping from these names. `base_from_robot` maps the URDF's root link to the map's base frame;
-        `ignore_links` names links that may touch, e.g. the one that stands on the table. The robot's own
-        links are not checked against each other. Raises InputError as `load_robot` and
-        `RobotSpheres.centers` do.
+        `robot` is a URDF file, which takes seconds to load, or the result of `jcr.load_robot`: spheres that cover its
+        collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names`, or a mapping from these
+        names. `base_from_robot` (4,4) is the pose of the URDF's root link in the base frame of the map; None: identity.
+        `ignore_links` are links that may collide, e.g. the one that stands on the table. Collisions between links of the
+        robot are not tested. Raises InputError as `load_robot` and `RobotSpheres.centers` do.
         """
         spheres = robot if isinstance(robot, RobotSpheres) else load_robot(robot)
         spheres = spheres.without(tuple(ignore_links))
@@ -270,7 +270,7 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
-        """Test spheres with unknown space "occupied" or "free"."""
+        """Test which spheres (centres and radii in m) collide, with unknown space "occupied" or "free"."""
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -278,24 +278,24 @@ class SceneMap:
             distance, beyond = grid.distance(nearest), (x - nearest).norm(dim=1)
             if unknown == "occupied":
                 return ((distance < radius) | (beyond > 0),)
-            # The box is convex: from outside, everything in it is at least so far.
+            # A lower bound of the distance from outside to surfaces in the box, which is convex.
             outside = (beyond**2 + distance.clamp(min=0) ** 2).sqrt()
             return (torch.where(beyond > 0, outside, distance) < radius,)
 
         return in_chunks(touches, x, radius)[0]
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
-        """Return the signed distance on the nodes of the workspace, computed once for each way to count the unknown."""
+        """Return the grid of signed distances, with unknown space "occupied" or "free"; computed once for each."""
         with self._lock:
             if unknown not in self._distance:
                 self._distance[unknown] = self._transform(unknown)
             return self._distance[unknown]
 
     def _transform(self, unknown: str) -> DistanceGrid:
-        """Return the distance transform of the field, with the unknown as solid or as empty.
+        """Compute the grid of signed distances from the occupancy field, with unknown space "occupied" or "free".
 
-        Up to two cells behind a seen surface the field decides in either case, though no ray passed
-        there: a surface without thickness would slip through the grid.
+        Within two cells behind a seen surface the field is used in both cases, although no ray crossed these cells:
+        otherwise the surface would have no thickness, and the nodes of the grid could miss it.
         """
         skin = dilate(halve((self.seen.state & HIT) != 0), 2)
         behind = SeenGrid(self.seen.lower, self.cell, skin.to(torch.uint8))
@@ -316,7 +316,10 @@ class SceneMap:
         )
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
-        """Return points on the map's device; raise InputError for a wrong shape, numbers or choice of `unknown`."""
+        """Return points as a tensor on the map's device; raise InputError for wrong shapes, values or `unknown`.
+
+        `what` is the name of the points in the message.
+        """
         if unknown not in get_args(Unknown):
             raise InputError(f"unknown={unknown!r}: choose occupied, free or report")
         x = x if isinstance(x, Tensor) else np.asarray(x)
@@ -329,7 +332,7 @@ class SceneMap:
         return tensor
 
     def save(self, path: Path) -> None:
-        """Write the map whole or not at all."""
+        """Write the map to a safetensors file; after an error there is no incomplete file."""
         about = {
             "fields": [field.about for field in self.fields.of],
             "lattices": [(lattice.cell, lattice.shape) for lattice in self.fields.lattices],
@@ -345,7 +348,7 @@ class SceneMap:
 
 
 def digest(tensors: dict[str, Tensor]) -> str:
-    """Return a digest of all numbers of a map, which detects a changed bit in its weights."""
+    """Return a checksum of names and numbers of all tensors of a map, which detects a damaged file."""
     total = blake2b(digest_size=16)
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
@@ -353,7 +356,10 @@ def digest(tensors: dict[str, Tensor]) -> str:
 
 
 def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
-    """Return the map that `save` wrote; raise KeyError, ValueError or similar for other content."""
+    """Return the map from the tensors and the metadata `about` of a file of `save`.
+
+    Raises KeyError, ValueError or a similar error for other content.
+    """
     seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
     lattices = [
         Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
@@ -365,7 +371,7 @@ def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> Scene
 
 
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
-    """Return the answer for each body from the k answers of its spheres."""
+    """Return the result of each body from those of its k spheres: OCCUPIED before UNKNOWN before FREE."""
     if unknown != "report":
         return np.asarray(states.any(-1))
     rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; its own inverse

@@ -1,8 +1,8 @@
-"""Grid of seen space: every cell of the workspace is crossed by a ray, hit by one, both, or unseen.
+"""Grid of seen space: every cell of the workspace is crossed by a ray, hit by a ray, both, or unseen.
 
-Each point is a ray from its camera: all before it is free, the point is surface, all behind it is unseen. Of a point
-that rests on a prior only the surface counts, because no ray showed free space before it. A field
-alone cannot represent this: trained on surfaces, it calls the inside of every object free.
+A ray leads from a camera to a point: the space between is free, the point is on a surface, and the space behind is
+unseen. The ray of a point from a prior shows its surface but no free space. The grid is needed because an occupancy
+field that is trained on surfaces alone returns "free" inside of every object.
 """
 
 from dataclasses import dataclass
@@ -18,45 +18,46 @@ from torch.nn import functional as F
 from jcr.compiled import compiled
 
 CROSSED, HIT = 1, 2
-"""Bits of a cell's state; 0 = unseen."""
+"""Bits of a cell's state: crossed by rays, hit by a ray's end; 0 = unseen."""
 RAY_END_M = 0.06
-"""Metres before each point in which its own ray is followed; farther off, the camera's depth image is asked."""
+"""Length (m) before each point along which its ray is followed cell by cell; farther away a depth image is used."""
 CROSSINGS = 4
-"""Samples of such rays, two to a cell's side, that make a cell crossed: one ray through a corner does not show that
-the cell is empty, and one ray that ends too deep is no reason to call the inside of an object free."""
+"""Number of samples of rays, two per cell side, with which a cell counts as crossed: a single ray may cross only a
+corner of the cell, or end too deep, inside an object."""
 PER_BIN = 2.0
-"""Points of an image in a bin of the depth image that is made of them."""
+"""Mean number of points per bin of the depth image that is made of an image's points."""
 
 
 @dataclass(frozen=True)
 class SeenGrid:
-    """The state of each cell of the workspace box."""
+    """State of each cell of the workspace: crossed, hit, both or unseen."""
 
     lower: Float[Tensor, "3"]
-    """Corner of the box in the base frame."""
+    """Lower corner (m) of the workspace in the base frame."""
     cell: float
-    """Side of a cell in metres."""
+    """Side (m) of a cell."""
     state: UInt8[Tensor, "nz ny nx"]
+    """Bits CROSSED and HIT of each cell; 0 = unseen."""
 
     @property
     def size(self) -> Float[Tensor, "3"]:
-        """Sides of the box in metres."""
+        """Side lengths (m) of the workspace along x, y and z."""
         return torch.tensor(self.state.shape[::-1], device=self.lower.device) * self.cell
 
     @property
     def box(self) -> Float[Tensor, "2 3"]:
-        """Lower and upper corner in the base frame."""
+        """Lower and upper corner (m) of the workspace in the base frame."""
         return torch.stack([self.lower, self.lower + self.size])
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> UInt8[Tensor, " n"]:
-        """Return the states at points (n,3); outside of the box everything is unseen."""
+        """Return the states of the cells at points (n,3) m; 0 (unseen) outside of the workspace."""
         index, inside = self.index(x_in_base)
         return torch.where(inside, self.state.view(-1)[index], 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Return flat indices of the cells that hold the points, and whether they lie in the box (else index 0)."""
+        """Return the flat index of each point's cell (0 for points outside), and a mask of the points inside the box."""
         nz, ny, nx = self.state.shape
-        # A point beyond int32, or NaN, must not wrap into the box.
+        # Points beyond the range of int32, and NaN, must not become indices inside the box.
         at = ((x_in_base - self.lower) * (1.0 / self.cell)).nan_to_num(-1.0).clamp(-1.0, 1e6).floor().int()
         x, y, z = at.unbind(-1)
         inside = (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
@@ -64,12 +65,11 @@ class SeenGrid:
 
 
 def without_doubts(seen: SeenGrid) -> SeenGrid:
-    """Return the seen grid without cells that its rays leave open: a ray shows its line, not the whole cell.
+    """Return the grid with doubtful cells reset: crossed cells without a hit next to unseen cells become unseen.
 
-    Next to the unseen, the rest of a crossed cell may belong to a thing that gave no points there, unless a surface
-    was found in this very cell. And where a surface ends beside such a cell, the thing that it belongs to goes on:
-    its cells there can be solid, not free. (Otherwise thirteen times as much of the inside of things is called
-    free, all of it past the ends of what gave points.)
+    A ray shows only its own line, and the rest of such a cell may belong to an object without points there. Hit cells
+    next to a reset cell lose the state CROSSED, because the object may continue there. Without this, 13 times as much
+    space inside of objects is called free.
     """
     hit, state = (seen.state & HIT) != 0, seen.state.clone()
     unsure = dilate(state == 0, 1) & ((state & CROSSED) != 0) & ~hit
@@ -79,7 +79,7 @@ def without_doubts(seen: SeenGrid) -> SeenGrid:
 
 
 def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx"]:
-    """Return the mask grown by this many cells along every axis."""
+    """Return the mask grown by `cells` cells in both directions of every axis."""
     for axis in range(3):
         grown, n = mask.clone(), mask.shape[axis]
         for step in range(1, min(cells, n - 1) + 1):
@@ -90,7 +90,7 @@ def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx
 
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
-    """Return the mask at half the resolution: set where any of eight cells is."""
+    """Return the mask at half the resolution; a cell is set if any of its eight cells is set."""
     return F.max_pool3d(mask[None].float(), 2)[0] > 0
 
 
@@ -103,12 +103,12 @@ def carve(
     measured: Bool[ndarray, " n"],
     device: str = "cpu",
 ) -> SeenGrid:
-    """Return the seen grid of the rays from each point's camera to the point; the box is whole pairs of cells.
+    """Return the grid of seen space from the rays between cameras and points; the box has even numbers of cells.
 
-    Rays of points that are not `measured` cross nothing, and end the crossing of those beside them.
-
-    Far from surfaces two cells at a time are judged at once, by their centre's depth before the nearest point in
-    its direction; the last centimetres of each ray are followed one by one, which keeps the grid sharp where it matters.
+    `image` are rows of `camera_centers_in_base`. Rays of points that are not `measured` cross no cells, and block
+    neighbouring rays behind their points. Far from surfaces, blocks of two cells a side count as crossed if they are
+    nearer to the camera than the nearest point in their direction. The last RAY_END_M of each ray are followed cell by
+    cell.
     """
     lower, block = box[0].astype(np.float32), np.float32(2 * cell)
     crossed = np.zeros(np.rint((box[1] - box[0]) / (2 * cell)).astype(int)[::-1], bool)
@@ -133,11 +133,11 @@ def carve(
 def _depth_image(
     points: Float[ndarray, "n 3"], measured: Bool[ndarray, " n"]
 ) -> tuple[Float[ndarray, "r c"], Float[ndarray, "3 3"], tuple[float, float], float]:
-    """Return the nearest depth in each bin of a pinhole image about the mean direction of a camera's measured points.
+    """Return a depth image (r,c) of a camera: the nearest depth (m) in each bin of a pinhole image, 0 in empty bins.
 
-    `points` are relative to the camera; with it the rotation to the image's frame, the image's corner and the bins'
-    side, both as tangents. An empty bin has depth 0 and frees nothing; points that are not measured only end what
-    others free.
+    `points` are relative to the camera, in base axes; the image looks along the mean direction of the measured ones.
+    Return also the rotation from base axes to the image's axes, and the image's corner and bin size, both as tangents.
+    Points that are not measured reduce the depth of bins, but fill no empty bin.
     """
     points, assumed = points[measured], points[~measured]
     axis = (points / np.linalg.norm(points, axis=1, keepdims=True)).mean(0)
@@ -166,7 +166,11 @@ def _depth_image(
 @compiled
 @no_type_check
 def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
-    """Mark the blocks (z,y,x) that lie wholly before the nearest point there; `start` is the first block's centre."""
+    """Mark in `crossed` (z,y,x) the blocks of side `block` (m) that lie completely before the nearest point there.
+
+    `nearest`, `rotation`, `corner` and `pitch` are a depth image (see `_depth_image`); `start` is the centre of the
+    first block in the axes of the image.
+    """
     per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
     rows, columns = nearest.shape
     for z in range(crossed.shape[0]):
@@ -186,10 +190,10 @@ def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
 @compiled
 @no_type_check
 def _follow(state, points, towards, reach, measured, cell):
-    """Mark the cells that enough rays cross shortly before their points, and those that points hit.
+    """Mark in `state` the cells that CROSSINGS samples of rays cross near their points, and the cells that points hit.
 
-    `points` are relative to the grid's lower corner, `towards` unit vectors to their cameras. Half a cell behind a point
-    is hit as well: a surface that lies just on a cell's far side has some thickness too.
+    `points` (m) are relative to the grid's lower corner, `towards` are unit vectors to their cameras, `reach` the
+    distances (m) to them. The place half a cell behind a point is hit, too, so that surfaces have a thickness.
     """
     samples = np.zeros(state.shape, np.uint8)
     nz, ny, nx = state.shape

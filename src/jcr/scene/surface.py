@@ -1,4 +1,4 @@
-"""Surface of a trained map as triangles and points; torch is imported when a map is there."""
+"""Surface of a trained map as triangles or as points; torch is imported only when a map is used."""
 
 from typing import TYPE_CHECKING
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 def surface_mesh(
     scene: "SceneMap",
 ) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"], UInt8[ndarray, "v 3"]]:
-    """Return vertices (v,3) m in the base frame, triangles (f,3) facing free space, and RGB of the vertices (v,3).
+    """Return vertices (v,3) m in the base frame, triangles (f,3) whose front faces free space, and vertex RGB (v,3).
 
-    Marching cubes (scikit-image) on the logit of occupancy at steps of half a cell. Behind each surface, where
-    no ray passed, the field crosses one half again: only triangles where rays ended are kept.
-    Raises InputError where there are none.
+    Marching cubes (scikit-image) finds the surface of occupancy 0.5, in steps of half a cell. Only triangles near the
+    ends of rays are kept, because the field has a second, false surface behind each real one. Raises InputError if the
+    map has no surface.
     """
     import torch
     from skimage.measure import marching_cubes
@@ -52,9 +52,9 @@ def surface_mesh(
 def sample_surface(
     scene: "SceneMap", count: int
 ) -> tuple[Float[ndarray, "n 3"], UInt8[ndarray, "n 3"], Int[ndarray, " n"]]:
-    """Return at most `count` points of the seen surface, where the occupancy is one half, drawn evenly over its area.
+    """Return positions (n,3) m in the base frame, RGB (n,3) and label (n,) of `count` points of the seen surface.
 
-    They are positions (m, base frame), RGB and label; none where the map has no surface.
+    The points are drawn uniformly over its area; there are none if the map has no surface.
     """
     try:
         vertices, faces, color = surface_mesh(scene)
@@ -70,7 +70,7 @@ def sample_surface(
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:
-    """Return the side (m) of squares that, drawn in place of the points, close most gaps between them."""
+    """Return the side (m) of squares that close most gaps between points (n,3) m when they are drawn as squares."""
     if len(points) < 2:
         return 0.01
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # built in a third of the time

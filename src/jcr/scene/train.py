@@ -1,4 +1,4 @@
-"""Training of fields on the rays of a cloud, until the loss on validation rays stops falling."""
+"""Training of fields on the rays of a cloud, until the loss on validation rays no longer falls."""
 
 import time
 from collections.abc import Callable
@@ -17,40 +17,42 @@ from jcr.scene.fields import Field
 from jcr.scene.seen import CROSSED, HIT, SeenGrid
 
 BEHIND = 2.0
-"""Cells behind a surface that still count as occupied."""
+"""Depth (cells) behind a surface point within which positives of occupancy are drawn."""
 CLEARANCE = 0.1
-"""Cells before a surface that no negative is drawn from, so that noise does not eat the surface."""
+"""Distance (cells) before a surface point within which no negatives are drawn, so that noise does not erase surfaces."""
 NEAR = 2.0
-"""Cells before a surface from which half of the negatives along the rays are drawn."""
+"""Distance (cells) before a surface point within which half of the negatives along the rays are drawn."""
 BATCH = 6144
-"""Rays a step."""
+"""Number of rays per training step."""
 GAIN = 0.03
-"""Share by which the loss must fall from look to look, or the learning rate falls."""
+"""Share by which the validation loss must fall from one test to the next; otherwise the learning rate is reduced."""
 
 
 RATES = (3e-2, 0.3)
-"""Learning rates of Adam for layers and grids."""
+"""Initial learning rates of Adam: for layers, and for feature grids."""
 LOOK, FALLS = 6, 2
-"""Steps between looks at the validation rays, and falls of the learning rate at which the training ends."""
+"""Steps between tests of the validation loss, and number of reductions of the learning rate that ends the training."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rays:
-    """The cloud on the training device, one row per point."""
+    """Training data: one ray from a surface point to its camera per row, on the training device."""
 
     x: Float[Tensor, "n 3"]
+    """Surface points (m, base frame)."""
     ahead: Float[Tensor, "n 3"]
-    """Unit vector towards the camera."""
+    """Unit vectors from the points towards their cameras."""
     reach: Float[Tensor, "n 1"]
-    """Metres from the point to its camera, or to where the ray enters the workspace."""
+    """Length (m) of the rays inside the workspace, from the point to its camera at most."""
     weight: Float[Tensor, " n"]
+    """Weights in the loss, with mean 1 over all rays."""
     measured: Float[Tensor, " n"]
-    """1; 0 for a prior, whose ray shows no free space."""
+    """1 if the ray shows free space, 0 if not (see `PointCloud.cleared`)."""
     targets: dict[str, Tensor]
-    """Properties of each point: color (n,3), label (n,), further values (n,d)."""
+    """Properties of the points to be learnt: color (n,3) in [0, 1], label (n,), other values (n,d)."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
-        """Return some of the rays."""
+        """Return the selected rays."""
         columns = {name: value[rows] for name, value in vars(self).items() if name != "targets"}
         return Rays(targets={name: target[rows] for name, target in self.targets.items()}, **columns)
 
@@ -58,9 +60,10 @@ class Rays:
 def workspace_box(
     cloud: PointCloud, workspace: tuple[float, float, float, float, float, float] | None
 ) -> Float[ndarray, "2 3"]:
-    """Return lower and upper corner of the map: as given, or around scene and cameras with a margin of 5 cm.
+    """Return lower and upper corner (2,3) of the workspace (m, base frame): as given, or computed from the cloud.
 
-    The scene is what lies within one and a half times the median distance from the cameras.
+    The computed box encloses the cameras and, along each axis, 99 % of the points that are nearer to their camera than
+    1.5 times the median distance, with a margin of 5 cm. Raises InputError for an invalid `workspace` or an empty cloud.
     """
     if workspace is not None:
         box = np.array(workspace, dtype=np.float64).reshape(2, 3)
@@ -71,7 +74,7 @@ def workspace_box(
         return box
     if len(cloud.points_in_base) == 0:
         raise InputError("the cloud holds no points; a map needs at least some hundreds")
-    # The background behind the scene, and a few stray points, must not stretch the workspace.
+    # The background behind the scene, and a few outliers, must not enlarge the workspace.
     distance = np.linalg.norm(cloud.points_in_base - cloud.camera_centers_in_base[cloud.image], axis=1)
     near = cloud.points_in_base[distance < 1.5 * np.median(distance)]
     lower, upper = np.percentile(near, [0.5, 99.5], axis=0)
@@ -80,7 +83,7 @@ def workspace_box(
 
 
 def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
-    """Return the rows of the points in the box; raise InputError where these are hardly any."""
+    """Return the rows of the points inside the box (m); raise InputError for fewer than 100."""
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
     if len(inside) < 100:
@@ -98,10 +101,10 @@ def workspace_rays(
     cell: float,
     device: str,
 ) -> Rays:
-    """Return the rays of the points that lie in the box; reliable points weigh more.
+    """Return the rays of the points inside the box, with colours, labels and `values` (see `build_scene`) as targets.
 
-    A point counts by its confidence (relative to the median, within a factor of four) and by how small its
-    `margin` and the depth's sigma are against a cell: there is no use in sharpness that the measurement does not have.
+    The weight of a point is w / (1 + (margin² + depth_std²) / cell²). w is its confidence relative to the median,
+    limited to 0.25 to 4.
     """
     inside = rows_inside(cloud, box)
     x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
@@ -135,15 +138,16 @@ def workspace_rays(
 
 
 Samples = tuple[Float[Tensor, "_ 3"], Float[Tensor, " _"], Float[Tensor, " _"]]
-"""Places, their known occupancy (0 or 1) and weight; the first are surface points, which carry other properties."""
+"""Training samples: positions (m), their occupancy (0 or 1), and weights. The first rows are the surface points of the
+rays, which also have the other properties."""
 
 
 def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samples:
-    """Return positives and negatives of occupancy along a batch of rays.
+    """Return samples of occupancy along a batch of rays, so that the field is 0.5 at the surface itself.
 
-    All from the camera to shortly before the point is free, half of it drawn close to the surface; behind the point,
-    where no ray passed, the surface goes on for some cells. So the field crosses one half at the surface itself. With
-    uniform negatives, as in the paper, the density of the points sets the distance at which it does.
+    Positives are the points, and positions up to BEHIND cells behind them that no ray crossed. Negatives lie between
+    camera and point, half of them near the point, and some anywhere in the workspace. With uniform negatives, as in the
+    paper, the distance of the 0.5 level from the surface would depend on the density of the points.
     """
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
@@ -152,13 +156,13 @@ def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samp
 
     a, b = rays[: n // 2], rays[n // 2 :]
     behind = a.x - BEHIND * cell * uniform(len(a.x)) * a.ahead
-    # What is behind one point may lie before another: thin walls, seen from both sides.
+    # A position behind one point may be free by the ray of another, as for thin walls seen from both sides.
     state = seen.at(behind)
     solid = ((state & CROSSED) == 0) | ((state & HIT) != 0)
     near = b.x + cell * (CLEARANCE + NEAR * uniform(len(b.x)).square()) * b.ahead
     far = a.x + (CLEARANCE * cell + a.reach * uniform(len(a.x))) * a.ahead
-    # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends all the
-    # same: what it says there counts only where the seen grid was crossed.
+    # On the ray of a prior only cells that other rays crossed are free. Negatives near the prior are used anyway: the
+    # field needs them to end the surface, and queries use its value only in cells that were crossed.
     free_far = torch.maximum(a.measured, ((seen.at(far) & CROSSED) != 0).float())
     anywhere = seen.lower + seen.size * uniform(n // 8, 3)
     positives = [(rays.x, rays.weight), (behind, a.weight * solid)]
@@ -177,7 +181,7 @@ def train(
     max_seconds: float,
     report: Callable[[float], None],
 ) -> int:
-    """Fit a field to the rays until the loss on validation rays stops falling; return the number of steps."""
+    """Fit a field to the rays until the loss on 2 % validation rays no longer falls; return the number of steps."""
     device, start = rays.x.device, time.perf_counter()
     generator = torch.Generator(device).manual_seed(seed)
     field.standardise(rays.targets)
@@ -190,9 +194,9 @@ def train(
     def draw(batch: Rays) -> Samples:
         if "occupancy" in field.heads:
             return draw_samples(batch, seen, generator)
-        return batch.x, torch.ones_like(batch.weight), batch.weight  # all else is known on surfaces only
+        return batch.x, torch.ones_like(batch.weight), batch.weight  # others are known on surfaces only
 
-    # Shuffled once, so that batches are slices and nothing is gathered again.
+    # The rays are shuffled once, so that each batch is a slice without a copy.
     rays = rays[torch.randperm(len(rays.x), generator=generator, device=device)]
     leave_one_out, rays = rays[: len(rays.x) // 50], rays[len(rays.x) // 50 :]
     test = draw(leave_one_out)
@@ -202,7 +206,7 @@ def train(
         batch = rays[first : first + BATCH]
         total_loss(field, batch, draw(batch)).backward()
         step += 1
-        # Adam (Kingma and Ba 2015); torch's class first imports a compiler, for a second or more.
+        # Adam (Kingma and Ba 2015) is written out because torch's class imports a compiler for a second or more.
         with torch.no_grad():
             for p, rate, mean, square in learnt:
                 assert p.grad is not None
@@ -221,9 +225,10 @@ def train(
 
 
 def total_loss(field: Field, rays: Rays, samples: Samples) -> Tensor:
-    """Return the weighted loss: binary cross-entropy of occupancy, cross-entropy of labels, squared error of others.
+    """Return the sum of the weighted mean losses of a field's properties.
 
-    Squared errors are in units of the value's variance, so that neither metres nor kelvins drown the rest.
+    The loss is binary cross-entropy for occupancy, cross-entropy for labels, and for other properties the squared error
+    divided by the variance of the property, so that units do not matter.
     """
     (x, occupied, of_samples), losses = samples, []
     for name, out in field(x).items():
