@@ -24,7 +24,7 @@ from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Track
 FEWEST_POINTS = 4
 """Least number of corners of a body that an image must show to be used."""
 FEWEST_IMAGES = 2
-"""Least number of images that must show a body, or one of its corners."""
+"""Least number of images that must show a body; each of its corners needs as many to be triangulated."""
 SAME_PLACE = 0.006
 """Largest rms distance of detected corners from the projected triangulated ones, as a share of the image's width."""
 MOST_PAIRS = 100

@@ -23,8 +23,7 @@ KINDS = (
     "aruco:0.050:DICT_4X4_50 and apriltag:0.050:36h11 (any number of tags, side of the black square in metres)",
 )
 INK = 120
-"""Least difference of a pixel's strongest and weakest channel (0 to 255) at which it is too coloured for a grey board.
-Least difference of a pixel's strongest and weakest channel (0 to 255) at which it is too coloured for a grey board."""
+"""Least difference of a pixel's strongest and weakest channel (0 to 255) that is too colourful for a grey board."""
 LARGEST = 1.0
 """Largest length of a square or tag, m; a larger number was meant in millimetres."""
 PRINTED = 0.002

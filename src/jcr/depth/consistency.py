@@ -96,10 +96,10 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
 @inlined
 @no_type_check
 def _row(v, n, a, b, k, width, height):
-    """Return the projection of row v of an image into the n-th other image, as factors of x, y and z.
+    """Return the factors that project row v of an image into the n-th other image.
 
-    x, y and z each have a factor of the ray's x, a constant, and a factor of inverse depth. The last element is the
-    largest x and y in the image, cx and 1/fx.
+    Each homogeneous coordinate x, y, z there is (first factor)·(x of the ray) + (second) + (third)·(inverse depth). The
+    last element is the largest x and y in the image, cx and 1/fx.
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]

@@ -148,7 +148,10 @@ def _chosen(
     reasons: list[int],
     stds: list[Float[ndarray, "m h w"]],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return inverse depth, and confidence, reason and standard deviation by the first mask that holds at a pixel."""
+    """Return the inverse depth, and confidence, reason and standard deviation per pixel.
+
+    These three belong to the first mask of `which` that is true at the pixel; without any they are 0, NO_DEPTH and 0.
+    """
     return (
         inverse_depth,
         np.select(which, confidences, 0).astype(np.float32),

@@ -16,8 +16,7 @@ TOO_WRONG = 20.0
 AGREES = 3.0
 """Number of standard deviations up to which matched and measured depth count as the same surface."""
 SLOPE = 0.05
-"""Relative difference of depth between neighbouring pixels beyond which a pixel lies on an edge and mixes two surfaces.
-Relative difference of depth between neighbouring pixels beyond which a pixel lies on an edge and mixes two surfaces."""
+"""Relative difference of depth between neighbouring pixels above which a pixel mixes the two surfaces at an edge."""
 UNKNOWN = 0.02
 """Relative standard deviation of depths that come without one."""
 REACH_M = (0.1, 6.0)

@@ -41,9 +41,10 @@ def _ray(v, u, k):
 @inlined
 @no_type_check
 def _look(v, u, asked, packed, motions, k, near, starts):
-    """Write `near` and `starts` of 16 pixels of row v, from column u on.
+    """Write `near` and `starts` for 16 pixels of row v, from column u on.
 
-    `near` holds the columns of K R times one step of taps in u and in v, then K R·ray, and K t.
+    `near` holds the columns of K R times one step of taps in u and in v, then K R·ray, and K t; `starts` are the indices
+    at which the neighbours' images begin in `packed`.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     size = packed.shape[1] * packed.shape[2]
@@ -63,7 +64,7 @@ def _look(v, u, asked, packed, motions, k, near, starts):
 @inlined
 @no_type_check
 def _score(v, u, tried, packed, windows, k, near, starts, each):
-    """Write the scores of the planes in `tried`: the mean of the BEST highest correlations with the neighbours."""
+    """Write to row 6 of `tried` the scores of its planes: the mean of the BEST highest correlations with neighbours."""
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
@@ -112,7 +113,7 @@ def _try_passed(found, row, u, side, tried):
 @inlined
 @no_type_check
 def _try_changed(found, v, u, k, search, halvings, state, tried):
-    """Write to `tried` random changes of the pixels' planes, by the size of `search` after `halvings` halvings."""
+    """Write to `tried` random variations of the pixels' planes, at half of the size in `search` after each halving."""
     lowest, highest, size = search[:3]
     scale = size * 0.5**halvings
     for lane in range(LANES):
@@ -215,7 +216,10 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
 @compiled
 @no_type_check
 def peaks(found, asked, packed, motions, windows, k, step):
-    """Return the inverse depth (h,w) at the peak of the parabola of the scores at factors 1 - step, 1, 1 + step."""
+    """Return the inverse depth (h,w) at the peak of the parabola through three scores of each pixel.
+
+    The scores are those of the pixel's plane with inverse depth times 1 - step, 1 and 1 + step.
+    """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
     each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)

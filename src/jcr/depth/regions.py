@@ -10,8 +10,7 @@ from numpy import ndarray
 from jcr.compiled import compiled, inlined
 
 SCALE = 0.35
-"""Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; larger values give larger regions.
-Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; larger values give larger regions."""
+"""Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; it grows with the regions' size."""
 SMALLEST = 12
 """Least number of pixels of a region; smaller ones are merged with the neighbour of most similar colour."""
 TRIALS = 60
@@ -19,10 +18,10 @@ TRIALS = 60
 FEWEST = 12
 """Least number of matched pixels from which a region's plane is fitted."""
 SAMPLED = 400
-"""Largest number of matched pixels of a region, about, that RANSAC counts inliers among."""
+"""Approximate largest number of matched pixels of a region among which RANSAC counts inliers."""
 SPREAD = 0.08
-"""Least ratio of the variance across of the pixels that support a plane to that of their region. Pixels along one edge
-do not determine the slope across it, and may belong to the adjacent object."""
+"""Least ratio of the smallest variance of the positions of the pixels that support a plane to that of all pixels of the
+region. Pixels along one edge do not determine the slope across it, and may belong to the adjacent object."""
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:

@@ -20,8 +20,7 @@ from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotatio
 ROBOT_STD = math.radians(0.3)
 """Standard deviation of a reported gripper rotation, rad; an industrial arm has 0.05°, a servo arm 1°."""
 SYSTEMATIC = 0.015
-"""Systematic difference between camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021.
-Systematic difference between camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021."""
+"""Systematic difference of camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021."""
 SYSTEMATIC_OF_GUESS = 0.04
 """Value of SYSTEMATIC where the focal length is estimated from the gripper's angles."""
 SIGMAS = 3.0

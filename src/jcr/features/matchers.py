@@ -60,7 +60,7 @@ class Features(Protocol):
         ...
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its two images before."""
+        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its images before matching."""
         ...
 
 

@@ -12,8 +12,7 @@ from jcr.features.matchers import ImageGeometry
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
-"""Numbers of near viewpoints that each image is paired with: in the first search, and where R_X is not found from it.
-Numbers of near viewpoints that each image is paired with: in the first search, and where R_X is not found from it."""
+"""Numbers of near viewpoints that each image is paired with: in the first search, and where this does not find R_X."""
 FEW = 16
 """Largest number of images whose pairs are all matched at once. This is cheap, and a pair that happens to match may
 register a camera far from all others (doosan_bench: 12 mm from its gripper with near pairs alone, 7 mm with all)."""

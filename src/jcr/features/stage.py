@@ -41,7 +41,7 @@ from jcr.geometry import rotation_angle
 from jcr.records import Intrinsics
 
 WORTH_SAYING = 0.1
-"""Share of contradicted pairs from which the user is told; a few wrong pairs are normal."""
+"""Share of contradicted pairs above which the user is told of them; a few wrong pairs are normal."""
 AS_TAKEN = math.radians(50)
 """Largest angle (rad) of the gripper's motion at which a network matches the images without rotating them first."""
 GUESSED_AT_ONCE = 6

@@ -179,7 +179,7 @@ class LearnedFeatures:
         """Descriptors of these keypoints, of unit length."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its two images before."""
+        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its images before matching."""
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
             for both in zip(pairs, rolls, strict=True)

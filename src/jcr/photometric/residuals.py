@@ -90,7 +90,10 @@ class Points:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometricEquations:
-    """Gauss-Newton equations of the camera steps and log focal length (last), with log depths eliminated (Schur)."""
+    """Gauss-Newton equations of p camera parameters, with the log depths of k points eliminated (Schur complement).
+
+    The parameters are six per camera, or six for all cameras, and last the log focal length.
+    """
 
     normal: Float[ndarray, "p p"]
     gradient: Float[ndarray, "k p"]

@@ -60,15 +60,13 @@ _START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
 real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
 _MANY, _GROWN = 40, 1.3
-"""Number of images above which COLMAP adjusts the whole map only after growth by the factor _GROWN (its default is 1.1).
-Number of images above which COLMAP adjusts the whole map only after growth by the factor _GROWN (its default is 1.1)."""
+"""Number of images above which COLMAP adjusts the whole map only after growth by a factor _GROWN (its default: 1.1)."""
 _ROUGHLY = 1e-3
-"""Relative change of the cost that ends the adjustment that another one follows."""
+"""Relative change of the cost that ends the first of the two last adjustments."""
 _MOST_OBSERVATIONS = 60_000
 """Largest number of observations of a map; more would not help, because the robot's errors limit the accuracy."""
 _MOST_MATCHED = 120_000
-"""Largest number of matched keypoints that are mapped; adjusting a point costs the square of the number of its images.
-Largest number of matched keypoints that are mapped; adjusting a point costs the square of the number of its images."""
+"""Largest number of matched keypoints that are mapped; adjusting a point costs the square of its number of images."""
 _SIFT_THREADS = 8
 """Largest number of images whose features are found at once; each takes 240 bytes per pixel meanwhile."""
 _FEW_FEATURES = 1000

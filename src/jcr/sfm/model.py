@@ -129,9 +129,9 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return image, keypoint and point of each observation, as row of `image_ids`, row in the image, and row of points.
+    """Return (image, keypoint, point) of each observation, as rows.
 
-    Points are in the order of their ids.
+    The rows are those of `image_ids`, of the image's keypoints, and of the points by ascending id.
     """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [

@@ -78,7 +78,7 @@ class Registration:
     x_px: Float[ndarray, "p 2"]
     """Keypoints of the new image, one per point, px."""
     row: Int[ndarray, " k"]
-    """Row of the known image of each observation there."""
+    """Known image (row) of each further observation of these points."""
     row_x_px: Float[ndarray, "k 2"]
     row_point: Int[ndarray, " k"]
 

@@ -103,7 +103,7 @@ def align_tracks(
 
 
 def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
-    """Return the sum of unit vectors from each point to its cameras, the normal of the point's plane.
+    """Return the normal of each point's plane: the sum of the unit vectors from the point to its cameras.
 
     Planes through neighbouring points gave the same result, because the affine part is free.
     """
@@ -269,7 +269,7 @@ def _smooth(grey, x, y):
 @compiled
 @no_type_check
 def _template(around, offsets, window, template, pull):
-    """Write the reference patch minus its mean to `template`, and the unknowns' change per grey to `pull` (n,8).
+    """Write the reference patch minus its mean to `template`, and the unknowns' change per grey level to `pull` (n,8).
 
     Returns the standard deviation of the patch. Where the texture does not determine the unknowns, `pull` is very large,
     and the resulting variance rejects the patch.

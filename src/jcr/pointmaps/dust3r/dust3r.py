@@ -21,8 +21,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
 
 MAX_BATCH = {"cpu": 1, "cuda": 16}
-"""Number of pairs in a batch by device. A larger one does not help a CPU, whose cores one pair of 768 tokens keeps busy.
-Number of pairs in a batch by device. A larger one does not help a CPU, whose cores one pair of 768 tokens keeps busy."""
+"""Number of pairs in a batch, by device. A CPU gains nothing from more: one pair of 768 tokens keeps its cores busy."""
 
 
 def reconstruct_dust3r(

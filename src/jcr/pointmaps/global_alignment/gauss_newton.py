@@ -65,9 +65,9 @@ class AlignmentSolution:
 class ImageEquations:
     """Gauss-Newton equations of one image after elimination of its depths and pair errors, and the terms of their steps.
 
-    The c local unknowns are one twist per second view (camera relative to observer), the log scales of the pairs, and
-    the log focal length. Twists are those of geometry.twist_from_step. Only the difference of the twists of camera and
-    observer changes a residual.
+    The c local unknowns are one twist for each of n second views (camera relative to observer), the log scales of the
+    pairs, and the log focal length. The t = 6n pair errors and the m log depths are eliminated. Twists are those of
+    geometry.twist_from_step; only the difference of those of camera and observer changes a residual.
     """
 
     hessian: Float[ndarray, "c c"]
@@ -76,7 +76,7 @@ class ImageEquations:
     """Matrix from a step of all unknowns to a step of the local unknowns."""
     gain: Float[ndarray, "t c"]
     offset: Float[ndarray, " t"]
-    """Constant of the step of the pairs' errors (recon axes), gain · (local step) + offset."""
+    """Constant term: the pairs' errors step by gain · (local step) + offset, in recon axes."""
     axes: Float[ndarray, "n 6 6"]
     """Adjoint of each observer: maps twists in recon axes to twists in the observer's axes."""
     error_variance: Float[ndarray, "n 6"]

@@ -12,9 +12,10 @@ from jcr.pointmaps.global_alignment.residuals import AlignmentState
 
 
 def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> AlignmentState:
-    """Estimate the state to a few per cent: depths from each image's first views, cameras along the best-agreeing pairs.
+    """Return an initial state, accurate to a few per cent.
 
-    `edges` are the image rows (first, second) of each pair.
+    Depths come from each image's first views, cameras from the pairs that agree best. `edges` are the images (first,
+    second) of each pair.
     """
     focal = _focal(images)
     depth, unit = [], np.zeros(len(edges))

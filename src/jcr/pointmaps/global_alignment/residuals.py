@@ -160,7 +160,7 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
 def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`; return it with a mean weight.
+    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`; return it with their mean weight.
 
     The pointmaps count as independent, weighted by agreement and noise.
     """
