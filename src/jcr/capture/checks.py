@@ -100,7 +100,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
-    """Return the EXIF orientation that all images share; raise InputError if they differ or it mirrors them."""
+    """Return the EXIF orientation that all images share; raise InputError if it differs or mirrors the images."""
     (first, orientation), *others = orientation_of.items()
     remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
     if orientation not in (1, *ROTATED):

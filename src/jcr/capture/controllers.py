@@ -19,7 +19,8 @@ METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 RADIANS_LIMIT = 2 * np.pi + 0.01
 """Largest plausible angle of a pose in radians; larger numbers are taken for degrees."""
 LEAST_REACH = 0.25
-"""Smallest reach (m) of an arm with a camera; positions that stay below it if read as mm are taken for cm."""
+"""Smallest reach of an arm with a camera, m. Positions in a wrong unit are cm if their largest distance from the base
+is under 1000 times this number, otherwise mm."""
 METRES_LIMIT = 10.0
 """Largest plausible distance of a gripper from its base, m; larger numbers are not in metres."""
 QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
@@ -96,7 +97,7 @@ def units_of(convention: str) -> str:
 def numbers_from_poses(
     base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
 ) -> Float[ndarray, "n k"]:
-    """Write poses as rows of numbers in a convention's columns; the inverse of `poses_from_numbers`."""
+    """Convert poses to rows of the k numbers of a convention, in its columns; inverse of `poses_from_numbers`."""
     form = CONVENTIONS[convention]
     position_unit, angle_unit = form.scales(units)
     position = base_from_gripper[:, :3, 3] / position_unit
@@ -114,7 +115,7 @@ def numbers_from_poses(
 def poses_from_numbers(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> Float[ndarray, "n 4 4"]:
-    """Convert rows of numbers in a convention's columns to base_from_gripper; raise InputError if a row is no pose."""
+    """Convert rows of the k numbers of a convention to base_from_gripper; raise InputError if a row is no pose."""
     poses, faults = checked_rows(numbers, convention, units, where)
     if faults:
         raise InputError(faults[min(faults)])
@@ -124,7 +125,7 @@ def poses_from_numbers(
 def checked_rows(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
-    """Convert rows of numbers in a convention's columns to base_from_gripper; return also the faults of the rows.
+    """Convert rows of the k numbers of a convention to base_from_gripper; return also the faults of the rows.
 
     The faults map the index of each row that is no pose to a message; its pose is NaN. `units` other than auto replace
     the convention's units. Raises InputError if the size of the numbers contradicts the units.
@@ -171,7 +172,11 @@ def tolerated(count: int) -> int:
 
 
 def far_faults(position: Float[ndarray, "n 3"], where: str, names: Sequence[str]) -> dict[int, str]:
-    """Return a message for each row whose position is over METRES_LIMIT from the base; raise InputError if many are."""
+    """Return messages, by row, for positions (m) that are more than METRES_LIMIT from the base.
+
+    Raises InputError if more than `tolerated` rows are, because wrong units are then the cause. `names` are the names
+    of the rows in the messages.
+    """
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
     if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):

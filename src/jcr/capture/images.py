@@ -15,13 +15,14 @@ from jcr.files import require_file
 from jcr.records.capture_json import other_size
 
 MAX_PIXELS = 64_000_000
-"""Largest number of pixels of an image; no wrist camera has more, and larger files may be decompression bombs."""
+"""Largest number of pixels of an image. No wrist camera has more; a larger file may be a decompression bomb, which is
+refused before it is unpacked."""
 BLURRED = 0.25
-"""Sharpness below which an image is blurred, as a share of the median sharpness of the capture's images."""
+"""Sharpness below which a frame is blurred, as a share of the median sharpness of the frames."""
 ORIENTATION = 0x0112
 """EXIF tag that holds an image's orientation."""
 DEFECTIVE = 10_000
-"""Number of pixels of which one may be defective and have any value."""
+"""Number of pixels of which one may be defective; a defective pixel may have any value."""
 BLURRED_EDGE = 1 / 80
 """Largest `edge_width` of a sharp image; images of eleven real arms have 1/300 to 1/98."""
 EDGES_AT = 640
@@ -33,8 +34,8 @@ ONE_VIEW = 0.25
 fourteen real captures the ratio is below 0.1 for images of one place with noise of 6 levels, 0.35 where the robot holds
 a board that fills a third of them, and above 0.75 between places."""
 USUAL_GREY = 2.0
-"""Smallest contrast (grey levels) by which details are normalised. Gaussian noise of 4 levels has 0.6 after the
-filter."""
+"""Smallest contrast (grey levels) by which `_detail` normalises. Noise of 4 levels has a contrast of 0.6 after its
+Gaussian filter."""
 DEPTH = "depth"
 """Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
 DARK, BRIGHT = 12, 243
@@ -157,7 +158,7 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
 
 
 def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
-    """Return the band-pass filtered grey image, normalised so that strong details count as much as usual ones.
+    """Return the band-pass filtered grey levels of an image, normalised so that strong details count as usual ones.
 
     The filter suppresses noise, which is finer, and shading, which is coarser. The normalisation keeps a printed board
     in front of the camera from outweighing the scene behind it.

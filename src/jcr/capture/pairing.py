@@ -21,8 +21,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _LATEST_NS = np.iinfo(np.int64).max
 """Largest time stamp (ns) that fits 64 bits, in the year 2262."""
 Paired = tuple[list[str], Float[ndarray, "n 4 4"], Mapping[int, str], tuple[str, ...]]
-"""Image paths relative to the folder, their base_from_gripper, messages by index for images without a usable pose, and
-notes for the user."""
+"""Image paths relative to the folder, base_from_gripper of each, messages by index for images without a usable pose,
+and notes for the user."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +64,10 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
 def paired_by_name(
     names: Sequence[str], poses: Float[ndarray, "n 4 4"]
 ) -> dict[bool, Float[ndarray, "n 4 4"]]:
-    """Return the poses as paired if the pose file had listed the images in the order of their names.
+    """Return the poses as they would be paired if the pose file had listed the images sorted by name.
 
-    Key True: names sorted by the numbers in them; key False: names sorted as text. `names` and `poses` are paired row
-    by row. An order that changes no pair is left out.
+    Key True: names sorted by the numbers in them; key False: names sorted as text. The given `names` and `poses` are
+    paired row by row. A key is left out if its order changes no pair.
     """
     found = {}
     for by_number in (True, False):
@@ -91,9 +91,9 @@ def image_names(folder: Path) -> list[str]:
 
 
 def stamp_ns(text: str, where: str) -> int:
-    """Convert the text of a time stamp to nanoseconds; its size distinguishes s, ms, µs and ns.
+    """Convert a time stamp from text to nanoseconds; the size of the number tells whether it is in s, ms, µs or ns.
 
-    The result is exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
+    The result is exact, as a float would not be: it holds 16 of the 19 digits that nanoseconds since 1970 have.
     """
     with suppress(ArithmeticError, ValueError):  # errors of Decimal and int
         value = Decimal(text)
@@ -136,7 +136,7 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
 def _paired_by_time(
     folder: Path, file: Path, table: PoseTable, taken: list[str], options: ReadOptions
 ) -> Paired | None:
-    """Interpolate the poses at the time stamps in the image names; None if the names are no stamps of that time."""
+    """Interpolate the poses at the time stamps that name the images; None if the names are not such stamps."""
     assert table.stamp_ns is not None
     try:
         stamps = np.array([stamp_ns(Path(name).stem, str(folder / name)) for name in taken])

@@ -66,7 +66,7 @@ def split_cells(lines: Sequence[str], file: Path) -> tuple[list[str] | None, lis
 
 
 def number_of(cell: Any) -> float | None:
-    """Return a cell as a float; None if it is not a number in Python's notation."""
+    """Return a table's cell as a float; None if the cell is not a number in Python's notation."""
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
@@ -124,7 +124,10 @@ def first_few(names: Sequence[str]) -> str:
 
 
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
-    """Return a file's content converted by its schema; raise InputError, begun with `where`, if it does not fit."""
+    """Return the content of a file, validated and converted by `schema`; raise InputError if the content does not fit.
+
+    The message begins with `where`.
+    """
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:
         return validate(content)

@@ -49,9 +49,9 @@ class PoseTrack:
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Return the row of the sample before each stamp, the fraction of the time to the next sample, and the gap in ns.
+    """Return for each stamp the row of the sample before it, the fraction of the way to the next sample, and the gap.
 
-    The gap is the time between the two samples around the stamp: 0 at a sample, NEVER outside of the samples.
+    The gap is the time (ns) between the two samples around the stamp: 0 at a sample, NEVER outside of the samples.
     """
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
@@ -65,7 +65,7 @@ def bracket(
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     """Return the speed (m/s) of the frame at time stamps (ns); rotation counts as in jcr.geometry.motion_length.
 
-    It is measured over SPEED_OVER_NS before and after each stamp, at the ends of the recording on one side only.
+    The motion is measured from SPEED_OVER_NS before to SPEED_OVER_NS after each stamp.
     """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
@@ -95,7 +95,7 @@ class TfTree:
                 self._static.add(child)
 
     def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
-        """Return a function from time stamps to base_from_gripper; raise InputError if no transforms join the two."""
+        """Return a function from time stamps to base_from_gripper; raise InputError if the frames are not connected."""
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
             if frame is None or frame not in frames:

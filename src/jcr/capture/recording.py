@@ -22,12 +22,12 @@ from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
 
 STILL = 0.005
-"""Speed below which the arm is at rest, m/s, as motion_length counts rotation: in 20 ms a tenth of a pixel at half a
-metre."""
+"""Speed (m/s) below which the arm is at rest; rotation counts as in motion_length. At half a metre this moves the image
+by a tenth of a pixel in 20 ms."""
 LOOKS = 5
 """Number of frames of one stop whose sharpness is compared."""
 SAME_VIEW = 0.005
-"""Smallest distance between two views, m, as motion_length counts rotation; of closer frames only the sharpest is
+"""Smallest distance (m) between two views; rotation counts as in motion_length. The sharpest of closer frames is
 kept."""
 WEAK = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
@@ -149,7 +149,7 @@ def best_frames(
         run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]
         for run in _runs(usable & (speed < STILL))
     ]
-    if len(moments) < count:  # the slowest frame of each of about 4 · count equal pieces of the rest
+    if len(moments) < count:  # add the slowest frame of each of about 4 · count equal pieces of the motion
         moving = _runs(usable & (speed >= STILL))
         piece = max(sum(map(len, moving)) // (4 * count), 1)
         parts = [part for run in moving for part in np.array_split(run, max(len(run) // piece, 1))]
@@ -161,7 +161,7 @@ def best_frames(
     least = BLURRED * np.median(sharp[sharpest]) if len(sharpest) else 0.0
     clear = sharpest[sharp[sharpest] >= least]
     views = clear[:0]
-    for row in clear[np.argsort(-sharp[clear], kind="stable")]:  # without those near a better one
+    for row in clear[np.argsort(-sharp[clear], kind="stable")]:  # skip views near a sharper one
         motion = inverse(base_from_gripper[views]) @ base_from_gripper[row]
         if (np.asarray(motion_length(motion)) > SAME_VIEW).all():
             views = np.append(views, row)

@@ -27,7 +27,7 @@ fisheye)."""
 _Numbers = Annotated[
     list[float], BeforeValidator(lambda array: list(array) if hasattr(array, "__iter__") else array)
 ]
-"""Numbers of an array in a message, as a list."""
+"""List of floats, converted from the array of a message."""
 
 
 class CameraInfo(BaseModel):
@@ -50,11 +50,11 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
 def intrinsics_of_ros(
     content: Any, size: tuple[int, int], where: str, is_rectified: bool = False
 ) -> Intrinsics | None:
-    """Return the intrinsics of images of `size` (width, height); None if all are 0: never calibrated.
+    """Return the intrinsics of images of `size` (width, height); None if the camera was never calibrated.
 
-    `content` is a CameraInfo message or the content of a YAML file. Rectified images have the intrinsics P and no
-    distortion. Raises InputError, begun with `where`, for an unknown distortion model, or intrinsics of another
-    resolution.
+    `content` is a CameraInfo message or the content of a YAML file; an uncalibrated camera has a matrix of zeros.
+    Rectified images have the intrinsics P and no distortion. Raises InputError, begun with `where`, for an unknown
+    distortion model, or intrinsics of another resolution.
     """
     info: CameraInfo = validated_content(CameraInfo, content, where)
     matrix, model, coefficients = info.k, info.distortion_model, info.d

@@ -35,7 +35,7 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
     import yourdfpy
 
     try:
-        # yourdfpy repairs what is no XML, with two lines of its own on stderr.
+        # yourdfpy would repair invalid XML and print two lines on stderr; such a file is refused here.
         etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
         plain = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
         for joint in plain.robot.joints:

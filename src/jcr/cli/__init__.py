@@ -95,7 +95,7 @@ LONGEST_LINE = 2000
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run one command and exit with its status at once; Python's own clean-up of modules would take a second."""
-    # Threads that wait by spinning gain nothing on small matrices; with torch's they cost a run two of fifteen seconds.
+    # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _open_closed_streams()
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_closed_streams() -> None:
-    """Open closed standard streams to nowhere; otherwise the next opened file would receive their output."""
+    """Open closed standard streams on the null device; the next opened file would otherwise take their numbers."""
     for number in range(3):
         try:
             os.fstat(number)

@@ -176,7 +176,7 @@ def _print(text: str) -> None:
 def _source(
     arguments: CaptureCommand, session: LiveSession, states: States | None, server: "LiveServer"
 ) -> Callable[[], None]:
-    """Return the function that takes images at the poses of `--poses`; start reading typed commands."""
+    """Return the function that takes images at the poses of `--poses`, and start a reader of typed commands."""
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():
         _print(HELP)

@@ -61,7 +61,7 @@ class CheckCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Examine the capture and print the verdict."""
+        """Check the capture, print the result and return the exit status."""
         from jcr.calibration.options import CalibrateOptions, check_options
         from jcr.pipeline.check import check_capture, read_and_compare
 
@@ -208,7 +208,7 @@ class CompareCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print the difference, whether the reported errors explain it, and the causes that would."""
+        """Print the difference, whether the reported errors explain it, and the shares of its possible causes."""
         from jcr.calibration.difference import difference, read_hand_eye
 
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
@@ -271,7 +271,7 @@ class VerifyCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Verify and print what to do."""
+        """Print for each camera whether it has moved, and the remedy; return the exit status."""
         from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 

@@ -71,7 +71,7 @@ class DocsCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print a page, or the names and titles of all."""
+        """Print a page, or the names and titles of all pages."""
         if self.name is not None:
             text = page(self.name)
             self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
@@ -136,7 +136,7 @@ class ModelsCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the list, or get weights."""
+        """Print the list of back ends, or download weights."""
         if self.action == "get":
             return self._get()
         if self.name is not None or self.accept_licence or self.revision is not None:

@@ -54,7 +54,7 @@ class CalibrateCommand:
     depth: DepthOptions = field(default_factory=DepthOptions)
 
     def main(self) -> int:
-        """Calibrate and print the result."""
+        """Calibrate, print the result and return the exit status."""
         from jcr.calibration.stage import is_one
         from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
@@ -92,7 +92,7 @@ class RunCommand(CalibrateCommand):
     """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
 
     def main(self) -> int:
-        """Run every stage and print the result."""
+        """Run every stage, print the result and return the exit status."""
         from jcr.capture.read import read_capture
 
         options = run_options(self, map=None if self.no_map else self.map)
@@ -133,7 +133,7 @@ class BatchCommand:
     map: MapOptions = field(default_factory=MapOptions)
 
     def main(self) -> int:
-        """Run all and print the table."""
+        """Run all captures and print a table; raise RejectedError if one failed or is rejected."""
         from jcr.pipeline.batch import batch
 
         if len(self.paths) < 2:
@@ -199,7 +199,7 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
 
 
 def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progress) -> Any:
-    """Return the capture of a command, read by `read`; frames of a recording are extracted to the run folder."""
+    """Return the capture of a command, as `read` returns it; frames of a recording are put into the run folder."""
     from jcr.files import locked
     from jcr.result import CAPTURE
 
@@ -211,7 +211,7 @@ def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progr
 def looked_at(
     path: Path, options: ReadOptions, read: Callable[..., Any], progress: Progress, **more: Any
 ) -> Iterator[Any]:
-    """Yield the capture at a path, read by `read`; extracted frames of a recording are deleted afterwards."""
+    """Yield the capture at a path, as `read` returns it; extracted frames of a recording are deleted afterwards."""
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
         yield read(path, options, into=scratch, progress=progress, **more)
 
@@ -221,7 +221,7 @@ def _run(
 ) -> "RunResult":
     """Run a capture, and print the calibration as soon as it is finished, before depth and map.
 
-    If no back end found a reconstruction, the result is the run folder, whose calibration.json states the reason.
+    If no back end found a reconstruction, the returned run's calibration.json states the reason.
     """
     from jcr.pipeline.run import run
     from jcr.pipeline.selection import NothingFoundError

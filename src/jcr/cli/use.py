@@ -43,9 +43,9 @@ class MapCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     add: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="CAPTURE")] = ()
-    """A capture of new images, in any format; repeat for more, oldest first. The calibration is not changed. What a new
-    image sees through is removed from the map; a new object needs two new images. They are kept for every later map of
-    the run (OUT/added)."""
+    """A capture of new images, in any format; repeat for more, oldest first. The calibration is not changed. Parts of
+    the map that a new image sees through are removed; a new object needs two new images. The images are kept for every
+    later map of the run (OUT/added)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
@@ -68,8 +68,8 @@ class MapCommand:
 class ExportCommand:
     """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
 
-    Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres. A
-    calibration that is rejected is exported with --force alone; the exit status is 3 without it.
+    Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres. A rejected
+    calibration is exported only with --force; without it the exit status is 3.
 
     for example:
       jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
@@ -135,7 +135,7 @@ class QueryCommand:
     """File to write, .csv or .npy (a structured array); by default points.answers.csv beside the points, or none with
     --json, which prints the answers."""
     unknown: Literal["occupied", "free", "report"] = "report"
-    """State of unseen space: solid, empty, or occupancy 0.5."""
+    """Treatment of unseen space: occupied (solid), free (empty), or report (occupancy 0.5)."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
@@ -217,7 +217,7 @@ def _finite(column: ndarray) -> list:
 
 @dataclass(frozen=True)
 class MeasureCommand:
-    """Measure the support plane, and the height, footprint and box of each object on it, with 1 sigma.
+    """Measure the support plane, and the height, footprint and box of each object on it, with standard deviations.
 
     OUT is the folder of a run. `jcr map --segments` selects how the scene is divided into objects.
 
@@ -269,7 +269,7 @@ def sizes_lines(measured: "Measurement") -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand:
-    """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
+    """Show a run in the browser: points, cameras, grippers, robot, layers of the map, and a sphere to query it.
 
     The page is served until Ctrl-C, and only to this machine; from another one use
     ssh -L 8080:127.0.0.1:8080. Needs viser: pip install 'jcr-handeye[view]'.

@@ -74,8 +74,8 @@ def export_run(
 ) -> Path:
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line. Raises InputError as the command does, and RejectedError if the
-    calibration is rejected; with `force` it is exported, and the file contains the reason.
+    `options` are those of the command line. Raises InputError for a run, format, option or path that cannot be used,
+    and RejectedError if the calibration is rejected; with `force` it is exported, and the file contains the reason.
     """
     file = None if path is None else Path(path)
     return write_run(Path(out), format, file, checked_options(options, ExportOptions))[2]

@@ -35,8 +35,8 @@ class ExportOptions:
     """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
     prints it; by default the same origin, with axes as in REP-103."""
     intrinsics: Literal["estimated", "given"] = "estimated"
-    """Intrinsics that the camera is used with: estimated by the run, or given by the capture. Each pair has a transform
-    of its own, and files name the pair."""
+    """Intrinsics that the camera is used with: estimated by the run, or given by the capture. Each of the two
+    has a transform of its own, and files state the intrinsics of theirs."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Voxel size (m) for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None

@@ -272,6 +272,6 @@ def _xml_comment(*lines: str) -> str:
 
 
 def _yaml(mount: CameraMount, content: Mapping[str, Any], *more: str, flow: bool | None = None) -> str:
-    """Return YAML text: the notes of a mount and `more` as comments, then the content."""
+    """Return YAML text: the notes of a mount and `more` as comments, then the content (`flow` as in yaml.safe_dump)."""
     body = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=flow, width=110)
     return f"{_comments(mount, *more)}\n{body}"

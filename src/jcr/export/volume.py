@@ -54,10 +54,9 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write the signed distance at the centres of voxels of side `voxel_size` m, by default the map's cell, as .npz.
 
-    Unseen space counts as occupied by default.
-    `values` (nx,ny,nz) with x slowest, as cuRobo lays out its voxel tensor; `origin` (3,) the centre of the
-    first voxel; `voxel_size`; `dims` (3,) the sides of the grid; `pose` (7,) its centre and quaternion w x y z,
-    as cuRobo wants them; and as text `frame`, `unit`, `sign`, `unknown`.
+    Unseen space counts as occupied by default. The arrays follow cuRobo: `values` (nx,ny,nz), x slowest; `origin` (3,),
+    the centre of the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and
+    quaternion w x y z. The texts are `frame`, `unit`, `sign` and `unknown`.
     """
     voxel, unknown = _voxel(scene, options.voxel_size), options.unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
@@ -116,7 +115,7 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the voxel centres of a grid; `lower` is its corner and `count` its number of voxels along x, y, z."""
+    """Return the voxel centres (m) of a grid; `lower` is its lower corner, `count` the number of voxels per axis."""
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 

@@ -71,7 +71,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
-    # Height of the plane without one image, for each image.
+    # Mean height of the plane's points without those of one image, for each image.
     off, shown_by = x_in_support[support.on_plane, 2], cloud.image[support.on_plane]
     n = len(cloud.camera_centers_in_base)
     total, count = np.bincount(shown_by, off, n), np.bincount(shown_by, minlength=n)
@@ -146,9 +146,9 @@ def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
 
 
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
-    """Return the height of an object's top (m) and the robust standard deviation of the heights around it (m).
+    """Return the height (m) of an object's top, and the robust standard deviation (m) of the heights of its points.
 
-    Over height, the density of points has a peak at a flat top and a step at a round one. The result is the median
+    The density of points over the height has a peak at a flat top and a step at a round one. The result is the median
     height around the highest peak that is not scatter. A high quantile would be 2 % and more too large for narrow tops
     with stray points above them.
     """
@@ -183,5 +183,5 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
 
 
 def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
-    """Return two unit vectors as rows: the axes x and y rotated by `rotation_rad`."""
+    """Return the unit vectors of the x and y axes after rotation by `rotation_rad`, as rows."""
     return rotation_exp(np.array([0.0, 0.0, -rotation_rad]))[:2, :2]

@@ -13,7 +13,7 @@ class TabletopOptions:
     """Limits of an object on the table."""
 
     object_lowest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.008
-    """Height (m) above the plane that an object must reach; its lower points may then belong to it."""
+    """Height (m) above the plane that an object must reach; then lower points may belong to it, too."""
     object_highest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.6
     """Height (m) above the plane beyond which nothing belongs to an object."""
     object_gap: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01

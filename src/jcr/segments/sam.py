@@ -56,7 +56,7 @@ def load_sam(weights: str) -> "Sam2Model":
         folder = str(cached[0].parent)
 
     bars = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()  # loading takes moments, and --quiet means quiet
+    logging.disable_progress_bar()  # loading is fast, and --quiet must print nothing
     try:
         model = Sam2Model.from_pretrained(folder, local_files_only=True)
     except (OSError, ValueError) as error:

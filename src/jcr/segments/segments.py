@@ -17,7 +17,7 @@ from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
 
 MOST = 1024
-"""Largest number of labels; an image that is no label image has more values."""
+"""Largest number of labels; an image with more values is probably no label image."""
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
@@ -30,7 +30,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
     folder = capture.folder / "labels"
     if not any(folder.glob("*.png")):
         return None
-    # The nearest label of the capture's image at each pixel of the pointmap.
+    # Positions of the pointmap's pixels in the capture's image, where the nearest label is read.
     at_px = project(reconstruction.intrinsics, rays(reconstruction.dense.intrinsics)).astype(np.float32)
     labels = np.zeros(reconstruction.dense.confidence.shape, np.int64)
     for k, row in enumerate(reconstruction.image_index):

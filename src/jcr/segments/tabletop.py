@@ -35,7 +35,7 @@ FEWEST, LEAST_SHARE = 30, 1e-3
 NOISE_REACH = 4.0
 """Largest height of a point on the plane, in standard deviations of the plane's noise."""
 CLEARLY = 1.5
-"""Multiple of the smallest height of an object that its highest points must exceed; noise reaches that height
+"""Multiple of the smallest height of an object that some of its points must exceed; noise reaches that height
 itself."""
 FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 """Smallest number of points of an occupied cell seen from above, and smallest share of the median cell's number. Cells
@@ -96,7 +96,7 @@ def fit_support(cloud: PointCloud) -> Support:
         up = axes[:, 0] * np.sign(axes[:, 0] @ up)
         distance = (x - middle) @ up
         noise = max(_noise(distance[np.abs(distance) < 3 * noise]), 1e-5 * far)
-    # x of the support's frame lies as near to x of the base as it can.
+    # The x axis of the support frame is the base's x axis (or y axis) projected onto the plane.
     along = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     along = along - (along @ up) * up
     along /= np.linalg.norm(along)

@@ -38,8 +38,8 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Read the best frames of a bag into the folder `into`; the bag is streamed, never held in memory as a whole.
 
-    Raises InputError that lists the existing topics or frames if the options name others, and if the poses of all
-    images are stale.
+    Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones),
+    and if the poses of all images are stale.
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
@@ -145,7 +145,7 @@ class _Bag:
         return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
-        """Return the intrinsics of CameraInfo for images of `size`, for rectified images from P; None if unknown."""
+        """Return the intrinsics of CameraInfo for images of `size` (matrix P for rectified images); None if unknown."""
         if (info := self.camera_info) is None:
             return None
         where = f"{self.path}: camera_info of {self.topic}"

@@ -236,7 +236,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
     urdf = capture.urdf
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
-        write_new(folder / URDF, urdf.read_bytes())  # a capture is complete in its folder
+        write_new(folder / URDF, urdf.read_bytes())  # so that the folder contains the whole capture
     optional = {
         "pose_convention": capture.pose_convention,
         "robot": capture.robot,
@@ -249,7 +249,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
 
 
 def origin(folder: Path) -> Path:
-    """Return the table or recording from which a capture folder was made; otherwise the folder itself."""
+    """Return the table or recording from which a capture folder was made; the folder itself if it has no origin."""
     try:
         return Path(read_json(folder / FILE)["made_from"][0])
     except (InputError, KeyError, IndexError, TypeError):

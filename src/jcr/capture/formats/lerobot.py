@@ -107,7 +107,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
         speed=np.concatenate([speed(PoseTrack(at, poses[part]).at, at) for at, part in pieces]),
-        gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
+        gap_ns=np.zeros(len(state), np.int64),  # pose and image of a row have the same time
         images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
         joints=joints,
     )
@@ -150,7 +150,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 def _read_table(
     path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
-    """Return the columns of one episode from Parquet, only its frames `rows` if given; nothing else is loaded."""
+    """Read columns of one episode from a Parquet table, only of the frames with index `rows` if these are given."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
@@ -176,10 +176,9 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 def _images(
     episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
 ) -> Iterator[Picture]:
-    """Yield the images of the `wanted` rows from the videos or tables of the episodes.
+    """Yield the images of the `wanted` rows (ascending) from the videos or tables of the episodes.
 
-    `rows` are the rows of each episode, counted over all episodes; `wanted` is ascending. `fps` is the frame rate of
-    the videos.
+    `rows` has the rows of each episode; rows are counted over all episodes. `fps` is the frame rate of the videos.
     """
     for episode, part in zip(episodes, rows, strict=True):
         mine = wanted[np.isin(wanted, part)]
@@ -232,9 +231,9 @@ def _video_frames(
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Return gripper poses from recorded poses or joint angles, and the joint angles (rad), None if unknown.
+    """Return gripper poses computed from poses or joint angles in `state`, and the joint angles (rad).
 
-    Joint angles are known only for a URDF whose gripper is moved by rotating joints.
+    The joint angles are None without a URDF in which rotating joints alone move the gripper.
     """
     where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:

@@ -113,7 +113,7 @@ def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
-    """Yield the cells of a matrix, a rotation or a position; `names` are the cells of a rotation, None without one."""
+    """Yield the cells of a matrix, rotation or position; `names` are the cells of the rotation, None if it is none."""
     rows = [row if isinstance(row, list) else [row] for row in value]
     flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}
     width = {9: 3, 12: 4, 16: 4}.get(len(flat), 0)

@@ -28,7 +28,8 @@ _IMAGE = (
 )  # fmt: skip
 _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
-"""Conventions that column names identify. Columns rx, ry, rz are not among them: a rotation vector or angles."""
+"""Conventions that column names identify. Columns rx, ry, rz identify none, as they may be a rotation vector or
+angles."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 _ALIASES = {
     re.compile(r"(?:[tp]_?|pos_|position_|translation_)([xyz])"): r"\1",
@@ -156,7 +157,7 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the pose convention that column names identify; raise InputError if they identify none."""
+    """Return the pose convention that column names identify; raise InputError if they identify none or several."""
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
