@@ -1,4 +1,4 @@
-"""Arms by name, from what their makers publish; frames, angles and signs are those of the controller."""
+"""Kinematic models of named arms from their makers' publications; frames and signs are those of the controller."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from jcr.geometry import Transform, transform
 Limits = Sequence[tuple[float, float]]
 Numbers = Sequence[float | int]
 TWICE = (-2 * pi, 2 * pi)
-"""A full rotation either way."""
+"""Limits (rad) of a joint with a full rotation in each direction."""
 
 
 def _arm(
@@ -26,9 +26,9 @@ def _arm(
     rest: Sequence[float],
     last_from_gripper: Transform | None = None,
 ) -> Arm:
-    """Return an arm whose joints rotate about z, from the frame of each joint in that of the joint before it.
+    """Return an arm whose joints rotate about z; row i of `origins` is joint i's frame in that of the previous joint.
 
-    Each row is x, y, z (m), roll, pitch, yaw (degrees), as the `origin` of a URDF. A further row is the gripper's frame,
+    Each row is x, y, z (m), roll, pitch, yaw (degrees), as the `origin` of a URDF. One more row is the gripper's frame,
     unless `last_from_gripper` is given.
     """
     rows = np.array(origins.split() if isinstance(origins, str) else origins, float).reshape(-1, 6)
@@ -44,9 +44,10 @@ def _arm(
 
 
 def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> Float[ndarray, "n 6"]:
-    """Return rows of `_arm` from a, d and α of each link, the base first; a standard table has zeros there.
+    """Return the `origins` of `_arm` from Denavit-Hartenberg parameters a (m), d (m), α (degrees), one row per frame.
 
-    Of a modified table (Craig) d is one row later than a and α.
+    Row 0 is the base; row i follows the rotation of joint i. Line i of a standard table is row i. Line i of a modified
+    table (Craig) has its d in row i, its a and α in row i − 1.
     """
     none = np.zeros(len(a))
     return np.stack([a, none, d, alpha_deg, none, none], axis=1)
@@ -174,11 +175,11 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
 }
 ROBOT_NAMES: tuple[RobotName, ...] = get_args(RobotName)
 CHOICES = f"{{{','.join(ROBOT_NAMES)}}}"
-"""Type of an option that names an arm, as the help shows it."""
+"""Names of the arms as the help of a command-line option shows them."""
 
 
 def arm_named(name: str) -> Arm:
-    """Return the arm of a name; raise InputError with the known names where it is unknown."""
+    """Return the arm with this name; raise InputError with the list of names if there is none."""
     for known, make in _ARMS.items():
         if known == name:
             return make()

@@ -1,14 +1,12 @@
-"""Known shapes of boards and tags, as a normal prior of their corners in the adjustment of images.
+"""Known shapes of boards and tags, as a normal prior on their corners in bundle adjustment.
 
-A body is a rig that no arm moves. It observes its own corners as a camera observes points, but in three dimensions:
-with the body's rotation R and origin t, its size e^l and its deformation D a, the residual of the corner that is
-printed at x and is at p in the world is e^(-l) Rᵀ (p - t) - x - D a, independent of the world's similarity. All bodies
-of a capture come from one printer, so they share l. A board bends and is stretched in a few smooth ways beside that;
-what is left is independent from corner to corner.
+A body (board or tag) is a rig that no arm moves. Let R and t be its pose, e^l its size and D a its deformation. A corner
+printed at x whose point is at p in the world has the residual e^(-l) Rᵀ (p - t) - x - D a, independent of the world's
+similarity. All bodies of a capture come from one printer, so they share l. A deformation is a stretch or a smooth bend;
+the remaining errors are independent from corner to corner.
 
-How large each is: with the shape free, ten real boards of 100 to 250 mm leave 0.05 to 0.25 mm about a surface of
-second order, their triangulation included (docs/results/real.md), and sheets bend by up to 3.6 mm, which the corners
-show to a few hundredths: the prior of the bend decides only where they show little.
+Measured sizes: ten real boards of 100 to 250 mm have 0.05 to 0.25 mm rms about a second-order surface, triangulation
+included (docs/results/real.md). Sheets bend by up to 3.6 mm, which the corners show to a few hundredths.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,34 +24,35 @@ from jcr.records import Boards
 CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
 """Standard deviation of a single corner along each axis of its body."""
 STRETCH_STD = 1e-3
-"""Relative: by how much more a printer stretches one side than the other."""
+"""Standard deviation of the relative stretch of x over y by a printer."""
 BEND_STD_M = {2: 3e-4, 3: 1e-4}
-"""Rms height of each polynomial of this degree over the corners."""
+"""Standard deviation of the bend (m rms over the corners) by one polynomial, by its degree."""
 SIZE_STD = 10.0
-"""Standard deviation of the logarithm of the size in units of the world, whose own unit is unknown."""
+"""Prior standard deviation of the log size l; large, because the unit of the world is unknown."""
 FEWEST_TO_BEND = 9
-"""Corners of a body with fewer show no bend beside its tilt."""
+"""Smallest number of corners of a body whose deformation is estimated."""
 FEWEST_CORNERS = 4
 """Smallest number of corners that determine the pose of a body."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardShapes:
-    """Corners of bodies and their shapes, one element for each corner in the order of the points."""
+    """Shape prior of c board corners, with s shape parameters: log size, then deformations of each body."""
 
     point: Int[ndarray, " c"]
-    """Row of the scene's points, ascending."""
+    """Point of each corner, ascending."""
     body: Int[ndarray, " c"]
-    """Row of the bodies."""
+    """Body of each corner."""
     first_rig: int
     """Rig of the first body."""
     x_in_body: Float[ndarray, "c 3"]
-    """Coordinates in the unit of the world where the adjustment starts."""
+    """Printed position of each corner in its body, in units of the world at the initial state."""
     by_shape: Float[ndarray, "c 3 s"]
-    """Displacement by each column of what is free of the shape; 0 for the first, the logarithm of the size."""
+    """Displacement of each corner by each shape parameter; 0 for the first, the log size."""
     shape_std: Float[ndarray, " s"]
+    """Prior standard deviation of each shape parameter."""
     unit: float
-    """Length, in units of the world where the adjustment starts, of a unit of the stated size."""
+    """Length of one stated metre, in units of the world at the initial state."""
 
     @property
     def rig(self) -> Int[ndarray, " c"]:
@@ -61,7 +60,7 @@ class BoardShapes:
         return self.first_rig + self.body
 
     def of_points(self, kept: Int[ndarray, " p"]) -> "BoardShapes":
-        """Return the shapes in a scene whose points are these rows, ascending, of the present one."""
+        """Return the shape prior after all points but those of the rows `kept` (ascending) are removed."""
         rows = np.flatnonzero(np.isin(self.point, kept))
         return replace(
             self,
@@ -77,7 +76,7 @@ class BoardShapes:
         points_in_world: Float[ndarray, "p 3"],
         shape: Float[ndarray, " s"],
     ) -> Float[ndarray, "c 3"]:
-        """Return the residual of each corner along the axes of its body, in standard deviations."""
+        """Return the residual of each corner along body axes, in standard deviations, for parameters `shape` (s,)."""
         pose = world_from_rig[self.rig]
         ahead = points_in_world[self.point] - pose[:, :3, 3]
         in_body = np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
@@ -91,9 +90,9 @@ class BoardShapes:
         columns: slice,
         shared: int,
     ) -> Derivatives:
-        """Return two rows for each corner, across and above its body; the second is half empty.
+        """Return residuals and derivatives of the corners as two observations each: (x, y), and (z, 0).
 
-        `columns` are those of the shape among the `shared` ones.
+        `columns` are the shape parameters among the `shared` columns of the image equations.
         """
         c = len(self.point)
         residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
@@ -118,7 +117,7 @@ class BoardShapes:
     def point_information(
         self, world_from_rig: Float[ndarray, "m 4 4"], shape: Float[ndarray, " s"], points: int
     ) -> Float[ndarray, "p 3 3"]:
-        """Return the information of the shape about each point where its body is known; 0 for other points."""
+        """Return the shape prior's information about each of p points for fixed body poses; 0 for other points."""
         whitened = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
         whitened /= CORNER_STD_M[:, None]
         out = np.zeros((points, 3, 3))
@@ -133,9 +132,9 @@ class BoardShapes:
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
 ) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
-    """Return the shapes of boards whose corners are among triangulated points, and initial poses of their bodies.
+    """Return the shape prior of boards with corners among the points, and initial world_from_body of each body.
 
-    Corners that are not `seen` take no part, nor do bodies with fewer than four such corners; None without bodies.
+    Only corners that are `seen`, and bodies with at least four of them, are used. The prior is None without bodies.
     """
     bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
     if not bodies:
@@ -166,7 +165,7 @@ def shapes_of(
 def _seen_bodies(
     boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
 ) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Transform, float]]:
-    """Yield point rows, coordinates, world_from_body and size in the world of each body with a determined pose."""
+    """Yield corner points, printed coordinates, world_from_body and size of each body whose pose is determined."""
     for body in boards.bodies:
         rows = np.flatnonzero(seen[body.point])
         x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
@@ -178,7 +177,7 @@ def _seen_bodies(
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
-    """Return the directions in which a body may deform, and their standard deviations."""
+    """Return w deformations of a body with c corners, displacements by one unit each, and their standard deviations."""
     if len(x) < FEWEST_TO_BEND:
         return np.zeros((len(x), 3, 0)), ()
     across = x[:, :2] - x[:, :2].mean(0)

@@ -1,9 +1,8 @@
-"""Hand-eye calibration with unknown scale in closed form, over all pairs of images at once, for many problems at once.
+"""Closed-form hand-eye calibration with unknown scale from all pairs of images, for many problems at once.
 
-For every image `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`. Summing the squared
-differences of this equation over all pairs of images is the same as summing over images with
-`base_from_recon` free, so all n(n-1)/2 motions are used at the cost of n. No rotation's logarithm is taken, so
-that rotations by 180° are like any other.
+For every image `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`. With `base_from_recon` free, the
+sum of squared differences over n images equals the sum over all n(n-1)/2 pairs. No logarithm of a rotation is used, so
+rotations by 180° need no special treatment.
 """
 
 import numpy as np
@@ -14,11 +13,11 @@ from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transf
 
 Poses = Float[ndarray, "*#batch n 4 4"]
 ROUNDS = 5
-"""Largest number of rounds that refine the rotations; a likelihood fit follows."""
+"""Largest number of alternating refinements of the two rotations; a likelihood fit follows."""
 NEAR_HALF_ROTATION = -0.73
-"""Trace of a rotation by 150°, beyond which the sine of the angle shows little of the axis."""
+"""Trace of a rotation by 150°; for larger angles the sine is small and determines the axis badly."""
 RELATIVE_CUT = 1e-10
-"""Share of the largest singular value below which a value is rounding, and its direction unobservable."""
+"""Relative singular value below which a direction counts as unobservable."""
 
 
 def closed_form(
@@ -26,9 +25,8 @@ def closed_form(
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
     """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
-    The rotation comes first, then translation and scale by one linear least-squares problem (the paper's scale
-    recovery problem, eq. 8 to 10, without its grid search over λ). Of motions that leave them open, the smallest
-    translation is returned. The scale is 0 or less where the motions do not determine it.
+    Rotations are solved first, then translations and scale by linear least squares (the paper's scale recovery problem,
+    eq. 8 to 10). Degenerate motions give the translation of least norm, and a scale that may be 0 or negative.
     """
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
     rotation, base_rotation = rotations(of_gripper, of_camera, rounds)
@@ -40,12 +38,12 @@ def initial_estimate(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
 ) -> tuple[Transform, float, Transform]:
-    """Return `closed_form` with a positive scale, that of the extents where the motions do not determine it."""
+    """Return X, scale and base_from_recon of `closed_form`; a scale ≤ 0 is replaced by the ratio of the extents."""
     x, scale, z = closed_form(base_from_gripper, recon_from_camera)
     if scale <= 0:
         way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
         extent, seen = (np.linalg.norm(of - of.mean(0)) for of in (way, center))
-        # Every scale fits a camera that only rotates.
+        # Any scale fits a camera that only rotates.
         scale = extent / seen if seen > RELATIVE_CUT * np.linalg.norm(center) else 1.0
     return x, float(scale) or 1.0, z
 
@@ -56,7 +54,7 @@ def motions(a_from_b: Poses) -> Float[ndarray, "... n n 4 4"]:
 
 
 def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
-    """Return the rotation axis times the sine of the angle (...,3), smooth at 0 and, unlike the logarithm, at π."""
+    """Return the rotation axis times the sine of the angle (...,3), which is smooth at angles 0 and π."""
     antisymmetric = (rotation - np.swapaxes(rotation, -1, -2)) / 2
     return np.stack([antisymmetric[..., 2, 1], antisymmetric[..., 0, 2], antisymmetric[..., 1, 0]], axis=-1)
 
@@ -66,12 +64,11 @@ def rotations(
     camera: Float[ndarray, "*#batch n 3 3"],
     rounds: int = ROUNDS,
 ) -> tuple[Rotations, Rotations]:
-    """Return R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
+    """Return R_X and R_Z, the rotations of X and base_from_recon (...,3,3), from R_G · R_X = R_Z · R_C.
 
-    The solution is Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. Where a
-    motion is nearly a rotation by 180°, whose sine is small, another solution competes: the equation is linear in R_X
-    and R_Z, and the leading singular pair of Σ R_C ⊗ R_G solves it (Shah 2013). That one alone is ambiguous where
-    all motions are rotations by 180°.
+    The method is Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. For problems
+    with a motion near 180° the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is tried
+    too, and the better fit is returned.
     """
     *batch, n = gripper.shape[:-2]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
@@ -99,7 +96,7 @@ def _polished(
     camera: Float[ndarray, "h n 3 3"],
     rounds: int,
 ) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
-    """Return R_X and R_Z, each optimal given the other in turn (monotone), and the squared residual."""
+    """Return R_X and R_Z after alternating refinement from `rotation` (an R_X), and the sum of squared residuals."""
     from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
     base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
     for _ in range(rounds):
@@ -115,18 +112,17 @@ def _polished(
 def _translations(
     base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations
 ) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
-    """Return t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
+    """Return t_X, λ and t_Z (of base_from_recon) by linear least squares from R_G t_X + t_G = λ R_Z t_C + t_Z.
 
-    t_Z is eliminated: it makes the means equal. The paper prints t_c^e for the camera's translation in its
-    d_i(λ); t_C is meant.
+    `base_rotation` is R_Z. The paper prints t_c^e for t_C in its d_i(λ).
     """
     center, rotation = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
     in_base = center @ np.swapaxes(base_rotation, -1, -2)
     position = base_from_gripper[..., :3, 3]
     rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
     rows = rows - rows.mean(-3, keepdims=True)
-    # The column has unit size, so that the cut of unobservable directions does not depend on the reconstruction's unit.
-    # Centres that differ by rounding alone count as one.
+    # The scale's column is normalised, so that the cut of singular values does not depend on the reconstruction's unit.
+    # Camera centres that differ by rounding only count as equal.
     size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
     unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
     rows[..., 3] /= unit[..., None, None]

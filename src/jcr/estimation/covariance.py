@@ -1,8 +1,8 @@
-"""Unknowns averaged over the sizes of the errors, with a calibrated covariance and its causes.
+"""Unknowns averaged over the sizes of the robot's errors, their covariance, and its division by cause.
 
-Cov = E[C] + Var[θ̂] over the sizes (robot_noise.py). A mixture has longer tails than a normal distribution of its
-covariance. The covariance is therefore scaled until its 99 % ellipsoid holds 99 %: an accepted result that is many
-standard deviations off is the worst fault.
+The covariance is E[C] + Var[θ̂] over the sizes (robot_noise.py), C and θ̂ being covariance and estimate for given sizes.
+Such a mixture has longer tails than a normal distribution; the covariance is enlarged until its 99 % ellipsoid contains
+99 % of the mixture.
 """
 
 from dataclasses import replace
@@ -27,9 +27,9 @@ from jcr.estimation.robot_noise import (
 from jcr.records import Budget, RobotNoise
 
 COVERED = 0.99
-"""Probability of the ellipsoid that is made to hold it."""
+"""Probability of the ellipsoid that the enlarged covariance must contain."""
 HALVINGS = 40
-"""Number of halvings of the interval that contains the size of that ellipsoid, to 1e-11 of it."""
+"""Number of bisections for the squared radius of that ellipsoid; relative error 1e-11."""
 
 Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
@@ -42,20 +42,22 @@ def posterior(
     region: Region,
     expected: bool = False,
 ) -> tuple[Float[ndarray, " p"], Square, Budget]:
-    """Return the step of the unknowns averaged over the sizes about their mode, their covariance, and its causes.
+    """Return the step of the unknowns averaged over the error sizes, their covariance (p,p), and its budget.
 
-    The covariance is for other poses of the region. `expected`: the residuals of the equations are 0, and their squares
-    are replaced by their expectations, tr(P V) for the covariance V of the noise at the mode.
+    `mode` and `information` are those of the log sizes; the covariance includes `Region.spread`. `expected`: for
+    predictions, the residuals are 0 and their squares are replaced by expectations under the noise at the mode.
     """
     root = cholesky(equations.covariance(mode))
 
     def density(solution: LinearSolution) -> Each:
+        """Return the log posterior of the sizes."""
         if not expected:
             return solution.log_posterior
         whitened, fitted = _whitened_and_fitted(solution, root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
+        """Return the covariance that systematic errors add for other poses of the workspace."""
         part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
         return region.spread(_blocks_of_poses(part) if expected else _second_moment(solution, part))
 
@@ -72,14 +74,14 @@ def posterior(
 
 
 def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
-    """Return the expected covariance where the sizes are known exactly, for comparisons."""
+    """Return the predicted covariance (p,p) of the unknowns for exactly known error sizes; faster than `posterior`."""
     mode = equations.log_sizes_of(noise)
     part = equations.variances(mode)[2] * equations.systematic
     return solve_equations(equations, mode).covariance + region.spread(_blocks_of_poses(part))
 
 
 def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return the second moment of each pose's systematic errors, of prior covariance `part`, given the residuals."""
+    """Return E[e eᵀ] of each of m poses' systematic errors e given the residuals; `part` is their prior covariance."""
     expected = (part @ solution.weighed_left[..., None])[..., 0]
     own = _blocks_of_poses(part)
     for sign, root in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
@@ -92,13 +94,13 @@ def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> 
 def _whitened_and_fitted(
     solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
-    """Return A and B with AᵀA − BᵀB = MᵀPM, P the projection of the solution."""
+    """Return A and B with AᵀA − BᵀB = MᵀPM, for M = `matrix` and P = `solution.projection`."""
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
     return lower(solution.root, matrix), fitted
 
 
 def _blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return the diagonal block of each pose."""
+    """Return the diagonal block (6,6) of each of m poses."""
     m = covariance.shape[-1] // 6
     each = np.arange(m)
     return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
@@ -110,10 +112,10 @@ def _widening(
     each: Float[ndarray, "k p p"],
     covariance: Square,
 ) -> float:
-    """Return the factor on the covariance of a mixture of normals that makes its 99 % ellipsoid hold 99 %.
+    """Return the factor ≥ 1 on a mixture's covariance with which its 99 % ellipsoid contains 99 % of the mixture.
 
-    Squared Mahalanobis distances under each component are matched by a scaled χ² of the same mean and variance
-    (Satterthwaite, Biometrics Bulletin 2, 1946).
+    The k normal components have the weights `weight`, means `off` and covariances `each`. Squared Mahalanobis distances
+    of each are approximated by a scaled χ² (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
     std = np.sqrt(np.diag(covariance))
     scaled, shift = covariance / np.outer(std, std), off / std
@@ -136,10 +138,10 @@ def _widening(
 
 
 def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
-    """Return the covariance of X and scale by its causes, which share the excess from averaging over sizes.
+    """Return the covariance of X and scale divided into four causes: robot random, robot systematic, intrinsics, images.
 
-    The part of the intrinsics is the covariance that knowing them would remove; the rest is divided as if they were
-    known. The images also have unobservable directions, and the rounding of their large numbers.
+    The part of the intrinsics is the covariance that exact intrinsics would remove. The increase from averaging over
+    the sizes is distributed over all parts. The part of the images includes unobservable directions and rounding.
     """
     exact = replace(
         equations,
@@ -154,13 +156,13 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
     if exact.confirmed is not None:
         systematic = systematic + gain @ exact.confirmed @ gain.T
-    # The part that neither robot nor cameras determine.
+    # Covariance from the priors and from errors of the camera poses.
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
     intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
     whole, parts = covariance[:7, :7], [part[:7, :7] for part in (random, systematic, intrinsics, images)]
-    # A linear map takes errors of the covariance of all parts to those of the whole.
+    # A linear map takes errors with the covariance of all parts to errors with the whole covariance.
     known = sum(parts[1:], parts[0])
     to_whole = upper(cholesky(known), cholesky(whole).T).T
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
@@ -171,9 +173,9 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
 
 
 def positive_part(part: Square, whole: Square | None = None) -> Square:
-    """Return a symmetric part of a covariance without the negative rounding that degenerate motions leave.
+    """Return a symmetric matrix with its negative eigenvalues, which come from rounding, set to 0.
 
-    Lengths are counted in the standard deviations of the `whole`; None: of the part.
+    Rows and columns are scaled by the standard deviations of `whole` first; None: by those of `part`.
     """
     std = np.sqrt(np.maximum(np.diag(part if whole is None else whole), 0.0))
     values, vectors = np.linalg.eigh(part / np.outer(*[np.where(std > 0, std, np.inf)] * 2))

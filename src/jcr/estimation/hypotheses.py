@@ -1,8 +1,8 @@
 """Tests of additional effects on gripper poses and cameras: Rao's score test ranks, Wald's test confirms.
 
-The score test (Proc. Cambridge Phil. Soc. 44, 1948) uses the error sizes of the solution, which were estimated with the
-effect inside and absorb part of it. The confirmation estimates the sizes again with the columns free and averages F
-tests over them (Seber and Lee, Linear Regression Analysis, 2003, chapter 4).
+The score test (Proc. Cambridge Phil. Soc. 44, 1948) uses the error sizes of the solution, which absorb part of an
+effect. The confirmation estimates the sizes again together with the effect and averages F tests over the sizes (Seber
+and Lee, Linear Regression Analysis, 2003, chapter 4).
 """
 
 from collections import Counter
@@ -48,16 +48,17 @@ from jcr.geometry import Poses, Transform, by_similarity, skew
 from jcr.records import Intrinsics, JointOffsets, RobotNoise
 
 CONFIRMED_AT_MOST = 3
-"""Kinds of effects that are confirmed: those with the largest gains of the score test."""
+"""Number of kinds of effects that are confirmed, those with the largest gains of the score test."""
 ORDERS = 200
-"""Orders of the images that a permutation test draws."""
+"""Number of random image orders in a permutation test."""
 BY_CHANCE = 0.02
-"""Share of other orders that may explain as much."""
+"""Largest share of random orders with at least the gain of the actual order."""
 LEAST_PART = 3
-"""Images on either side of a change: fewer are single wrong poses."""
+"""Smallest number of images before and after a change; fewer are single wrong poses."""
 MANY_PLACES = 60
-"""Largest number of places of a change that are tested; longer captures are sampled evenly."""
+"""Largest number of images at which a change is tested; longer captures are sampled evenly."""
 UP = np.array([0.0, 0.0, 1.0])
+"""Direction against gravity in the base frame."""
 PLAUSIBLE: dict[FindingKind, tuple[float, float]] = {
     FindingKind.SLIP: (0.12, np.radians(45.0)),
     FindingKind.BASE_MOVED: (0.2, np.radians(20.0)),
@@ -67,9 +68,9 @@ PLAUSIBLE: dict[FindingKind, tuple[float, float]] = {
     FindingKind.BASE_LEANS: (0.3, 0.0),
     FindingKind.TOOL_SAGS: (0.3, 0.0),
 }
-"""Largest estimate that the cause can produce: m and rad of a motion, else the norm of the parameters."""
+"""Largest plausible estimate of each effect: (m, rad) of a motion with six parameters, else the parameters' norm."""
 STRAINS = np.zeros((5, 3, 3))
-"""Orthonormal basis of the symmetric strains without a common factor, which is the scale and unobservable."""
+"""Orthonormal basis of the traceless symmetric strain matrices; the trace is a scale, which is unobservable."""
 STRAINS[0], STRAINS[1] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2), np.diag([-1.0, -1.0, 2.0]) / np.sqrt(6)
 for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
     STRAINS[_k, _a, _b] = STRAINS[_k, _b, _a] = 1 / np.sqrt(2)
@@ -77,49 +78,50 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Columns that one effect adds to the equations of the gripper poses."""
+    """One possible effect on the gripper poses: its d parameters and the columns they add to the equations."""
 
     kind: FindingKind
     columns: Float[ndarray, "s d"]
-    """Derivative of the residuals (m, rad, base axes) by the d parameters of the effect."""
+    """Derivative of the s = 6n residuals (m, rad; base axes) by the parameters."""
     place: int = 0
-    """Image before which a change happens; 0 for an effect without a place."""
+    """First image after the change; 0 for an effect that is not a change at one image."""
     prior_std: float = 0.1
-    """Standard deviation of the parameters once the effect is adopted: so large that the poses decide."""
+    """Prior standard deviation of the parameters when the effect is adopted, large enough to have little influence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Test:
-    """Result of one confirmed row."""
+    """Result of Wald's test of one effect."""
 
     row: Row
     estimate: Float[ndarray, " d"]
+    """Estimated parameters of the effect."""
     covariance: Float[ndarray, "d d"]
     log_p: float
-    """Logarithm of the probability of this estimate or a larger one without the effect, times the places tested."""
+    """Log p-value: chance of such an estimate without the effect, times the number of places tested."""
     shift: Float[ndarray, " p"]
-    """Step of the unknowns that comes with the effect."""
+    """Change of the p unknowns when the effect is estimated too."""
     noise: RobotNoise
-    """Robot pose noise that the effect leaves."""
+    """Robot pose noise estimated together with the effect."""
 
     def is_within(self, limits: tuple[float, float]) -> bool:
-        """Return whether the estimate is within limits (m and rad of a motion, else the norm of the parameters)."""
+        """Return whether a motion is within limits (m, rad), or the norm of other parameters within the first."""
         if self.row.columns.shape[1] != 6:
             return bool(np.linalg.norm(self.estimate) <= limits[0])
         return bool((np.linalg.norm(self.estimate.reshape(2, 3), axis=1) <= limits).all())
 
 
 def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s _"]]) -> list[float]:
-    """Return the gain of the score test for each set of columns A: gᵀS⁻¹g, g = Aᵀ V⁻¹(r + Jθ), S = Aᵀ P A."""
+    """Return the score test's gain gᵀS⁻¹g for each matrix A in `every`: g = AᵀV⁻¹(r + Jθ), S = AᵀPA."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     return [float(left @ a @ np.linalg.lstsq(a.T @ projection @ a, a.T @ left, rcond=1e-9)[0]) for a in every]
 
 
 def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> list[Test]:
-    """Return confirmed tests of the best rows, one of a kind, the most significant first.
+    """Return Wald's tests of the most promising effects, at most one row of each kind, the smallest p-value first.
 
-    The probability of a kind is multiplied by the number of its rows, the places that were searched.
+    A p-value is multiplied by the number of rows of its kind, the places that were tested.
     """
     # The penalty d · log(s) of Schwarz (1978).
     penalty = [np.log(len(equations.residual)) * row.columns.shape[1] for row in rows]
@@ -135,10 +137,10 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
 
 
 def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | None = None) -> Test:
-    """Return Wald's test of a row, with the sizes of the errors estimated again while its columns are free.
+    """Return Wald's test of an effect, with the error sizes estimated together with the effect.
 
-    The chance is averaged over the sizes. `freedom` is that of the sizes at each point of the average; None: of all
-    residuals, which counts their uncertainty twice and is on the safe side.
+    The p-value is averaged over the sizes and multiplied by `places`. `freedom` is the denominator's degrees of freedom
+    of each F test; None: those of all residuals, which is conservative.
     """
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     free = replace(
@@ -152,7 +154,7 @@ def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | No
     without = solve_equations(equations, likeliest)
     under = float(max(len(equations.residual) - UNKNOWNS - d, 1)) if freedom is None else freedom
     log_shares = []
-    # With few poses the sizes are hardly known, and larger ones leave more to chance.
+    # Few poses determine the sizes badly, and with larger sizes the same estimate is less significant.
     for weight, _, each in over_sizes(free, likeliest, information):
         size, covariance = each.step[:, count:], each.covariance[:, count:, count:]
         ratio = (size * np.linalg.solve(covariance, size[..., None])[..., 0]).sum(1) / d
@@ -175,14 +177,15 @@ def explains_by_order(
     share: Float[ndarray, " n"],
     own: slice,
 ) -> bool:
-    """Return whether a motion with these shares explains more than in nearly all other orders of the images `own`.
+    """Return whether a motion explains the residuals better than it does in nearly all random orders of the images.
 
-    A permutation test of the score gain: the errors of real arms have heavy tails, and one wrong pose is no motion.
+    `by_motion` is the derivative of the residuals by a motion, `share` (n,) its size at each image; the images `own` are
+    permuted. This permutation test of the score gain allows for errors with heavy tails and single wrong poses.
     """
     rng, centred, shares = np.random.default_rng(0), share[own] - share[own].mean(), [share]
     for _ in range(ORDERS):
         order = rng.permutation(centred)
-        # The hand-eye transform takes up a constant, and the sign is free: such an order is the same one.
+        # A constant is absorbed by the hand-eye transform and the sign is arbitrary: such orders are equivalent.
         if not (np.allclose(order, centred) or np.allclose(order, -centred)):
             shares.append(share.copy())
             shares[-1][own] = order
@@ -193,7 +196,7 @@ def explains_by_order(
 def order_rows(
     base_from_gripper: Poses, by_x: Float[ndarray, "n 6 6"], by_z: Float[ndarray, "n 6 6"]
 ) -> Iterator[Row]:
-    """Yield the effects that depend on the order of the images.
+    """Yield the effects that depend on the image order: slip of the camera, base moved, drift, delayed poses.
 
     `by_x` and `by_z` are the derivatives of the residuals by the hand-eye transform X and by base_from_recon.
     """
@@ -211,28 +214,28 @@ def order_rows(
 
 
 def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
-    """Yield the effects of the arm that depend on where its gripper is; n poses, residuals in base axes (m, rad)."""
+    """Yield the effects that depend on the gripper pose: strain of all lengths, leaning base, sagging tool."""
     position, rotation = base_from_gripper[:, :3, 3], base_from_gripper[:, :3, :3]
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
     strain[:, :3] = np.einsum("kab,nb->nak", STRAINS, position)
     yield Row(kind=FindingKind.LENGTHS, columns=_flat(strain), prior_std=0.1)
-    # The base rotates towards the gripper by 1 rad per metre of horizontal reach.
+    # The base leans towards the gripper by 1 rad per metre of horizontal distance.
     lean = np.cross(position, UP)
     yield Row(
         kind=FindingKind.BASE_LEANS,
         columns=_flat(np.concatenate([np.cross(lean, position), lean], axis=1)[..., None]),
         prior_std=0.2,
     )
-    # The gripper rotates by its weight at a lever along each of its axes, 1 rad where that lever is level.
+    # The gripper rotates under a weight on a lever along each of its axes, by 1 rad for a horizontal lever.
     sag = np.zeros((n, 6, 3))
     sag[:, 3:] = -rotation @ skew(rotation[:, 2])
     yield Row(kind=FindingKind.TOOL_SAGS, columns=_flat(sag), prior_std=0.1)
 
 
 def velocity(base_from_gripper: Poses) -> Float[ndarray, "n 6"]:
-    """Return the steps per image interval (base axes; m, rad) of an arm that moves smoothly through all poses."""
-    # These imports take as long as all of SciPy that every command needs.
+    """Return the gripper's velocity at each of n poses (m, rad per image; base axes), by splines through all poses."""
+    # These imports are slow and rarely needed.
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -244,15 +247,15 @@ def velocity(base_from_gripper: Poses) -> Float[ndarray, "n 6"]:
 
 
 def _flat(columns: Float[ndarray, "n 6 d"]) -> Float[ndarray, "s d"]:
-    """Return columns with one row per residual, s = 6n."""
+    """Return the columns (n,6,d) as a matrix with s = 6n rows."""
     return columns.reshape(-1, columns.shape[2])
 
 
 def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffsets:
-    """Return the offset of each joint (rad), true angle less reported one, and its standard deviation.
+    """Return each joint's offset (rad), true minus reported angle, with its standard deviation.
 
-    Best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the most likely sizes of the
-    errors of the poses. An offset that no pose shows, as of the first joint, keeps the standard deviation of any joint.
+    The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the most likely
+    error sizes. Unobservable offsets, as of the first joint, keep their prior standard deviation, the size σ_s.
     """
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
@@ -265,49 +268,50 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
 
 
 OfImage = Literal["focal", "shear", "x", "y"]
-"""Parameter of each image, in the order of the rows of `Problem.directions`."""
+"""Names of the OF_IMAGE parameters of each image, in the order of the rows of `Problem.directions`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
-    """Equations of every column that may be freed, with the adjusted unknowns eliminated.
+    """Normal equations of e camera parameters that may be freed, with all adjusted unknowns eliminated.
 
-    The columns are the parameters of one camera in `units`, then those of its images and the prism.
+    The e parameters are one camera's q intrinsics in `units`, then focal, shear, x and y of each of its m images
+    (problem.OF_IMAGE), then s1 to s4 of the thin prism.
     """
 
     hessian: Float[ndarray, "e e"]
     right: Float[ndarray, " e"]
+    """Negative gradient."""
     total: Float[ndarray, " e"]
-    """Displacement of the columns by what is free beside the prior of the camera."""
+    """Present value of each parameter from `Problem.freed`, 0 if none was freed."""
     place_by_column: Float[ndarray, "6 e"]
-    """Derivative of the camera's pose by each column."""
+    """Derivative of the camera's pose (m, rad; axes of its parent) by each parameter."""
     images: int
     """Number of images of the camera."""
     freedom: int
-    """Degrees of freedom of the robots' residuals, by which their noise was estimated: far fewer than the images have.
-    """
+    """Degrees of freedom of the reported poses' residuals, used for F tests; images have far more."""
     dispersion: float
-    """Variance of the gradient of a parameter over the variance that the weights state."""
+    """Dispersion: actual variance of a gradient over the variance that the weights imply."""
     names: tuple[str, ...]
     """Names of the camera's parameters."""
     units: Float[ndarray, " q"]
-    """Unit of each parameter: focal lengths relative, the centre in widths."""
+    """Unit of each intrinsic parameter: fx and fy for focal lengths, image width for cx and cy, else 1."""
     distance: Float[ndarray, " m"]
     """Median depth of the points of each image (m)."""
     down_in_camera: Float[ndarray, "m 3"]
-    """Direction against the base's z axis in the camera of each image."""
+    """Base's −z axis in the camera frame of each image."""
 
     @property
     def columns(self) -> int:
-        """Number of columns that may be freed."""
+        """Number e of parameters that may be freed."""
         return len(self.right)
 
     def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
-        """Return the combinations that are these parameters of the camera."""
+        """Return unit vectors (columns) for p of the camera's intrinsics, by their names."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
     def of_images(self, parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Return the combinations that move a parameter of each image by its share."""
+        """Return columns that change one parameter of the m images by `shares`, one column for each of p patterns."""
         out = np.zeros((self.columns, shares.shape[1]))
         first = len(self.names) + get_args(OfImage).index(parameter) * self.images
         out[first : first + self.images] = shares
@@ -316,14 +320,14 @@ class Alternatives:
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """Result of a test of some combinations."""
+    """Result of the test of p linear combinations of camera parameters."""
 
     log_p: float
-    """Logarithm of the probability of this gain or a larger one by chance."""
+    """Log p-value: chance of this gain or a larger one without the effect."""
     covariance: Float[ndarray, "p p"]
-    """Covariance of the combinations."""
+    """Covariance of the p coefficients."""
     shift: Float[ndarray, "6"]
-    """Step of the camera's pose that comes with it, axes of its parent."""
+    """Change of the camera's pose when the combinations are free (m, rad; axes of its parent)."""
 
 
 def first_x(state: State) -> Transform:
@@ -337,17 +341,17 @@ def alternatives(
     place: Callable[[State], Transform] = first_x,
     model_error_std: float | None = None,
 ) -> Alternatives:
-    """Return the columns and equations of one camera about a solution; what was freed of it is among the columns.
+    """Return the normal equations of all parameters of one camera that may be freed, or were freed, about a solution.
 
     `place` returns the pose of the camera on its parent. `model_error_std` is the size of the remaining distortion of
-    the cameras' models, in widths of the image; None: as estimated.
+    all cameras, in image widths; None: as estimated.
     """
     problem, images = solution.problem, solution.images
     state, observations = images.state, problem.observations
     assert observations is not None
     mine = np.flatnonzero(observations.camera == camera)
     rows, units, weak = rows_of(problem, camera, mine, problem.n_images)
-    # The columns take the place of what was freed of this camera.
+    # The new columns replace those that were freed for this camera.
     own = len(problem.directions.T) - len(problem.freed_std)
     before, steps = problem.directions[:, own:], state.camera_steps[own : problem.columns.cameras.stop]
     others, each = ~before[rows].any(0), np.zeros((len(before), len(rows)))
@@ -369,7 +373,7 @@ def alternatives(
             model_error_std=sizes if model_error_std is None else np.full_like(sizes, model_error_std),
         ),
     )
-    # The arms are at the most likely state, the images where the evidence is.
+    # The arms are at the most likely state, the images at the state of the evidence.
     at, likely, begin = wider.state, solution.most_likely, problem.arm_unknowns
     at = replace(at, x=likely.x, scale=likely.scale, z=likely.z)
     equations = pose_equations(wider.problem, at, wider).equations
@@ -380,14 +384,14 @@ def alternatives(
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
-    # The camera's pose does not depend on parameters of cameras.
+    # The camera's pose does not depend on intrinsics or parameters of images.
     derivative = solution.derivative(place)
     after = derivative.shape[1] - begin - problem.columns.boards.start
     by_kept = np.zeros((6, len(hessian)))
     by_kept[:, :begin] = derivative[:, :begin]
     by_kept[:, len(hessian) - after :] = derivative[:, derivative.shape[1] - after :]
     now, rig, image = solution.state, observations.rig[mine], observations.image
-    # An image without points is as far away as the others.
+    # An image without points gets the median distance.
     depth = wider.view.depth
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
     return Alternatives(
@@ -406,9 +410,9 @@ def alternatives(
 
 
 def _dispersion(images: ImageEvidence) -> float:
-    """Return the dispersion of the weighted residuals, at least that of their sums over cells of the images.
+    """Return the larger dispersion of weighted residuals: of single ones, or of their sums over image cells.
 
-    Cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
+    Image cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
     """
     problem, weight = images.problem, images.weight
     pull = weight[:, None] * images.view.residual_px
@@ -418,7 +422,7 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return the combinations of columns of `Alternatives` that give every image a focal length of its own."""
+    """Return the columns (e,p) over the parameters of `Alternatives` that free a focal length for each of p images."""
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0
@@ -434,7 +438,7 @@ def differences(count: int) -> Float[ndarray, "n d"]:
 def test_combinations(
     equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]
 ) -> ScoreTest:
-    """Return the test of the combinations `free`, with those of `beside` free under both hypotheses."""
+    """Return the test that frees the combinations `free`; those of `beside` are free under both hypotheses."""
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     (without, gain_without, _), (step, gain, covariance) = (_step(equations, one) for one in (fewer, more))
@@ -450,7 +454,7 @@ def test_combinations(
 def _step(
     equations: Alternatives, free: Float[ndarray, "e r"]
 ) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
-    """Return the step of these combinations where they are free, its gain, and their covariance."""
+    """Return the estimate of r free combinations, the gain (decrease of twice the cost), and the covariance."""
     covariance = np.linalg.inv(free.T @ equations.hessian @ free)
     right = free.T @ equations.right
     step = covariance @ right
@@ -458,11 +462,11 @@ def _step(
 
 
 FEWEST, MOST = 8, 50
-"""Poses from which such errors are looked for, and poses that decide: of more, this many evenly along the sequence."""
+"""Smallest number of poses for a test of drift, and largest number used; more are sampled evenly."""
 SUSPICIOUS = 2.0
-"""Standard deviations of the score test of a growth that make the evidence worth computing."""
+"""Score test statistic of a growth, in standard deviations, from which the evidence is computed."""
 CLEAR = 3.0
-"""Gain of the log evidence from which such errors are adopted: odds of 20 to 1."""
+"""Gain of the log evidence from which drift of the camera poses is adopted: odds of 20 to 1."""
 
 
 def drift_covariance(
@@ -473,9 +477,10 @@ def drift_covariance(
     error_covariance: Float[ndarray, "s s"],
     noise_floor: tuple[float, float] | None,
 ) -> Float[ndarray, "s s"] | None:
-    """Return the covariance of the steps of camera poses whose errors add up in their order; None where they do not.
+    """Return the covariance (6n,6n) of camera pose errors that accumulate along the sequence; None if they do not.
 
-    `fit` is the solution without such errors; poses that are not `used` take no part in the decision.
+    Errors accumulate as in visual odometry; log evidence decides. `fit` is the estimate of (X, scale, base_from_recon)
+    without them. Only `used` poses decide.
     """
     rows = np.flatnonzero(used)
     if len(rows) < FEWEST:
@@ -512,13 +517,13 @@ def drift_covariance(
 
 
 def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, "s s"]]:
-    """Return covariances of the steps of cameras whose errors grow from one to the next, s = 6n.
+    """Return three covariances (6n,6n) of camera pose errors that accumulate along the sequence as random walks.
 
-    They grow by 1 m of position per image, 1 rad, and 1 of log scale; `scale` is in metres per unit.
+    They grow per image by 1 m of position, by 1 rad, and by 1 of log scale; `scale` is in metres per unit.
     """
     n, position = len(recon_from_camera), recon_from_camera[:, :3, 3]
     moves = np.zeros((n, n - 1, 6, 7))
-    # A camera rotates about itself; the way to it from the one before has a wrong length.
+    # Rotations are about each camera's centre; a scale error changes the translation from the previous camera.
     moves[:, :, :3] = by_similarity(position[:, None] - position[1:])
     moves[:, :, :3, 6] = position[:, None] - position[:-1]
     moves[:, :, 3:, 3:6] = np.eye(3)

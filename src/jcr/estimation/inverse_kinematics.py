@@ -1,8 +1,8 @@
-"""Joint angles from gripper poses by damped least squares, and the base and tool of an arm from both.
+"""Inverse kinematics by damped least squares, and estimation of an arm's base and tool from joint angles and poses.
 
-Limits of what poses can show: an arm with six joints reaches a pose in up to eight ways; the branch with the least
-change from image to image and nearest the arm's rest posture is chosen. Poses of any tool within reach fit an arm with
-six joints or more: a wrong robot is recognised only where its reach or its limits exclude a pose.
+An arm with six joints reaches a pose with up to eight sets of angles; the set with the least change between images and
+the nearest to the rest posture is chosen. Six joints or more reach any pose within reach, so a wrong robot is
+recognised only if its reach or its joint limits exclude a pose.
 """
 
 from dataclasses import dataclass, replace
@@ -36,17 +36,19 @@ from jcr.geometry import (
 from jcr.least_squares import minimise
 
 STARTS = 12
+"""Number of initial joint angles for each pose."""
 STEPS = 30
+"""Largest number of Gauss-Newton steps."""
 MOST = 30
 """Largest number of poses from which an unknown tool is estimated."""
 FITS = (1e-4, 1e-3)
-"""Largest misfit (m, rad) of a pose that the arm reaches."""
+"""Largest misfit (m, rad) of a pose that counts as reached."""
 REFUSED = (0.01, np.radians(1.0))
-"""Misfit, as a share of the reach and in rad, from which poses are not of this arm."""
+"""Misfit of a pose, as a share of the reach and in rad, from which the robot is refused."""
 TO_REST = 3e-4
-"""Weight (m/rad) of the distance from the rest posture: an angle that the pose determines changes by 1e-6 rad."""
+"""Weight (m/rad) of the distance from the rest posture; it changes determined angles by only 1e-6 rad."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
-"""Weights of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
+"""Weights of squared misfit (m²) and squared distance from rest (rad²); squared change between poses has weight 1."""
 TOOL_STD = (0.15, 1.0)
 """Standard deviation (m, rad) of a weak prior on an unknown tool."""
 TOOLS = (0.0, 0.0), (0.1, 0.0), (0.1, -np.pi / 4), (0.2, 0.0), (0.2, -np.pi / 4)
@@ -55,13 +57,14 @@ TOOLS = (0.0, 0.0), (0.1, 0.0), (0.1, -np.pi / 4), (0.2, 0.0), (0.2, -np.pi / 4)
 
 @dataclass(frozen=True)
 class Posture:
-    """Joint angles of gripper poses, and the misfit."""
+    """Result of inverse kinematics for n gripper poses."""
 
     joints: Float[ndarray, "n dof"]
+    """Joint angles (rad)."""
     flange_from_tool: Transform
-    """Identity, or estimated."""
+    """Identity, or the estimated tool."""
     misfit: Float[ndarray, "n 2"]
-    """Distance (m) and angle (rad) from each pose."""
+    """Distance (m) and angle (rad) of the reached pose from each given one."""
 
     @property
     def fits(self) -> bool:
@@ -70,9 +73,9 @@ class Posture:
 
 
 def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
-    """Return joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
+    """Return joint angles (n,dof) within the limits for n poses, with little change between poses, and the misfits.
 
-    Where the poses are out of reach, they are those of a constant tool, which is estimated together with the angles.
+    If the arm does not reach all poses, a constant tool is estimated together with the angles.
     """
     rng = np.random.default_rng(0)
     tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
@@ -87,9 +90,9 @@ def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> 
 
 
 def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints) -> Joints:
-    """Return joint angles (n,dof) within the limits that bring the gripper as near each pose as it gets from `start`.
+    """Return joint angles (n,dof) within the limits that bring the gripper nearest to each pose, from `start`.
 
-    All poses are solved at once. The free motion of a redundant arm goes towards its rest posture.
+    Redundant joints move towards the rest posture.
     """
     low, high = arm.limits.T
 
@@ -98,7 +101,7 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
         residual = np.concatenate([-error, TO_REST * (joints - arm.rest)], axis=1)
         rest = np.broadcast_to(TO_REST * np.eye(arm.dof), (len(joints), arm.dof, arm.dof))
         jacobian = np.concatenate([jacobian, rest], axis=1)
-        # A joint at its limit that would move beyond it takes no part in the step.
+        # A joint at its limit that would move beyond is fixed in this step.
         gradient = (residual[:, None] @ jacobian)[:, 0]
         stuck = ((joints <= low) & (gradient > 0)) | ((joints >= high) & (gradient < 0))
         return residual[..., None], (jacobian * ~stuck[:, None])[:, :, None]
@@ -112,7 +115,7 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Return the difference to the pose in base axes, rotations times geometry.ARM (m), and the gripper's Jacobian."""
+    """Return the step from the reached to the given pose (base axes; m, angles times geometry.ARM), and the Jacobian."""
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM
@@ -125,9 +128,9 @@ def _posture(
     flange_from_tool: Transform,
     rng: np.random.Generator,
 ) -> Posture:
-    """Return the best path through the solutions from many initial estimates, for a known tool."""
+    """Return joint angles for poses of a known tool: the best sequence of solutions from many initial angles."""
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
-    # The rest posture, and random angles within the limits (within the middle rotation of wider ones).
+    # The initial angles are the rest posture and random ones within the limits, at most ±180° about their middle.
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
     starts = arm.limits.mean(1) + half * rng.uniform(-1, 1, (len(base_from_tool), STARTS, arm.dof))
     starts[:, 0] = arm.rest
@@ -141,13 +144,13 @@ def _posture(
 def _misfit(
     arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
-    """Return the distance (m) and the angle (rad) from each pose."""
+    """Return the distance (m) and angle (rad) of the reached tool poses from the given ones."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), rotation_angle(off[:, :3, :3])], 1)
 
 
 def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:
-    """Return one solution for each pose, with the least change between poses (Viterbi), near the rest posture."""
+    """Return for each pose one of s solutions `found`, with the least change between poses (Viterbi algorithm)."""
     own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []
     for k in range(1, len(found)):
@@ -169,14 +172,14 @@ def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n 
 def _change(
     arm: Arm, a: Float[ndarray, "... dof"], b: Float[ndarray, "... dof"]
 ) -> Float[ndarray, "... dof"]:
-    """Return the change from angles a to b, the shorter way where the joint has a full rotation."""
+    """Return the change from angles a to b; the shorter way for joints whose limits span a full rotation."""
     return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, (b - a + np.pi) % (2 * np.pi) - np.pi, b - a)
 
 
 def _with_tool(
     arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
 ) -> Transform:
-    """Return one tool that lets the arm reach all poses, estimated with their joint angles from initial values."""
+    """Return flange_from_tool that lets the arm reach all poses best, estimated together with the joint angles."""
     some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST)).astype(int))
     poses, n, dof = base_from_tool[some], len(some), arm.dof
     weight = 1e-3 / np.repeat(TOOL_STD, 3)
@@ -190,7 +193,7 @@ def _with_tool(
         jacobian = np.zeros((6 * n + 6, n * dof + 6))
         for k in range(n):
             jacobian[6 * k : 6 * k + 6, dof * k : dof * k + dof] = by_joints[k]
-        # A step of the tool, in flange axes, moves the required gripper pose back by this.
+        # Derivative of −error by a step of the tool in flange axes.
         by_tool = np.zeros((n, 6, 6))
         by_tool[:, :3, :3] = rotation
         by_tool[:, :3, 3:] = rotation @ skew(tool[:3, 3])
@@ -210,9 +213,9 @@ def _with_tool(
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """Return the arm with its tool, and its joint angles at the poses, computed where `joints` is None.
+    """Return the arm with base and tool as the poses show, and its joint angles, by inverse kinematics if None.
 
-    Raise InputError where poses, joints and arm do not fit.
+    Raise InputError if poses, joints and arm do not agree.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints
@@ -227,22 +230,22 @@ def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Ar
 
 
 NOISE = (1e-3, 1e-3 / ARM)
-"""Differences (m, rad) of equal weight."""
+"""Errors (m, rad) of equal weight in the fit of base and tool."""
 AGREE = (0.015, np.radians(1.5))
-"""Largest rms difference of agreeing angles and poses, as a share of the reach and in rad (factory calibration)."""
+"""Largest rms difference between forward kinematics and poses, as a share of the reach and in rad."""
 ALIKE, SURE = 0.01, 5.0
-"""Difference of lengths beyond a factory's calibration: relative, and in standard deviations."""
+"""Relative difference of lengths that counts as an error, and the number of standard deviations it must exceed."""
 
 
 class LengthError(InputError):
-    """Error for gripper positions that are longer or shorter than the arm's by one factor, which no image shows."""
+    """Error for gripper positions that differ from the arm's by a common factor, which images cannot show."""
 
 
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """Return the arm with the base and tool whose forward kinematics fits the reported poses best.
 
-    Where the motions do not determine them, they are nearest the arm's own. Raise InputError where angles and poses
-    disagree, and LengthError where they do by a factor of all positions.
+    Directions that the motions do not determine stay as in `arm`. Raise InputError if angles and poses disagree,
+    LengthError if they disagree by a common factor on all positions.
     """
     nominal = forward_kinematics(arm, joints)
     half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
@@ -265,7 +268,7 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
 
 
 def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
-    """Raise LengthError where one factor other than 1 on all positions makes them agree with the nominal arm."""
+    """Raise LengthError if the poses agree with forward kinematics `nominal` up to a common factor on all positions."""
     tool, scale, base = closed_form(base_from_gripper, nominal)
     factor = float(scale)
     if factor <= 0:  # unobservable
@@ -287,5 +290,5 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
 
 
 def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:
-    """Return the rms difference in m and rad."""
+    """Return the rms over n residuals of the distance (m) and of the angle (rad)."""
     return np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))

@@ -1,4 +1,4 @@
-"""Serial arms: forward kinematics, and the errors by which a real arm differs from the one its controller computes.
+"""Serial arms: forward kinematics, Jacobians, and the kinematic errors of a real arm against its nominal model.
 
 A chain is F₁ R(a₁, q₁) F₂ R(a₂, q₂) … R(aₙ, qₙ) F: fixed transforms between joint frames, and a rotation about
 an axis in each. Denavit-Hartenberg tables of both conventions and URDF chains have that form.
@@ -6,14 +6,14 @@ an axis in each. Denavit-Hartenberg tables of both conventions and URDF chains h
 Each joint has errors of two kinds, the main ones of industrial arms:
 
 - the offset of its zero, q + φ (rad);
-- the error of where its axis sits on the link before it, F · exp(ξ): two translations (m) and two rotations (rad),
-  perpendicular to the axis. A rotation about the axis is the joint offset; a translation along the axis moves a later
-  axis or the gripper, and is contained in their errors.
+- the error of its axis on the previous link, F · exp(ξ): two translations (m) and two rotations (rad), perpendicular
+  to the axis. A rotation about the axis is the joint offset; a translation along the axis is contained in the errors
+  of the next axis or of the gripper.
 
-With a constant at the gripper these are complete (Mooring, Roth and Driels, "Fundamentals of Manipulator Calibration",
-1991; parallel axes need the rotations, as in Hayati 1983). Errors that only move the base (the offset of the first
-joint) or the gripper (that of the last joint) are not identifiable: they add to the hand-eye transform or to the base,
-which the estimator leaves free anyway.
+Together with a constant error at the gripper they are complete (Mooring, Roth and Driels, "Fundamentals of Manipulator
+Calibration", 1991; parallel axes need the rotations, as in Hayati 1983). Errors that only move the base (offset of the
+first joint) or the gripper (offset of the last joint) are not identifiable: the hand-eye transform or base_from_recon
+absorbs them.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,18 +31,19 @@ LINK_ERRORS = 4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Arm:
-    """A chain of revolute joints from the base to the gripper (the flange, unless said otherwise)."""
+    """Kinematic model of a serial arm: revolute joints from the base to the gripper frame, usually the flange."""
 
     name: str
     parent_from_joint: Float[ndarray, "dof 4 4"]
-    """Each joint's frame in that of the joint before it (the base), at angle zero."""
+    """Frame of each joint in the frame of the previous joint (of the base for the first), at angle zero."""
     axes: Float[ndarray, "dof 3"]
-    """Unit vectors in the joints' frames."""
+    """Unit vector of each joint's axis, in the joint's frame."""
     last_from_gripper: Transform
+    """Gripper frame in the frame of the last joint."""
     limits: Float[ndarray, "dof 2"]
-    """Lowest and highest angle (rad)."""
+    """Smallest and largest angle of each joint (rad)."""
     rest: Float[ndarray, " dof"]
-    """A usual posture (rad) over a table, gripper down; the initial estimate of inverse kinematics."""
+    """Rest posture: joint angles (rad) of a typical pose over a table with the gripper down."""
     forward: Float[ndarray, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     """Unit vector in the gripper frame along which a tool points."""
 
@@ -53,18 +54,18 @@ class Arm:
 
     @property
     def reach(self) -> float:
-        """Longest way from the second joint's axis to the gripper along the links, in metres."""
+        """Sum of the link lengths from the second joint's axis to the gripper (m)."""
         links = [*self.parent_from_joint[2:, :3, 3], self.last_from_gripper[:3, 3]]
         return float(np.linalg.norm(links, axis=1).sum())
 
 
 def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:
-    """Return the arm with its gripper frame at a tool."""
+    """Return the arm whose gripper frame is the tool, `flange_from_tool` relative to the present gripper frame."""
     return replace(arm, last_from_gripper=arm.last_from_gripper @ flange_from_tool)
 
 
 def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Poses]:
-    """Return base_from_joint of each joint, before its own rotation, and base_from_gripper."""
+    """Return base_from_joint (n,dof,4,4) of each joint before its own rotation, and base_from_gripper (n,4,4)."""
     rotated = transform(rotation_exp(joints[..., None] * arm.axes), np.zeros(3))
     frames = np.empty((*joints.shape, 4, 4))
     at = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
@@ -80,25 +81,25 @@ def forward_kinematics(arm: Arm, joints: Joints) -> Poses:
 
 
 def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, "n 6 dof"]]:
-    """Return base_from_gripper, and its twist (v of the gripper's origin, ω; base axes) per rad of each joint."""
+    """Return base_from_gripper and its Jacobian: velocity (of its origin, then ω; base axes) per rad of each joint."""
     frames, gripper = joint_frames(arm, joints)
     return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
 
 
 def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"]:
-    """Return one standard deviation of each column of `error_jacobian`, for a joint's offset (rad) and a link (m).
+    """Return the standard deviation of each of the p = 5 dof errors of `error_jacobian`.
 
-    A link's rotations have that of its translations divided by geometry.ARM (0.3 m), a typical length of a link: 0.3
-    mm goes with 0.06°.
+    `joint_offset` (rad) and `link` (m) are those of joint offsets and link translations. Link rotations have
+    `link` / geometry.ARM, the typical length of a link: 0.3 mm goes with 0.06°.
     """
     return np.r_[np.full(arm.dof, joint_offset), np.tile([link, link, link / ARM, link / ARM], arm.dof)]
 
 
 def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
-    """Return the derivative of the gripper's true pose by the arm's errors, at errors zero; p = 5 dof.
+    """Return the derivative of the gripper's true pose by the p = 5 dof kinematic errors, at errors zero.
 
-    Rows are those of `residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
-    which errors φ add `error_jacobian · φ`. Columns are the offsets of all joints, then the errors of each link.
+    Rows are the step from the nominal to the true pose (m, rad; base axes). Columns are the offsets of all joints
+    (rad), then for each joint two translations (m) and two rotations (rad) of its axis.
     """
     frames, gripper = joint_frames(arm, joints)
     sideways = frames[..., :3, :3] @ perpendicular(arm.axes)
@@ -111,19 +112,20 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
 
 
 def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
-    """Return the gripper's twist (v of its origin, ω; base axes) per rad of each joint, from `joint_frames`."""
+    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint, from `joint_frames`."""
     return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
 
 
 def _twist(
     frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axis_in_base: Float[ndarray, "n dof 3"]
 ) -> Float[ndarray, "n dof 6"]:
+    """Return the gripper's velocity (of its origin, then ω) per rad of rotation about axes through the joint origins."""
     lever = gripper[:, None, :3, 3] - frames[..., :3, 3]
     return np.concatenate([np.cross(axis_in_base, lever), axis_in_base], axis=-1)
 
 
 def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
-    """Return two unit vectors perpendicular to each axis: the frame's x and y where the axis is its z."""
+    """Return two unit vectors (columns) perpendicular to each axis; x and y of the frame for an axis along z."""
     order = np.argsort(np.abs(axes), axis=1, kind="stable")
     first = np.eye(3)[order[:, 0]]
     first = first - (first * axes).sum(1, keepdims=True) * axes

@@ -1,9 +1,10 @@
 """Errors of gripper poses: their covariance, the mixed linear model, and the estimates of their sizes.
 
-The residuals of n poses are r = −J θ + e + ε. The random part ε has σ_t² per axis of position and σ_r² per axis of
-rotation, the systematic part e has covariance σ_s² G. Restricted maximum likelihood estimates the three sizes (Searle,
-Casella and McCulloch, "Variance components", 1992, section 6.6). Few images determine these badly: a result is averaged
-over them on a grid about the mode (Rue, Martino and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
+The residuals of n poses are r = −J θ + e + ε. The random part ε has the variance σ_t² per axis of position and σ_r² per
+axis of rotation; the systematic part e has the covariance σ_s² G. The *sizes* of the errors are σ_t (m), σ_r and σ_s
+(rad), estimated by restricted maximum likelihood (Searle, Casella and McCulloch, "Variance components", 1992, section
+6.6). Few images determine them badly, so results are averaged over a grid of log sizes about their mode (Rue, Martino
+and Chopin, J. R. Statist. Soc. B 71, 2009, section 3).
 """
 
 from collections.abc import Callable
@@ -22,18 +23,18 @@ from jcr.geometry import Poses, rotation_angle
 from jcr.records import RobotNoise
 
 REACH = 0.45
-"""Typical lever (m) between an arm's joint and its gripper, by which an error of rotation shows in the position."""
+"""Typical lever (m) between an arm's joint and its gripper, which turns an angle error into a position error."""
 ALIKE = 1.0
-"""Distance (rad, with REACH for lengths) of gripper poses that share e^(−1/2) of their errors."""
+"""Distance of gripper poses (rad; lengths divided by REACH) whose errors have the correlation e^(−1/2)."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
-"""Error of a link (m) for each rad of a joint offset: 0.1° and 0.3 mm, 0.3° and 1 mm."""
+"""Assumed ratio (m/rad) of link errors to joint offsets: 0.3 mm with 0.1°, 1 mm with 0.3°."""
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of errors that vary smoothly over gripper poses, of 1 rad per axis and REACH m.
+    """Return the covariance (6n,6n) of steps of n poses whose errors vary smoothly from pose to pose.
 
-    They are a Gaussian random field over poses, of steps of geometry.retract: half of an error keeps its direction in
-    the base, half of it rotates with the gripper.
+    Standard deviations are 1 rad and REACH metres per axis. Half of an error is constant in base axes, half in gripper
+    axes.
     """
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
@@ -47,9 +48,9 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
 
 
 def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of the errors of an arm with joint offsets of 1 rad and link errors in proportion.
+    """Return the covariance (6n,6n) of steps of n poses from errors of the arm's joint offsets and links.
 
-    `joints` (n,dof) are its angles in rad.
+    Joint offsets have 1 rad standard deviation, link errors LINK_PER_JOINT metres; `joints` (n,dof) are angles in rad.
     """
     columns = error_jacobian(arm, joints) * error_std(arm, 1.0, LINK_PER_JOINT)
     stacked = columns.reshape(-1, columns.shape[2])
@@ -57,33 +58,33 @@ def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
 
 
 NOISE_FLOOR = (2e-5, np.radians(0.002))
-"""Least noise (m, rad) beside the estimated one, so that a perfect fit does not claim a perfect robot."""
+"""Random errors (m, rad) that are added to the estimated ones, because a perfect fit does not prove a perfect robot."""
 TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
-"""Middle of the weak priors of σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
+"""Middle of the weak priors on σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
 FACTOR_STD = np.log([10.0, 10.0, 3.0])
-"""Logarithms of the factors by which arms differ in these (data sheets: 0.03 to 0.1°, servo arms 1 to 2°)."""
+"""Prior standard deviations of log σ_t, log σ_r, log σ_s (data sheets: 0.03 to 0.1°, servo arms 1 to 2°)."""
 TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
-"""Growth of the errors of camera poses per image (m, rad, relative scale), and the factor by which it varies."""
+"""Weak prior on the growth of camera pose errors per image (m, rad, relative scale): middle, std of the logarithm."""
 GIVEN_SHARE = 0.3
-"""Middle of the prior of a robot's noise beside a given one, as a share of the given one."""
+"""Middle of the prior on random errors in addition to a given noise, as a share of it."""
 SHOWN = 1.1
-"""Factor on a given noise beyond which the noise counts as estimated from the residuals."""
+"""Factor on a given noise above which the noise is reported as estimated from the residuals."""
 LEAST_BESIDE = 0.01
-"""Least errors beside the given noise, as a share of it: the logarithm of no error is not finite."""
+"""Smallest random errors in addition to a given noise, as a share of it; the logarithm of 0 is not finite."""
 RATIO_STD = np.log(4.0)
-"""Standard deviation of log(σ_t / (REACH · σ_r)) over robots; with log 2, three images cover 80 to 90 %."""
+"""Prior standard deviation of log(σ_t / (REACH · σ_r)); with log 2, 95 % regions of three images hold 80 to 90 %."""
 LEVELS = tuple(1.5 * np.arange(-4, 5))
-"""Distances from the mode at which the posterior is evaluated, in standard deviations; an error of 3e-4."""
+"""Grid of log sizes along each axis, in standard deviations from the mode; relative error of an average: 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
-"""Largest squared distance from the mode; with 7, three images covered 81 % instead of 95 %."""
+"""Largest squared distance of the grid from the mode; with 7, 95 % regions of three images hold 81 %."""
 MANY, TOO_MANY = 15, 80
-"""Numbers of poses from which the smaller limit is enough, and from which the mode alone is used, of as many poses."""
+"""Number of poses from which LESS_FAR is used; number above which the mode, from that many poses, replaces the grid."""
 AT_ONCE = 4e6
-"""Largest number of elements of an array of solutions that are computed together."""
+"""Largest number of elements of the arrays that are computed together."""
 SETTLED = 1e-4
-"""Change of log sizes that no longer matters."""
+"""Step of the log sizes that ends the search of their mode."""
 LogSizes = Float[ndarray, "*k c"]
-"""Logarithms of σ_t, σ_r, σ_s, and of the growths of the errors of camera poses."""
+"""c logarithms: of σ_t, σ_r, σ_s, and of the growths of camera pose errors that add up along the sequence."""
 Each = Float[ndarray, "*k"] | np.floating
 Covariance = Float[ndarray, "s s"]
 Information = Float[ndarray, "c c"]
@@ -92,34 +93,36 @@ Information = Float[ndarray, "c c"]
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Linearised equations of the used poses; s = 6 times their number, p unknowns."""
+    """Linearised equations r + J θ of n gripper poses: s = 6n residuals, p unknowns θ with a normal prior."""
 
     residual: Float[ndarray, " s"]
-    """Steps (geometry.retract) from the reported to the predicted poses in turn: m, then rad; both in base axes."""
+    """r: step from the reported to the predicted pose, pose by pose: m, then rad; both in base axes."""
     jacobian: Float[ndarray, "s p"]
+    """J: derivative of r by the unknowns."""
     prior_information: Float[ndarray, "p p"]
     prior_gradient: Float[ndarray, " p"]
+    """Gradient of the prior's half squared distance at θ = 0."""
     systematic: Covariance
-    """Covariance of the systematic part where σ_s is 1 rad."""
+    """G: covariance of the systematic part e for σ_s = 1 rad."""
     known: Covariance | None = None
-    """Covariance of the residuals by errors of the cameras."""
+    """Covariance of the residuals from errors of the camera poses; None: exact camera poses."""
     given: tuple[float, float] | None = None
-    """Lower bounds of σ_t and σ_r that the user gave (m, rad)."""
+    """Random errors (m, rad) that the user gave: lower bounds of σ_t and σ_r."""
     walks: tuple[Covariance, ...] = ()
-    """Covariances of errors of the camera poses that add up along the sequence, where their sizes are 1."""
+    """Covariances of camera pose errors that add up along the sequence, each for a growth of 1 per image."""
     confirmed: Covariance | None = None
-    """Covariance of errors that were confirmed, whatever the sizes of the others are."""
+    """Covariance of errors by confirmed effects (a strain of the arm, ...); it does not depend on the sizes."""
 
     @property
     def least(self) -> Float[ndarray, "2"]:
-        """Noise σ_t and σ_r that counts beside the estimated one."""
+        """Given σ_t and σ_r (m, rad), or NOISE_FLOOR; the estimated variances are added to their squares."""
         return np.array(self.given or NOISE_FLOOR)
 
     @cached_property
     def prior(self) -> tuple[Float[ndarray, "r c"], Float[ndarray, " r"], Float[ndarray, " c"]]:
-        """Weak prior of the log sizes x: A and b of its residuals A x − b, and the standard deviations of x.
+        """Weak prior on the log sizes x: A and b of its whitened residuals A x − b, and the standard deviations of x.
 
-        The last residual is that of the ratio of the random errors.
+        The last residual is that of log(σ_t / (REACH · σ_r)).
         """
         typical, count = np.r_[TYPICAL, TYPICAL_WALKS], 3 + len(self.walks)
         if self.given is not None:
@@ -131,11 +134,11 @@ class Equations:
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
-        """1 for residuals of position, 0 for those of rotation."""
+        """Mask of the residuals: 1 for position, 0 for rotation."""
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
-        """Return the equations of some of the poses."""
+        """Return the equations of k of the poses, by their rows."""
         rows = (6 * poses[:, None] + np.arange(6)).ravel()
 
         def part(of: Covariance | None) -> Any:
@@ -152,24 +155,24 @@ class Equations:
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """Return σ_t², σ_r², σ_s² and the squared growth of the camera errors."""
+        """Return σ_t² and σ_r² plus the squares of `least`, σ_s², and the squared growths of camera pose errors."""
         variances = np.exp(2 * log_sizes)
         variances[..., :2] += self.least**2
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
-        """Return the log sizes of a noise, at least LEAST_BESIDE of the noise that counts in any case."""
+        """Return log σ_t, σ_r and σ_s of a noise record: the inverse of `noise`, at least LEAST_BESIDE of `least`."""
         squared = np.square([noise.translation, noise.rotation]) - self.least**2
         beside = np.sqrt(np.maximum(squared, (LEAST_BESIDE * self.least) ** 2))
         return np.log(np.r_[beside, max(noise.systematic, LEAST_BESIDE * float(self.least[1]))])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
-        """Return the variance of each residual's random part."""
+        """Return the variance of the random part of each residual: σ_t² or σ_r²."""
         variances = self.variances(log_sizes)
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
     def noise(self, log_sizes: LogSizes) -> RobotNoise:
-        """Return the errors of the poses at these sizes."""
+        """Return the noise record for these log sizes (robot random and systematic errors)."""
         metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
         left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
@@ -183,7 +186,7 @@ class Equations:
         )
 
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
-        """Return the covariance V of the residuals."""
+        """Return the covariance V (s,s) of the residuals for these log sizes."""
         covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
         variances = self.variances(log_sizes)[..., 2:]
         for k, part in enumerate((self.systematic, *self.walks)):
@@ -196,48 +199,48 @@ class Equations:
 
 @dataclass(frozen=True, kw_only=True)
 class LinearSolution:
-    """Unknowns at one value of the sizes, or at k values."""
+    """Generalised least-squares solution of `Equations` for given error sizes, or for each of k values of them."""
 
     log_posterior: Each
-    """Restricted log likelihood of the sizes with their prior; up to a constant that all sizes and all models of the
-    same residuals share."""
+    """Restricted log likelihood of the sizes plus their log prior, up to a constant that the residuals' number sets."""
     step: Float[ndarray, "*k p"]
+    """Estimate of the unknowns θ."""
     root: Float[ndarray, "*k s s"]
     """Lower Cholesky factor of V."""
     information_root: Float[ndarray, "*k p p"]
     """Lower Cholesky factor of JᵀV⁻¹J + prior."""
     weighed: Float[ndarray, "*k s p"]
-    """V⁻¹J."""
+    """V⁻¹J, V being the covariance of the residuals."""
     weighed_left: Float[ndarray, "*k s"]
-    """Weighed remaining residuals V⁻¹(r + Jθ)."""
+    """V⁻¹(r + Jθ): weighted residuals after the fit."""
 
     @property
     def gain(self) -> Float[ndarray, "*k p s"]:
-        """Gain with which errors of the residuals pass into the unknowns, with the sign reversed: C JᵀV⁻¹."""
+        """C JᵀV⁻¹, C the covariance of the unknowns: minus the derivative of the unknowns by the residuals."""
         return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
 
     @property
     def covariance(self) -> Float[ndarray, "*k p p"]:
-        """C of the unknowns."""
+        """Covariance C of the unknowns."""
         return over(self.information_root, np.eye(self.step.shape[-1]))
 
     @cached_property
     def weight(self) -> Covariance:
-        """V⁻¹, at one value of the sizes."""
+        """Inverse V⁻¹ of the covariance of the residuals; for one value of the sizes only."""
         return inverse_of(self.root)
 
     @property
     def projection(self) -> Covariance:
-        """P = V⁻¹ − V⁻¹J C JᵀV⁻¹, at one value of the sizes."""
+        """Matrix P = V⁻¹ − V⁻¹J C JᵀV⁻¹ of the residuals; for one value of the sizes only."""
         return self.weight - self.weighed @ self.gain
 
 
 Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]
-"""Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
+"""Groups of grid points of the log sizes: posterior weights (sum over all groups: 1), log sizes, solutions."""
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
-    """Return the generalised least-squares solution at given sizes."""
+    """Return the generalised least-squares solution for given log sizes of the errors."""
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
     jacobian, residual = whitened[..., :-1], whitened[..., -1:]
@@ -262,9 +265,9 @@ def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution
 def left_out(
     solution: LinearSolution, noise: tuple[float, float]
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
-    """Return each pose's residual from a fit without it, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
+    """Return the residual of each of m poses from a fit without that pose, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
 
-    `noise` (m, rad) sets the units in which the matrices are inverted.
+    `noise` (m, rad) scales the matrices before they are inverted.
     """
     sigma, m = np.repeat(noise, 3), len(solution.root) // 6
     own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
@@ -278,11 +281,11 @@ def most_likely(
     start: LogSizes | None = None,
     settled: float = SETTLED,
 ) -> tuple[LogSizes, Information]:
-    """Return the log sizes at the mode of their posterior, to a last step `settled`, and their expected information.
+    """Return the log sizes at the mode of their posterior, and their expected information (c,c) there.
 
-    More than TOO_MANY poses are represented by as many, evenly spaced ones: the time is cubic in their number.
-    Fisher scoring uses the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
-    2006, eq. 6.19): where the expected information is half of the curvature, steps swing about the mode.
+    The search ends with a step below `settled`. Of more than TOO_MANY poses, that many are used, evenly spaced. Fisher
+    scoring is corrected by the curvature along the last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006,
+    eq. 6.19), because steps oscillate where the expected information is half of the curvature.
     """
     if (poses := len(equations.residual) // 6) > TOO_MANY:
         some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
@@ -312,10 +315,10 @@ def most_likely(
 
 
 def log_evidence(equations: Equations, at_mode: LinearSolution, information: Information) -> float:
-    """Return the log density of the residuals, averaged over unknowns and sizes, up to a common constant.
+    """Return the log marginal density of the s residuals, times (2π)^(s/2), by Laplace's method.
 
-    Laplace's method is used about the mode of the sizes, where `information` is the expected one. The factor
-    (2π)^(−s/2) of s residuals is left out.
+    Unknowns and sizes are integrated out. `at_mode` is the solution at the mode of the log sizes, `information` their
+    expected information there.
     """
     gradient = equations.prior_gradient
     against_prior = gradient @ np.linalg.lstsq(equations.prior_information, gradient, rcond=None)[0]
@@ -331,9 +334,8 @@ def over_sizes(
 ) -> Weighed:
     """Return a grid of log sizes about their mode with posterior weights and solutions.
 
-    `density` is the logarithm of the sizes' posterior, up to a constant. The steps along both directions of each axis of
-    the information are the standard deviation of the posterior there, which is skew: few images bound the sizes from
-    above rather than from below.
+    `density` is the log posterior of the sizes, up to a constant. Grid axes are eigenvectors of the information, with
+    one step length for each direction, because the posterior is skewed: sizes have longer tails on one side.
     """
     poses = len(equations.residual) // 6
     sizes, log_volumes = mode[None], np.zeros(1)
@@ -358,7 +360,7 @@ def over_sizes(
 
 
 def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
-    """Return the log posterior of the sizes, its gradient, and the expected information."""
+    """Return the log posterior of the log sizes, its gradient (c,), and the expected information (c,c)."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])

@@ -1,11 +1,10 @@
-"""Selection of the images whose gripper poses agree with the others (stale or shuffled poses do not).
+"""Rejection of images whose gripper pose contradicts the others (stale or shuffled poses), by Bayesian evidence.
 
-Candidates come from triples of images whose motions are congruent (a rotation and its conjugate rotate by the same
-angle, whatever X is: the screw congruence of Chen 1991). The candidate with the least trimmed squares over images
-(Rousseeuw 1984) starts a maximum-likelihood fit, which images join as long as the evidence grows: the density of all
-residuals, averaged over what is unknown, where those of wrong poses may be of any size (Box and Tiao, Biometrika 55,
-1968). A bent arm's errors are larger than those of the few images that it bends least, and yet none is wrong: it costs
-less to take the arm for a worse one than many poses for wrong.
+Candidates come from triples of images with congruent motions: gripper and camera rotate by the same angle for every X
+(screw congruence, Chen 1991). The candidate with the least trimmed squares over images (Rousseeuw 1984) starts a
+maximum-likelihood fit, which images join while the evidence grows. The evidence is the marginal density of all
+residuals; those of wrong poses may have any size (Box and Tiao, Biometrika 55, 1968). Large systematic errors of an arm
+therefore give a larger estimated noise rather than many rejected poses.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,18 +21,19 @@ from jcr.estimation.solve import Solution, solve
 from jcr.geometry import ARM, Poses, rotation_angle, transform
 
 Images = Bool[ndarray, " n"]
+"""Mask of the used images."""
 
 SHARE_RIGHT = 0.65
-"""Share of images that the trimmed fit relies on; up to the rest may be wrong."""
+"""Share of the images that the trimmed fit uses; the others may be wrong."""
 MAX_TRIPLES, MOST_TRIPLES = 1500, 30_000
-"""Triples that a closed form is tried for, and triples that these are chosen from (all of 57 images)."""
+"""Largest number of triples that are solved in closed form, and of triples to choose from (all, up to 57 images)."""
 CONCENTRATED = 20
-"""Best triples from which the trimmed fit is sought: its cost is then 0.1 % above the least found, with 5 it is 2 %."""
+"""Number of best triples that start a trimmed fit; its cost is 0.1 % above the best known one, with 5 it is 2 %."""
 WRONG = 1e-5
-"""Prior share of wrong gripper poses: of sound ones of low-cost arms 5 % were rejected at 0.02, 2 % at 1e-5; at 1e-7 a
-wrong pose of doosan_bench is kept."""
+"""Prior share of wrong gripper poses. Correct poses of low-cost arms that were rejected: 5 % at 0.02, 2 % at 1e-5; at
+1e-7 a wrong pose of the capture doosan_bench is accepted."""
 LEAST_WRONG, MOST_WRONG = (1e-3, np.radians(0.2)), (1.0, np.pi)
-"""Least and largest errors of wrong poses (m, rad): no image is rejected for less."""
+"""Smallest and largest errors of wrong poses (m, rad); images with smaller errors are not rejected."""
 
 
 def robust_fit(
@@ -44,11 +44,10 @@ def robust_fit(
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
 ) -> Solution:
-    """Solve for the images that agree with each other, which `problem.used` of the solution names.
+    """Solve for the images that agree with each other; the mask `problem.used` of the solution has them.
 
-    With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of pose_problem.
-    Solved in a frame at the middle of the cameras and in their extent as unit, for in a frame far away a rotation about
-    its origin looks like a translation; `state` of the solution is in the frame of the cameras as given.
+    Fewer than five images are all used. Arguments are those of pose_problem. The problem is solved in a frame at the
+    centre of the cameras with their extent as unit, for numerical reasons; the solution is in the given frame.
     """
     n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)
@@ -73,6 +72,7 @@ def robust_fit(
     fits: dict[bytes, Solution] = {}
 
     def fitted(used: Images) -> Solution:
+        """Return the solution with the used images, without averaging over error sizes."""
         if used.tobytes() not in fits:
             x, scale, z = initial_estimate(base_from_gripper[used], recon_from_camera[used])
             start = replace(state, x=x[None], scale=scale, z=z[None])
@@ -96,7 +96,10 @@ def _improved(
     used: Images,
     changes: Callable[[Solution, Images], Iterator[Images]],
 ) -> tuple[Images, float]:
-    """Return the images to use and their log evidence, after `changes` of `used` while the evidence grew."""
+    """Return the mask of images with the largest log evidence, by a greedy search, and that evidence.
+
+    `changes` yields the masks to try next, from a fit and its mask.
+    """
     fit = fitted(used)
     best = _evidence(fit, used)
     while True:
@@ -111,7 +114,7 @@ def _improved(
 
 
 def _more(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield the used images with those that are likelier right than wrong, then with the likeliest one."""
+    """Yield masks with more images: all that are more likely right than wrong, then the most likely one."""
     _, spread = np.linalg.slogdet(fit.leave_one_out[1])
     likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
     if not used.all():
@@ -119,26 +122,27 @@ def _more(fit: Solution, used: Images) -> Iterator[Images]:
 
 
 def _fewer(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield the used images without the farthest one; at least four stay."""
+    """Yield the mask without the used image of the largest leave-one-out error; at least four images stay."""
     if used.sum() > 4:
         yield used & (np.arange(len(used)) != np.where(used, _distance(fit), -np.inf).argmax())
 
 
 def _evidence(fit: Solution, used: Images) -> float:
+    """Return the log evidence of a fit: log density of the used poses' residuals and of the unused poses' errors."""
     return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
 
 
 def _distance(fit: Solution) -> Float[ndarray, " n"]:
-    """Return the squared distance of each pose from a fit without it, in the expected covariance."""
+    """Return the squared Mahalanobis length of each pose's leave-one-out error."""
     left_out, covariance = fit.leave_one_out
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
 
 
 def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
-    """Return the log density of the error of each pose if it is wrong, times (2π)^3, and the odds that it is wrong.
+    """Return for each pose the log of: density of its leave-one-out error if wrong, times (2π)^3, times prior odds.
 
-    Wrong poses have errors of any size and direction alike.
+    The errors of wrong poses have a uniform direction and a log-uniform size.
     """
     off = np.linalg.norm(fit.leave_one_out[0].reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
@@ -148,7 +152,7 @@ def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
 
 
 def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
-    """Return the subset of images with the least trimmed squared error over candidate triples, and its root mean (m)."""
+    """Return the mask of images with the least trimmed squared error over candidate triples, and the rms error (m)."""
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
     triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
@@ -181,13 +185,16 @@ def _squared_error(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n"]:
-    """Return the squared distance (m²) of each reported gripper pose from its prediction, rotation counted by ARM."""
+    """Return the squared error (m²) of each reported gripper pose from its prediction; angles count times ARM."""
     gap = predicted_gripper_poses(x, scale, z, recon_from_camera) - base_from_gripper
     return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
 
 
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
-    """Return triples of images whose three motions rotate by the same angle in gripper and camera, best first."""
+    """Return h triples of images whose motions `a` (gripper) and `b` (camera) have the most similar angles, best first.
+
+    `a` and `b` hold the relative motion of every pair of images.
+    """
     n = len(a)
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
     if n * (n - 1) * (n - 2) > 6 * MOST_TRIPLES:
@@ -197,10 +204,10 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
         row = np.arange(n)
         i, j, k = np.nonzero((row[:, None, None] < row[:, None]) & (row[:, None] < row))
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
-    # Two motions about one axis determine no X: triples that rotate about two axes are preferred.
+    # Motions about one axis do not determine X, so triples with two different axes are preferred.
     axes = sine_axis(a[..., :3, :3])
     spread = np.linalg.norm(np.cross(axes[i, j], axes[i, k]), axis=1)
-    # The 0.3 quantile of all gaps comes from pairs of sound images even when 30 % of the images are wrong.
+    # The 0.3 quantile comes from pairs of correct images even if 30 % of the images are wrong.
     typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
     order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]
     return np.stack([i[order], j[order], k[order]], axis=1)

@@ -1,10 +1,9 @@
-"""Solution of an estimation problem: the sizes of all errors and a Gauss-Newton step of all unknowns, in turn.
+"""Solution of an estimation problem by rounds: estimate the error sizes, then take a Gauss-Newton step of all unknowns.
 
-Without observations the unknowns are those of the arms. With observations, arms, cameras, rigs and points step
-together. Weights of observations and sizes of errors are estimated from a state, and the state follows from them: each
-round leaves up to 0.8 of the distance of the last one. The next round therefore begins at the combination of the last
-rounds whose step would be smallest (Anderson, J. ACM 12, 1965; Walker and Ni, SIAM J. Numer. Anal. 49, 2011). The
-result is averaged over the sizes of the robot's errors (covariance.py).
+Without observations only the arms' unknowns are estimated; else arms, cameras, rigs and points together. Such rounds
+converge slowly (each leaves up to 0.8 of the distance), so the next round starts from a linear combination of the
+last rounds (Anderson acceleration, J. ACM 12, 1965; Walker and Ni, SIAM J. Numer. Anal. 49, 2011). The result is
+averaged over the sizes of the robot's errors (covariance.py).
 """
 
 from collections.abc import Callable, Sequence
@@ -71,86 +70,89 @@ from jcr.least_squares import one_blas_thread
 from jcr.records import Budget, Intrinsics, ModelError, RobotNoise, Tracks, Uncertainty
 
 START_NOISE = (1e-3, float(np.radians(0.2)))
-"""Random errors of gripper poses before the first estimate (m, rad)."""
+"""Assumed random errors of gripper poses before their first estimate (m, rad)."""
 ROUNDS, STEPS = 25, 50
 """Largest number of rounds with observations, and of steps of the arms alone."""
 STEP_SETTLED = 0.01
-"""Step of an arm's unknown, in standard deviations, that ends the rounds."""
+"""Largest step of an arm's unknown, in standard deviations, at which the rounds end."""
 ROUNDING = 1e-9
-"""Relative increase of a cost that is rounding."""
+"""Relative increase of a cost that is accepted as rounding."""
 ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
-"""Steps of the arms alone, in squared standard deviations, that end them: of a result, and of one to compare."""
+"""Step of the arms' unknowns, in squared standard deviations, that ends their iteration: final, intermediate fits."""
 ROUNDS_BEFORE = 3
-"""Number of earlier rounds that the next one uses."""
+"""Number of earlier rounds that the acceleration uses."""
 PARALLEL = 1e-2
-"""Rounds whose steps differ by less than this share of what others differ by add nothing."""
+"""Relative cutoff of singular values in the acceleration, against rounds with nearly equal steps."""
 FARTHEST = 5.0
-"""Largest distance of the combination from the end of a round, in lengths of the round's own step."""
+"""Largest extrapolation beyond the end of a round, in lengths of the round's step."""
 TINY_STEP = 1e-6
-"""Step for derivatives by differences (m, rad, or standard deviations)."""
+"""Step of numerical derivatives by the arms' unknowns (m, rad, log scale)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """Estimates of a problem, averaged over the sizes of the robot's errors, and their covariance."""
+    """Solution of a problem: state averaged over the sizes of the robot's errors, covariance, and equations."""
 
     problem: Problem
     state: State
     covariance: Float[ndarray, "p p"]
-    """Covariance of steps as `full_step` takes them."""
+    """Covariance of the p unknowns: steps of the arms, then of the columns `Problem.free`."""
     budget: Budget | None
-    """Covariance of the first arm's X and scale by its causes; None where it was not averaged."""
+    """Covariance of the first arm's X and scale divided by cause; None if the sizes were not averaged."""
     most_likely: State
-    """State before the averaging, about which the equations are linear."""
+    """State at the most likely error sizes, before the averaging; the equations are linearised there."""
     poses: PoseEquations
+    """Equations of the reported poses."""
     at_mode: LinearSolution
-    """Solution of the mixed model at the most likely sizes of the robot's errors."""
+    """Solution of the linearised equations at the most likely sizes of the robot's errors."""
     size_information: Information
     """Expected information of the log sizes of the robot's errors."""
     evidence: ImageEvidence | None = None
+    """Evidence of the images; None without observations."""
     settled: bool = True
-    """Whether sizes and steps settled before the largest number of rounds."""
+    """Whether the rounds converged before their largest number."""
     iterations: int = 0
+    """Number of rounds; 0 without observations."""
     last_step: float = 0.0
     """Largest step of an arm's unknown in the last round, in standard deviations; 0 without observations."""
 
     @property
     def equations(self) -> Equations:
-        """Mixed model of the reported poses, in the order of the covariance."""
+        """Linearised equations of the used reported poses; unknowns in the order of the covariance."""
         return self.poses.equations
 
     @property
     def log_sizes(self) -> LogSizes:
-        """Most likely log sizes of the robot's errors."""
+        """Most likely logarithms of the robot's error sizes σ_t (m), σ_r, σ_s (rad)."""
         assert self.most_likely.robot_log_sizes is not None
         return self.most_likely.robot_log_sizes
 
     @property
     def noise(self) -> RobotNoise:
-        """Errors of the reported poses, the same for all arms."""
+        """Estimated sizes of the errors of the reported poses, common to all arms."""
         return self.equations.noise(self.log_sizes)
 
     @property
     def images(self) -> ImageEvidence:
-        """Evidence of the images of a problem with observations."""
+        """Evidence of the images; only for a problem with observations."""
         assert self.evidence is not None
         return self.evidence
 
     @cached_property
     def log_evidence(self) -> float:
-        """Log density of the used residuals, averaged over unknowns and sizes, times (2π)^(3m)."""
+        """Log of (2π)^(3m) times the density of the m used poses' residuals, unknowns and sizes integrated out."""
         return log_evidence(self.equations, self.at_mode, self.size_information)
 
     @cached_property
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-        """Each pose's residual from a solution without it (m, rad; base axes), and its whole covariance."""
+        """Leave-one-out residual of each of n poses (m, rad; base axes), and its covariance."""
         used, every, noise, solution = self.poses.used, self.poses.every, self.noise, self.at_mode
         random, n = (noise.translation, noise.rotation), len(used)
         found, covariance = every.residual.reshape(n, 6).copy(), np.empty((n, 6, 6))
         found[used], covariance[used] = left_out(solution, random)
         if used.all():
             return found, covariance
-        # Errors of an unused pose as the errors of the others show them (best linear unbiased prediction).
+        # The used poses predict the systematic error of an unused one (best linear unbiased prediction).
         alike = noise.systematic**2 * every.systematic + (0.0 if every.known is None else every.known)
         rows = np.repeat(used, 6)
         for i in np.flatnonzero(~used):
@@ -163,23 +165,23 @@ class Solution:
         return found, covariance
 
     def camera_unknowns(self, columns: slice) -> slice:
-        """Return the unknowns of the mixed model that are these columns of the cameras."""
+        """Return the slice of the unknowns for a slice of the image columns before the mounts."""
         first = self.problem.arm_unknowns
         return slice(first + columns.start, first + columns.stop)
 
     def intrinsics_covariance(self, camera: int) -> Float[ndarray, "q q"]:
-        """Return the covariance of the parameters of a camera, in the order of camera.parameters."""
+        """Return the covariance of a camera's q intrinsics, in the order of camera.parameters."""
         own = self.camera_unknowns(self.problem.columns.cameras)
         directions = self.problem.directions[self.problem.parameters_of[camera]]
         return directions @ self.covariance[own, own] @ directions.T
 
     def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
-        """Return a transform that is a function of the state, and the covariance of its step."""
+        """Return `of(state)`, a transform that depends on the state, and the covariance of its step."""
         j = self.derivative(of)
         return of(self.state), j @ self.covariance @ j.T
 
     def derivative(self, of: Callable[[State], Transform]) -> Float[ndarray, "6 p"]:
-        """Return the derivative of the step of a transform that is a function of the state."""
+        """Return the derivative of the step of the transform `of(state)` by the p unknowns, by differences."""
         found, cameras = of(self.state), self.problem.arm_unknowns
         size = TINY_STEP * np.ones(len(self.covariance))
         std = np.sqrt(np.diag(self.covariance))
@@ -199,11 +201,10 @@ def solve(
     averaged: bool = True,
     start_noise: tuple[float, float] = START_NOISE,
 ) -> Solution:
-    """Solve a problem from an initial state.
+    """Solve a problem from an initial state; a state with pixel noise is assumed to be near the solution.
 
-    A state that contains sizes of errors is taken for one near the solution. `averaged`: the result is averaged over the
-    sizes of the robot's errors; else these are taken at their most likely values, which is faster and understates the
-    uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
+    `averaged`: average over the sizes of the robot's errors, else use their most likely values, which is faster and
+    understates the uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)
@@ -229,11 +230,11 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     near: Solution | None = None,
     start_noise: tuple[float, float] = START_NOISE,
 ) -> Solution:
-    """Adjust images and reported poses together, from a result of a fit to poses.
+    """Solve for images and reported poses of a wrist camera together, from the initial estimate of a fit to poses.
 
-    The arguments are those of `wrist_problem`; the systematic errors of poses without an arm are smooth over the poses,
-    and intrinsics without a prior are exact. `start_noise` is the initial size of the random errors of the poses
-    (m, rad). `near` is a solution of the same poses and of the same points or more, from which the adjustment starts.
+    Arguments are those of `wrist_problem` and `solve`. `arm` may be poses, with the systematic errors `smooth_errors`;
+    `camera` may be intrinsics, which are then exact. The adjustment starts from the solution `near`, of the same poses
+    and of these or more points, if it is given.
     """
     arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
     if isinstance(camera, Intrinsics):
@@ -247,7 +248,7 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
 
 
 def uncertainty_of(found: Solution) -> Uncertainty:
-    """Return the uncertainty of the first arm's transform, of the scale, and of the first camera's intrinsics."""
+    """Return the uncertainty of the first arm's X, of the scale, and of the first camera's intrinsics."""
     problem, observations, model_error = found.problem, found.problem.observations, None
     known, directions = problem.intrinsics(found.state)[0], problem.directions[problem.parameters_of[0]]
     own, cameras = problem.columns.model_error[0], found.camera_unknowns(problem.columns.cameras)
@@ -266,9 +267,9 @@ def uncertainty_of(found: Solution) -> Uncertainty:
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
-    """Return scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
+    """Return scale (metres per unit) and base_from_recon of the reconstruction to which `tracks` belong.
 
-    A similarity is fitted to its points and the adjusted ones, points that disagree having less weight.
+    They are the robust least-squares similarity from the reconstruction's points to the adjusted points.
     """
     state, observations = solution.state, solution.problem.observations
     assert observations is not None and observations.point_rows is not None
@@ -284,13 +285,13 @@ def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
 
 
 def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
-    """Return the solution with other linear priors; the evidence of the images stays as it is."""
+    """Return the solution of the same problem with other linear priors; the images are not adjusted again."""
     problem = with_free(solution.problem, priors=tuple(priors))
     return with_covariance(problem, solution.most_likely, solution.evidence, True)
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
-    """Return the log of the metres, by the scale, of a stated metre of the boards, and its derivative by unknowns."""
+    """Return log(estimated size / stated size) of the boards, and its derivative by the p unknowns."""
     problem, column = solution.problem, solution.problem.columns.boards.start
     assert problem.boards is not None
     by_unknown = np.zeros(problem.unknowns)
@@ -300,10 +301,10 @@ def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
 
 
 def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
-    """Estimate the sizes of errors and step all unknowns, in turn until both settle.
+    """Estimate error sizes and step all unknowns, in rounds until both converge.
 
-    Return also whether they settled, the number of rounds, and the largest last step of an arm's unknown in standard
-    deviations.
+    Return the state, the evidence of the images, whether the rounds converged, their number, and the largest last step
+    of an arm's unknown in standard deviations.
     """
     state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
     ends, steps = list[ndarray](), list[ndarray]()
@@ -327,14 +328,14 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         share = share_within_limits(arms)
         moved = stepped(problem, state, share * arms, share * columns)
         moved = replace(moved, points_in_world=normal.stepped(state.points_in_world, share * columns))
-        # The cost has the weights and sizes of errors at the start of the step.
+        # Both costs use the weights and error sizes at the start of the step.
         root = cholesky(replace(equations, known=None).covariance(log_sizes))
         cost, moved_cost = (
             float((lower(root, reported_poses(problem, one)[0].reshape(-1, 1)) ** 2).sum())
             + cost_of_images(images, one)
             for one in (state, moved)
         )
-        # The combination of rounds assumes whole steps; one that was cut short comes from a poor initial estimate.
+        # The acceleration needs full steps; a shortened step means a poor initial estimate.
         if share == 1 and moved_cost <= cost * (1 + ROUNDING):
             begin, end = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
             ends, steps = [*ends[-ROUNDS_BEFORE:], end], [*steps[-ROUNDS_BEFORE:], end - begin]
@@ -352,11 +353,11 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 def _joint_step(
     images: ImageEvidence, equations: Equations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton step of the arms and of the images' columns, and the std of the unknowns."""
+    """Return the Gauss-Newton steps of the arms' unknowns and of all image columns, and the std of all unknowns."""
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
     step = solution.step
-    # The rigs step to the images' estimate given the cameras, and towards the reported poses by their weight.
+    # Rigs step to the mean of images and reported poses, given the step of the cameras.
     by_rig = reported_poses(problem, images.state)[2]
     pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
     columns = np.zeros(problem.columns.count)
@@ -368,7 +369,11 @@ def _joint_step(
 def _accelerated(
     ends: list[ndarray], steps: list[ndarray], judged: Int[ndarray, " p"], std: Float[ndarray, " p"]
 ) -> Float[ndarray, " n"]:
-    """Return the begin of the next round from the last ones; unknowns that are not `judged` follow the others."""
+    """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
+
+    `ends` and `steps` are coordinates at the end of each round and its step. Coefficients minimise the combined step of
+    the coordinates `judged`, in units of their `std`; the others follow.
+    """
     if len(steps) == 1:
         return ends[-1]
     step = steps[-1][judged] / std
@@ -386,9 +391,9 @@ def with_covariance(
     averaged: bool = True,
     expected: RobotNoise | None = None,
 ) -> Solution:
-    """Return the solution with the evidence of the images, from a state that is near.
+    """Return the solution, with its covariance, from a state near it and the evidence of the images.
 
-    `expected` is the noise of the robot in a problem without residuals, whose solution is predicted.
+    `expected` is the assumed robot noise of a predicted solution, whose residuals are 0.
     """
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
@@ -419,7 +424,10 @@ def with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Step the arms' unknowns and the sizes of errors until a step is below `settled` squared standard deviations."""
+    """Return the state with the likeliest arms' unknowns and error sizes; the images' evidence is constant.
+
+    The iteration ends with a step below `settled` squared standard deviations.
+    """
     arms = problem.arm_unknowns
     for _ in range(STEPS):
         equations = pose_equations(problem, state, images).equations
@@ -433,7 +441,7 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
 
 
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
-    """Return the information of the reported poses about the rigs, X, scale and Z eliminated.
+    """Return the information of the reported poses about the rigs, with X, scale and Z eliminated.
 
     `root` is the lower Cholesky factor of the covariance of the errors of the poses.
     """
@@ -453,13 +461,13 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return a state as steps from the start: arms, columns of the images, points, log sizes of model errors."""
+    """Return the coordinates of a state: steps from `start` of arms, image columns and points; log model-error sizes."""
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 
 
 def _state_at(problem: Problem, start: State, like: State, coordinates: Float[ndarray, " n"]) -> State:
-    """Return the state with these coordinates; the other sizes of errors are those of `like`."""
+    """Return the state with these `_coordinates`; pixel noise and robot error sizes are those of `like`."""
     ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
     arms, columns, points, sizes = np.split(coordinates, ends)
     return replace(
