@@ -1,16 +1,18 @@
-"""Compiled loops of PatchMatch stereo: a plane for every pixel, found by passing good ones on to the neighbours.
+"""Compiled loops of PatchMatch stereo: a plane for every pixel, propagated from neighbouring pixels and varied at random.
 
 Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011, for several views as in Schönberger et al., ECCV 2016. A
-plane p of camera coordinates holds p·x = 1, so that p·ray is the inverse depth of a pixel whose ray has z = 1, and the
-homography to a neighbour is K (R + t pᵀ) K⁻¹. Planes are passed on from row to row, for 16 pixels of a row at once.
+plane is a vector p in the camera frame with p·x = 1 for its points x. So p·ray is the inverse depth of a pixel whose
+ray has z = 1, and the homography to a neighbour is K (R + t pᵀ) K⁻¹. Planes propagate from row to row, for 16 pixels
+of a row at once.
 
-What the loops share: `found` (4,h,w) is each pixel's plane and its score, `asked` (a,h,w) the neighbours that it is
-matched with, both with whole blocks of `window.LANES` columns; `windows` what `window.windows` makes of the image,
-`packed` (n,y,x) what `window.quads` makes of its neighbours, continued by `PAD` pixels, `motions` (n,12) the rows of K R
-and K t to each, and k is fx, fy, cx, cy. For one block: `near` (a,12,lanes) and `starts` (a,lanes) are what
-`window.correlate` takes of the neighbours asked, `each` (a,lanes) the correlations with them, and `tried` (7,lanes) has
-a plane in rows 0 to 2, what `correlate` takes of it in rows 3 to 5, and its score. All are plain arguments: an array
-that is taken out of a tuple is counted by numba, which takes longer than a window.
+Arguments of the loops: `found` (4,h,w) is each pixel's plane and score, and `asked` (a,h,w) the indices of the
+neighbours that it is matched with; both have whole blocks of `window.LANES` columns. `windows` is the result of
+`window.windows` for the image, and `packed` (n,y,x) that of `window.quads` for its neighbours, padded by `PAD` pixels.
+`motions` (n,12) are the rows of K R and K t to each neighbour; k is fx, fy, cx, cy. For one block of pixels, `near`
+(a,12,lanes) and `starts` (a,lanes) describe the neighbours asked, as `window.correlate` reads them, and `each` (a,lanes)
+are the correlations with them. `tried` (7,lanes) holds a plane in rows 0 to 2, input of `correlate` in rows 3 to 5, and
+the score. Arrays are plain arguments, because numba counts references of an array taken out of a tuple, which takes
+longer than a window.
 """
 
 from typing import no_type_check
@@ -29,7 +31,7 @@ UNKNOWN = -2.0
 _PASSED = 3
 """Number of planes that a pixel tries from the row before: that of its own column, and the best one to either side."""
 _BESIDE = 3
-"""Number of columns to either side in which the best plane is looked for."""
+"""Number of columns to either side in which the best plane is searched."""
 
 
 @inlined
@@ -162,9 +164,9 @@ def random_planes(family, span, k, h, w, seed):
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
     """Update the plane of every pixel once by planes of the row before or random changes, wherever these score higher.
 
-    Passes go down for even and up for odd seeds (Bleyer et al. 2011, section 3.2). `search` is (lowest inverse depth,
-    highest one, relative change to try, number of tries, whether the planes have no score yet). The change of inverse
-    depth and normal halves from try to try.
+    The module's docstring describes the arrays. Passes go down for even and up for odd seeds (Bleyer et al. 2011,
+    section 3.2). `search` is (lowest inverse depth, highest one, relative change to try, number of tries, whether the
+    planes have no score yet). The change of inverse depth and normal halves from try to try.
     """
     state = random_state(seed)
     slots, h, w = asked.shape
@@ -192,7 +194,10 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
 @compiled
 @no_type_check
 def best_neighbours(found, asked, packed, motions, windows, k, count):
-    """Return the `count` neighbours (count,h,w) with which each pixel's plane correlates best, the best first."""
+    """Return the `count` neighbours (count,h,w) with which each pixel's plane correlates best, the best first.
+
+    The arguments are described in the module's docstring.
+    """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
     each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)

@@ -5,6 +5,7 @@ known. No initial estimate is needed: the cameras look at a common place, which 
 gripper frame. Rotations about this direction and tilts of it are tried on images 15 pixels high. The alignment then
 goes from coarse to fine, with a depth for each of a few thousand pixels. In the last stages every camera moves by
 itself, so that disagreement with the robot's motion shows.
+
 Pointmaps are matched near edges; plain surfaces between the edges are filled with planes (jcr/depth/priors.py). The
 page `plain-tables` describes when this back end works, and its errors.
 """

@@ -178,7 +178,8 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
 def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
     """Align all observations except the references: update `warp` (centres, affine parts, bends) and `variance_px`.
 
-    The variance (px²) of an observation that could not be aligned stays infinite.
+    `ends` are the first observations of the tracks and the end of the last track; `reference` is the reference of each
+    track. The variance (px²) of an observation that could not be aligned stays infinite.
     """
     offsets, window = _window(_RADIUS)
     wide, _ = _window(_RADIUS + 1)
@@ -304,7 +305,10 @@ def _template(around, offsets, window, template, pull):
 @compiled
 @no_type_check
 def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
-    """Update `x_px` and `affine` by Gauss-Newton; return the correlation at convergence, -1 without convergence."""
+    """Update `x_px` and `affine` by Gauss-Newton; return the correlation at convergence, -1 without convergence.
+
+    `template` and `pull` come from `_template`: a step is the sum over the patch of (grey − template)·pull.
+    """
     step = np.empty(_FREE)
     for _ in range(_STEPS):
         if not _patch(grey, x_px, affine, bend, offsets, patch):

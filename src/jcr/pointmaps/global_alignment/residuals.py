@@ -1,9 +1,12 @@
 """Residuals of pairwise pointmaps against a reconstruction, their weights, and the depth fitted to each pixel.
 
-Networks predict directions several times better than distances, so that each residual has two parts, across = n − (n·x̂)
-x̂ and along = log|x| − log|q| − log σ_e. Here x is the modelled point relative to the observer and x̂ its direction; q
-is the predicted point, n its direction, and σ_e the pair's scale. The variances are estimated from the residuals: per
-pointmap by their median, per kind of view by the correlation of neighbouring residuals.
+Networks predict directions several times better than distances, so that each residual has two parts,
+
+    across = n − (n·x̂) x̂        along = log|x| − log|q| − log σ_e
+
+Here x is the modelled point relative to the observer and x̂ its direction; q is the predicted point, n its direction,
+and σ_e the pair's scale. The variances are estimated from the residuals: per pointmap by their median, per kind of view
+by the correlation of neighbouring residuals.
 """
 
 from dataclasses import dataclass
