@@ -1,4 +1,4 @@
-"""Compiled loops of PatchMatch stereo: a plane for every pixel, propagated from neighbouring pixels and varied at random.
+"""Compiled loops of PatchMatch stereo: a plane for every pixel, propagated between pixels and varied at random.
 
 Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011, for several views as in Schönberger et al., ECCV 2016. A
 plane is a vector p in the camera frame with p·x = 1 for its points x. So p·ray is the inverse depth of a pixel whose
