@@ -1,4 +1,4 @@
-"""Findings of the checks: the record, the table of kinds, and their sentences."""
+"""Findings of the checks: the record of a finding, the table of its kinds, and the sentences made from both."""
 
 from jcr.findings.finding import *
 from jcr.findings.table import FindingKind as FindingKind

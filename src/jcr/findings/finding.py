@@ -1,4 +1,4 @@
-"""Record of a finding, and the order, verdict and sentences of several."""
+"""Record of a finding; text and remedy of a finding; order and verdict of several findings."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,13 +19,13 @@ Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", 
 images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles; or nothing."""
 Verdict = Literal["accepted", "accepted with warnings", "rejected"]
 NUMBERS = ("joints", "value", "std", "p", "shift", "intrinsics_shift")
-"""Fields of a finding that are its numbers."""
+"""Keyword arguments of Finding.of that set fields of a finding; all others are its details."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Observation that speaks against a calibration, or that is worth stating."""
+    """Result of a check: a fault of a calibration that rejects or warns, or a remark that informs."""
 
     # Files also hold text and remedy, which follow from the fields.
     __pydantic_config__ = {"extra": "ignore"}
@@ -33,35 +33,35 @@ class Finding:
     severity: Severity
     concerns: Concerns = "none"
     images: tuple[str, ...] = ()
-    """Names of the images concerned; empty where it concerns all or none."""
+    """Names of the images with the fault; empty if it concerns all images or none in particular."""
     joints: tuple[int, ...] = ()
-    """Joints concerned, the first is 1."""
+    """Numbers of the joints with the fault; the first joint is 1."""
     value: float | None = None
-    """Size, in the unit of its kind (docs: reference/findings); None where it has no size."""
+    """Size of the fault, in the unit of its kind (docs: reference/findings); None if it has no size."""
     std: float | None = None
-    """One standard deviation of the value."""
+    """One standard deviation of `value`."""
     p: float | None = None
-    """Chance of this or more where there is nothing to find."""
+    """p-value: probability of a test result at least this extreme if there were no fault."""
     shift: tuple[float, ...] | None = None
-    """Change of the calibration if this were allowed for, in COVARIANCE_ORDER; its outer product is part of the
-    covariance. None where it adds nothing."""
+    """Change s of transform and scale if the fault were modelled, in COVARIANCE_ORDER; s·sᵀ is part of the covariance.
+    None: nothing is added to the covariance."""
     intrinsics_shift: tuple[float, ...] | None = None
-    """Change of the intrinsics with it, in the order of camera.parameters. What these compensate of `shift` is no
-    error for a user of both. None where it concerns the transform alone."""
+    """Change of the intrinsics together with `shift`, in the order of camera.parameters; both partly compensate each
+    other in a point's position. None: the intrinsics do not change."""
     details: Mapping[str, float | str] = field(default_factory=dict)
-    """Further numbers (m, rad, px, shares) and names that the sentence needs."""
+    """Other numbers (m, rad, px, fractions) and names that the templates of text and remedy use."""
 
     @classmethod
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Make a finding about these images; `known` are its numbers, and details by their names."""
+        """Make a finding about the named images; `known` sets the fields in NUMBERS and, by name, the details."""
         sizes = {name: known.pop(name) for name in NUMBERS if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Its part of the covariance of the calibration, in COVARIANCE_ORDER."""
+        """Part s·sᵀ of the calibration's covariance due to the shift s, in COVARIANCE_ORDER."""
         shift = np.zeros(7) if self.shift is None else np.array(self.shift)
         return np.outer(shift, shift)
 
@@ -73,11 +73,11 @@ LENGTHS = {
     "depth camera": "the depth camera",
     "network": "the network's metre",
 }
-"""Names of the sources of a scale."""
+"""Printed names of the sources of scale: the robot and the known lengths."""
 
 
 class _Number(float):
-    """Number of a template: {n:~} has two significant digits, {n:!.1f} no sign, and {n:long|short} goes by the sign."""
+    """Number in a template: {n:~} gives two significant digits, {n:!.1f} no sign, {n:a|b} "a" if positive, else "b"."""
 
     def __format__(self, spec: str) -> str:
         if "|" in spec:
@@ -89,7 +89,7 @@ class _Number(float):
 
 
 class _Text(str):
-    """Text of a template: {name:a=words of a|b=words of b}, or {name:words around $}, which are empty without it."""
+    """Text in a template: {name:a=A|b=B} gives "A" for the text "a"; {name:words $} the text in words, if not empty."""
 
     def __format__(self, spec: str) -> str:
         if "=" in spec:
@@ -100,7 +100,7 @@ class _Text(str):
 
 
 class _Images(tuple[str, ...]):
-    """Images of a template: {images} names at most three, {images:is|are} agrees with their number."""
+    """Image names in a template: {images} lists at most three; {images:is|are} is singular or plural by their number."""
 
     def __format__(self, spec: str) -> str:
         if spec:
@@ -109,9 +109,9 @@ class _Images(tuple[str, ...]):
 
 
 class Quantities(dict[str, Any]):
-    """Quantities that templates name: details and numbers of a finding, these also in mm, degrees and percent.
+    """Values for the templates of a finding: its details and numbers, the numbers also in mm, degrees and percent.
 
-    A quantity that a finding lacks is an empty text.
+    A name without a value gives an empty text.
     """
 
     def __missing__(self, name: str) -> _Text:
@@ -119,7 +119,7 @@ class Quantities(dict[str, Any]):
 
     @staticmethod
     def of(finding: Finding) -> "Quantities":
-        """Return the quantities of a finding."""
+        """Return the template values of a finding."""
         named = Quantities(images=_Images(finding.images), concerns=_Text(finding.concerns))
         for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
             if isinstance(one, str):
@@ -156,74 +156,75 @@ def joined(words: Iterable[str]) -> str:
 
 
 def text(finding: Finding) -> str:
-    """Return the message: what is wrong, in one sentence."""
+    """Return the message of a finding: the fault in one sentence."""
     return finding.kind.row.message.format_map(Quantities.of(finding))
 
 
 def remedy(finding: Finding) -> str:
-    """Return the remedy in one sentence; empty where nothing helps or nothing need be done."""
+    """Return the remedy of a finding in one sentence; empty if there is none or none is needed."""
     return finding.kind.row.remedy.format_map(Quantities.of(finding))
 
 
 def unobservable(finding: Finding) -> str:
-    """Return the direction that is unobservable, or nearly so, in words."""
+    """Return the direction that a finding of kind UNOBSERVABLE calls unobservable, or nearly so, in words."""
     return "{nearly:nearly unobservable: |}{direction}".format_map(Quantities.of(finding))
 
 
 def reached_in_words(required: Requirement) -> str:
-    """Return the bound of 95 % of the errors beside the requirement, in words."""
+    """Return a sentence with the reached bound on 95 % of the errors and the required one."""
     short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "informs", "none", **required.details)
     return REACHED.format_map(Quantities.of(short))
 
 
 def sentence(finding: Finding) -> str:
-    """Return message and remedy in one line."""
+    """Return message and remedy of a finding, separated by a semicolon."""
     return "; ".join(filter(None, (text(finding), remedy(finding))))
 
 
 def doubt_of(findings: Iterable[Finding]) -> str | None:
-    """Return the first reason of a rejection, of findings that are strongest first; None where nothing rejects."""
+    """Return message and remedy of the first finding that rejects; None if no finding rejects."""
     return next((sentence(finding) for finding in findings if finding.severity == "rejects"), None)
 
 
 def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
-    """Return a sentence for each finding that rejects or warns."""
+    """Return message and remedy of each finding that rejects or warns."""
     return tuple(sentence(finding) for finding in findings if finding.severity != "informs")
 
 
 def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
-    """Return the failure of every back end as findings."""
+    """Return the findings for the error that every back end failed: its reason, and its further sentences."""
     words = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", **words)
     return (failed, *(Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in error.also))
 
 
 def is_cause(finding: Finding) -> bool:
-    """Test whether a finding explains others."""
+    """Test whether a finding is a cause: other kinds of findings may be its consequences."""
     return bool(finding.kind.row.explains)
 
 
 def is_lasting(finding: Finding) -> bool:
-    """Test whether a finding holds for every reconstruction of the same images: camera, robot, mount, order."""
+    """Test whether a finding is a cause that another reconstruction of the same images cannot remove."""
     return is_cause(finding) and finding.kind.row.group != "reconstruction"
 
 
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Order findings by severity; of one severity those of the images alone, other causes, then consequences."""
+    """Sort findings by severity; within a severity: findings about images, then other causes, then consequences."""
 
     def place(finding: Finding) -> tuple[int, bool, bool]:
+        """Return the sort key of a finding."""
         return RANK[finding.severity], finding.kind.row.group != "images", not is_cause(finding)
 
     return tuple(sorted(findings, key=place))
 
 
 def is_explained(findings: Sequence[Finding]) -> bool:
-    """Test whether a cause rejects a calibration, against which neither more images nor other motions help."""
+    """Test whether the first of sorted findings is a cause that rejects; more images or motions do not help then."""
     return bool(findings) and findings[0].severity == "rejects" and is_cause(findings[0])
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return findings, strongest first, without those that the first one explains: their remedies do not help."""
+    """Return sorted findings without the consequences of the first one, if that one is a cause and rejects."""
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings
@@ -231,7 +232,7 @@ def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict, that of the worst finding."""
+    """Return the verdict on a calibration with these findings, which the most severe one decides."""
     severities = {finding.severity for finding in findings}
     if "rejects" in severities:
         return "rejected"

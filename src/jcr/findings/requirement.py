@@ -9,28 +9,33 @@ Where = Literal["seen", "camera", "scene"]
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """Required and reached accuracy of a calibration; 95 % of errors are smaller."""
+    """Required and reached accuracy of a calibration, as bounds on 95 % of the errors."""
 
     translation_mm: float
+    """Required bound on the translation error."""
     rotation_deg: float
+    """Required bound on the rotation error."""
     asked: bool
-    """Whether the user asked for it; else it is the default, for grasping."""
+    """Whether the user gave the required accuracy; otherwise it is the default, enough for grasping."""
     distance_mm: float
-    """From the camera to the point that the translation is of; 0: the camera itself."""
+    """Distance from the camera to the point to which the translation bounds refer; 0: the camera itself."""
     reached_mm: float
+    """Bound on the translation error that the calibration reaches."""
     reached_deg: float
+    """Bound on the rotation error that the calibration reaches."""
     more_images: int | None = None
-    """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
+    """Number of images, at the proposed poses, to add until the required accuracy is reached; 0 if it is reached, None
+    if no reasonable number suffices."""
     at: Where = "camera"
     """Quantity that the millimetres and degrees refer to."""
 
     @property
     def met(self) -> bool:
-        """Whether 95 % of the errors are within what is required."""
+        """Whether the reached accuracy is at least the required one."""
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
 
     @property
     def details(self) -> dict[str, float | str]:
-        """Numbers and names for the details of a finding."""
+        """Fields as the `details` of a finding that the requirement is not met."""
         named = {name: value for name, value in vars(self).items() if value is not None}
         return {name: one if isinstance(one, str) else float(one) for name, one in named.items()}

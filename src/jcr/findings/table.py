@@ -1,4 +1,4 @@
-"""Table of the findings: a row for each kind, with message, remedy, consequences and documentation."""
+"""Table of the kinds of findings, each with its message, remedy, consequences and documentation."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,7 +10,7 @@ MISFIT = (
     "too uncertain",
     "leave-one-out error",
 )
-"""Kinds that follow from a fault of camera, robot, mount or order where that fault rejects a calibration."""
+"""Kinds that are consequences of a rejecting fault of camera, robot, mount or image order: poses and images misfit."""
 TOO_FEW = (
     "unobservable motion",
     "camera moved on the gripper",
@@ -18,7 +18,7 @@ TOO_FEW = (
     "robot base moved against the scene",
     "gripper poses early or late",
 )
-"""Kinds that follow, too, where too few of the images can be used."""
+"""Kinds that are further consequences if too few of the images can be used."""
 ONE_PART = (
     "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
     "the other part only where "
@@ -30,7 +30,7 @@ REACHED = (
     "{reached_deg:~}°|scene=95 % of errors of mapped points are below {reached_mm:~} mm and {reached_deg:~}°}; "
     "{translation_mm:g} mm and {rotation_deg:g}° are {asked:asked for|needed to grasp}"
 )
-"""Bound of 95 % of the errors beside the requirement."""
+"""Template of the sentence with the reached and the required bound on 95 % of the errors."""
 NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
 TILT = "tilt the wrist by 20° or more away from {axis} in two images"
 MOTIONS = {
@@ -76,7 +76,7 @@ MOTIONS = {
         "move that point too: take two or more images with it 10 cm away from where it was",
     ),
 }
-"""Unobservable direction and remedy of each kind of motion."""
+"""Templates of the unobservable direction and of its remedy, for each kind of degenerate motion."""
 GROUPS = {
     "motion": "Motions, poses and accuracy",
     "camera": "The camera",
@@ -89,7 +89,7 @@ GROUPS = {
     "cell": "Further cameras",
     "single": "Single images",
 }
-"""Title of each group of kinds in the documentation."""
+"""Title of each group of kinds of findings in the documentation."""
 
 
 @dataclass(frozen=True)
@@ -99,24 +99,24 @@ class KindRow:
     group: str
     """Key of GROUPS."""
     message: str
-    """Template of the numbers and names of a finding (finding.Quantities)."""
+    """Template of the message in one sentence, filled with the values of finding.Quantities."""
     remedy: str = ""
-    """Template of the remedy in one sentence; empty where nothing helps or nothing need be done."""
+    """Template of the remedy in one sentence; empty if there is none or none is needed."""
     explains: tuple[str, ...] = ()
-    """Kinds that follow from this one where it rejects a calibration; empty for a kind that is no cause."""
+    """Kinds that are consequences of this kind if it rejects a calibration; empty for a kind that is no cause."""
     means: str = ""
-    """Meaning, for the documentation, where the message does not state it."""
+    """Meaning of the kind in the documentation; empty if the message is enough."""
     help: str = ""
-    """Remedy for the documentation, where `remedy` does not state it."""
+    """Remedy in the documentation; empty if `remedy` is enough."""
 
 
 class FindingKind(StrEnum):
-    """Kinds of findings."""
+    """Kinds of findings; each member's value is its name, and `row` its row of the table."""
 
     row: KindRow
 
     def __new__(cls, name: str, row: KindRow) -> "FindingKind":
-        """Make a member whose value is its name and which carries its row."""
+        """Make a member from its name and its row of the table."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.row = row
@@ -340,5 +340,5 @@ class FindingKind(StrEnum):
 
 
 def kinds_of(*groups: str) -> frozenset[FindingKind]:
-    """Return the kinds of these groups."""
+    """Return the kinds of findings that belong to the named groups (keys of GROUPS)."""
     return frozenset(kind for kind in FindingKind if kind.row.group in groups)

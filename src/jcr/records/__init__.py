@@ -1,4 +1,4 @@
-"""The records that flow from stage to stage, and nothing else.
+"""Records that the stages of a run exchange: capture, reconstruction, parts of the calibration, requirement.
 
 Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward), `recon` (arbitrary origin
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.

@@ -1,6 +1,6 @@
-"""Parts of the record of a calibration (calibration/record.py), each as it is in memory and in calibration.json.
+"""Parts of the record of a calibration (calibration/record.py), in memory and in calibration.json.
 
-Arrays are lists in the file, and lengths and angles have the unit that their key states.
+In the file, arrays are lists, and lengths and angles have the unit that their key names.
 """
 
 from dataclasses import dataclass, replace
@@ -37,238 +37,253 @@ class ImageVerdict:
     """Use and residuals of one image of the capture."""
 
     image: str
-    """Path relative to the folder of the capture; the name of the sample where poses were given."""
+    """Path relative to the folder of the capture; for given camera poses, the name of the sample."""
     used: bool
+    """Whether the calibration uses the image."""
     reason: str | None
-    """Why it was not used; None when it was."""
+    """Reason why the image is not used; None if it is."""
     translation_residual_mm: float | None = None
-    """Distance of the reported gripper from where the fit puts it (mm); None of an image that is not registered."""
+    """Distance between reported and predicted gripper position (mm); None for an image that is not registered."""
     rotation_residual_deg: float | None = None
-    """Angle of the reported gripper from where the fit puts it (degrees)."""
+    """Angle between reported and predicted gripper orientation (degrees); None for an image that is not registered."""
     reprojection_px: float | None = None
-    """Median reprojection error (px); None of an image that was not adjusted."""
+    """Median reprojection error (px); None for an image that was not adjusted."""
 
 
 @dataclass(frozen=True)
 class Observability:
-    """Directions of (translation, rotation, scale) that the motions determine."""
+    """Observability of the translation, rotation and scale of a calibration by the motions of the capture."""
 
     findings: Annotated[tuple[Finding, ...], Field(exclude=True)] = ()
-    """One of kind UNOBSERVABLE per direction that is unobservable, or nearly so."""
+    """Findings of kind UNOBSERVABLE, one for each direction that is unobservable, or nearly so."""
 
     @computed_field
     @property
     def observable(self) -> bool:
-        """Whether every direction is observed, however weakly."""
+        """Whether every direction is observable; directions with a large uncertainty count as observable."""
         return all("nearly" in finding.details for finding in self.findings)
 
     @computed_field
     @property
     def unobservable(self) -> tuple[str, ...]:
-        """Unobservable directions in words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
+        """Unobservable directions in words, e.g. "scale: the camera only rotates about its own centre"."""
         return tuple(unobservable(finding) for finding in self.findings)
 
     @computed_field
     @property
     def advice(self) -> tuple[str, ...]:
-        """One remedy per unobservable direction."""
+        """Remedy of each unobservable direction, in the order of `unobservable`."""
         return tuple(remedy(finding) for finding in self.findings)
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """Principal directions of the excitation by the motions, the weakest first (estimation/observability.py)."""
+    """Principal directions of the excitation of the hand-eye unknowns by the motions (estimation/observability.py)."""
 
     value: Float[ndarray, "7"]
+    """Excitation of each direction, weakest first."""
     direction: Float[ndarray, "7 7"]
-    """Rows; unit vectors of (translation in m, rotation times the arm there, log scale times `spread`)."""
+    """Directions as rows: unit vectors of translation (m), rotation times the length ARM, and log scale times
+    `spread`."""
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """Gripper pose to add, and the expected accuracy of a calibration with it and those before it."""
+    """Gripper pose to add, and the predicted uncertainty of a calibration with this pose and those before it."""
 
     base_from_gripper: Matrix
     like: str
-    """Image whose gripper pose is the nearest to it."""
+    """Name of the image with the nearest gripper pose."""
     expected_std: Numbers7
-    """One standard deviation of each unknown once this pose is added, in COVARIANCE_ORDER."""
+    """Predicted standard deviations, in COVARIANCE_ORDER."""
     within_95_mm: Spread
-    """Bound on 95 % of the errors of a seen point (mm), as Seen has it."""
+    """Predicted bound on 95 % of the errors of a seen point (mm), as in Seen."""
     rotation_95_deg: Spread
-    """Bound on 95 % of the errors of directions there."""
+    """Predicted bound on 95 % of the direction errors (degrees), as in Seen."""
     moved_m: Annotated[Metres, Field(alias="moved_mm")] = 0.0
-    """Distance of the gripper's origin from its place at `like` (m)."""
+    """Distance of the gripper's origin from its position at the image `like` (m)."""
     rotation_rad: Annotated[Radians, Field(alias="rotated_deg")] = 0.0
-    """Angle of the rotation from that pose (rad)."""
+    """Rotation angle from the gripper pose at the image `like` (rad)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise:
-    """One-sigma noise of the gripper poses per axis."""
+    """Robot errors: random noise of the gripper poses, one sigma per axis, and systematic errors."""
 
     translation: Annotated[Metres, Field(alias="translation_mm")]
+    """Random noise of the position (m)."""
     rotation: Annotated[Radians, Field(alias="rotation_deg")]
+    """Random noise of the orientation (rad)."""
     estimated: bool
+    """Whether the random noise was estimated from the residuals; otherwise it is the given one."""
     given: Annotated[tuple[Metres, Radians] | None, Field(alias="given_mm_deg")] = None
-    """m, rad: what the user gave; used where the residuals determine no more."""
+    """Noise given by the user (m, rad), a lower bound on the random noise; None if none was given."""
     systematic: Annotated[Radians, Field(alias="systematic_deg")] = 0.0
-    """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
+    """Size (rad) of the systematic errors: of the joint offsets of a known arm, else of the gripper's rotation."""
     systematic_left: Annotated[tuple[Metres, Radians], Field(alias="systematic_left_mm_deg")] = (0.0, 0.0)
-    """m, rad: systematic errors of these poses per axis, after the effective hand-eye transform took its part."""
+    """Systematic errors of the poses per axis (m, rad), without the part that the hand-eye transform absorbs."""
 
     @property
     def together(self) -> tuple[float, float]:
-        """m, rad: random and systematic errors of a gripper pose per axis."""
+        """Random and remaining systematic error of a gripper pose together, one sigma per axis (m, rad)."""
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
 
 @dataclass(frozen=True)
 class JointOffsets:
-    """Estimated offset of each joint of the arm, from the base on."""
+    """Estimated offsets of the arm's joint angles, one for each joint, from the base to the gripper."""
 
     offset: Numbers
-    """rad: true angle less the reported one."""
+    """True minus reported joint angles (rad)."""
     std: Numbers
-    """rad."""
+    """Standard deviations of the offsets (rad)."""
     prior_std: float
-    """rad: of any joint, before its own poses are asked."""
+    """Standard deviation of a joint's offset in the prior (rad), the same for all joints."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
-    """Part of the uncertainty: one sigma, root mean square over the axes; squares of the parts add up to the whole."""
+    """Part of the uncertainty due to one cause: its covariance, and its standard deviations as the rms over the axes."""
 
     translation_mm: Spread
     rotation_deg: Spread
     covariance: PartCovariance7
-    """Covariance in the order of `uncertainty`; the parts' sum is the whole."""
+    """Covariance in COVARIANCE_ORDER; the sum over all causes is the covariance of the calibration."""
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
-    """Return a part of the covariance with its size."""
+    """Return the covariance of one cause together with its standard deviations."""
     metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1)).tolist()
     degrees = float(np.degrees(radians))
     return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
 
 
 def _covariance_of(share: Share | None) -> Float[ndarray, "7 7"]:
+    """Return the covariance of a part of the uncertainty; 0 for a part that is missing."""
     return np.zeros((7, 7)) if share is None else share.covariance
 
 
 _share = Annotated[Share | None, AfterValidator(_covariance_of), PlainSerializer(share_of, return_type=Share)]
 PartOfBudget = Annotated[Float[ndarray, "7 7"], in_json(_share)]
-"""Covariance in COVARIANCE_ORDER; in files a Share."""
+"""Covariance of one cause in COVARIANCE_ORDER; in files a Share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Parts of the covariance of a calibration, by cause, in COVARIANCE_ORDER; their sum is the covariance."""
+    """Uncertainty budget: parts of a calibration's covariance by cause of error; their sum is the covariance."""
 
     robot_random: PartOfBudget
+    """Part due to the random noise of the gripper poses."""
     robot_systematic: PartOfBudget
+    """Part due to the systematic errors of the gripper poses."""
     intrinsics: PartOfBudget
-    """Part that would vanish if the intrinsics were known."""
+    """Part that would vanish if the intrinsics were known exactly."""
     images: PartOfBudget
-    """Camera poses and features; and what is unobservable."""
+    """Part due to errors of camera poses and features, and to unobservable directions."""
     faults: PartOfBudget
-    """Part that findings and their uncertainty add."""
+    """Part due to findings: the shifts that they state, and differences from known lengths."""
 
     @property
     def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors, which more images leave, are most of the translation's variance."""
+        """Whether systematic robot errors, which more images do not reduce, are most of the translation's variance."""
         others = self.robot_random, self.intrinsics, self.images, self.faults
         return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Leave-one-out error: prediction of each image's gripper pose from the others."""
+    """Mean leave-one-out error: each image's gripper pose is predicted from the other images."""
 
     translation_mm: float
     rotation_deg: float
     reprojection_px: float | None
+    """Median reprojection error with the predicted poses (px); None if the images were not adjusted."""
     how: str
+    """Method of the prediction, in words."""
 
     @property
     def length_m(self) -> float:
-        """Both errors as one length, by which calibrations can be compared."""
+        """Translation and rotation error as one length (m): hypot of translation and geometry.ARM times rotation."""
         from jcr.geometry import ARM  # SciPy, which help need not wait for
 
         return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))
 
 
 COVARIANCE_ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "log_scale")
-"""The step (geometry.retract) that takes gripper_from_camera to the true one, in gripper axes: R_true = exp(r)·R;
-relative scale error (scale_true = exp(s)·scale)."""
+"""Errors whose covariance is stated: translation and rotation vector r of the step (geometry.retract, gripper axes) from
+gripper_from_camera to the true one, R_true = exp(r)·R; and s of the scale, scale_true = exp(s)·scale."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthCheck:
-    """A depth camera's lengths against the robot's, at features whose depth the images and the robot give."""
+    """Scale error and noise of a depth camera, measured at features whose depth the calibrated images determine."""
 
     off_percent: float
-    """By how much its lengths are too long (negative: too short)."""
+    """Relative error of measured depths (percent); positive: measured depths are too large."""
     std_percent: float
-    """One-sigma uncertainty of that, the robot's own scale included."""
+    """Standard deviation of `off_percent`, including that of the robot's scale."""
     noise_m: float
+    """Constant part a of the noise (m): a depth z without its scale error has the standard deviation hypot(a, b·z²)."""
     noise_per_m: float
-    """One sigma of a depth z, its scale corrected, is hypot(noise_m, noise_per_m · z²)."""
+    """Factor b (1/m) of the noise that grows with z²."""
     distances_m: tuple[float, float]
-    """Nearest and farthest of the features (5 % and 95 %): beyond, the noise is extrapolated."""
+    """5 % and 95 % quantile of the features' depths (m); beyond these the noise is extrapolated."""
     images: int
+    """Number of depth images that were compared."""
     features: int
+    """Number of features that were compared."""
 
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
-        """One sigma (m) of corrected depths (m), what is unknown of the scale included."""
+        """Return the standard deviation (m) of depths (m) with corrected scale, from noise and scale uncertainty."""
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """Point uncertainty: bounds on 95 % of the errors of a point that the camera sees, exact gripper poses assumed."""
+    """Point uncertainty: bounds on 95 % of the errors of a point seen by the camera, for exact gripper poses."""
 
     distance_mm: Spread
     """Distance of the point from the camera along its ray (mm)."""
     within_95_mm: Spread
-    """Distance of the point from where it is, in three dimensions."""
+    """Bound on the position error in three dimensions (mm)."""
     lateral_95_mm: Spread
-    """Across the ray."""
+    """Bound on the position error across the ray (mm)."""
     along_95_mm: Spread
-    """95 % bound of the error along the ray (mm), for a distance that was measured in the reconstruction."""
+    """Bound on the position error along the ray (mm), if the distance is that of the reconstruction."""
     ray_95_deg: Spread
-    """Direction of the ray."""
+    """Bound on the error of the ray's direction (degrees)."""
     rotation_95_deg: Spread
-    """Bound on directions there, the rotation about the ray included."""
+    """Bound on the orientation error at the point (degrees), including the rotation about the ray."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenAndCorners(Seen):
-    """Point uncertainty at the centre of the image, at the median distance of the scene, and at its worst corner."""
+    """Point uncertainty at the image centre, for a point at the median distance of the scene, and at the corners."""
 
     corners: Seen
+    """Point uncertainty at the worst corner of the image."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneUncertainty:
-    """Uncertainty of the reconstructed scene in the base frame, every point by all images that see it."""
+    """Uncertainty of the reconstructed scene in the base frame, with each point triangulated from all its images."""
 
     middle_in_base: Numbers3
-    """Middle of the scene (m)."""
+    """Centre of the scene (m)."""
     covariance: PartCovariance7
-    """Covariance of steps of the scene as a whole (geometry.retract) about its middle, along axes of the base, and
-    of the logarithm of its size."""
+    """Covariance of the scene's similarity: translation and rotation (geometry.retract about `middle_in_base`, base
+    axes), log scale."""
     shape_m: Spread
-    """One sigma per axis of what else moves a point: the scene is bent."""
+    """Standard deviation per axis of a point's remaining error, the deformation of the scene (m)."""
     within_95_m: Spread
-    """Distance that 95 % of a point's errors stay below, the median point; its own triangulation included."""
+    """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-        """Return the covariances of points (m²), without their own triangulation."""
+        """Return the covariances (m²) of scene points in the base frame, without the errors of their triangulation."""
         from jcr.geometry import by_similarity  # SciPy, which help need not wait for
 
         by = by_similarity(x_in_base - self.middle_in_base)
@@ -277,38 +292,44 @@ class SceneUncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class WithGivenIntrinsics:
-    """Transform for the intrinsics that were given: the likeliest one where these are exact."""
+    """Transform to use with the given intrinsics instead of the estimated ones: its most likely value for these."""
 
     gripper_from_camera: Matrix
     covariance: Covariance7
-    """Covariance in COVARIANCE_ORDER, with the distance from the transform of the estimated intrinsics."""
+    """Covariance in COVARIANCE_ORDER, including the difference from the transform for the estimated intrinsics."""
     intrinsics: Intrinsics
+    """Given intrinsics."""
     seen: Seen
-    """Uncertainty of a seen point with these intrinsics, what they place wrongly included."""
+    """Point uncertainty with the given intrinsics, including the effect of their errors."""
     differs_mm: Spread
-    """Distance between the places of a point at the image centre by the two pairs (mm)."""
+    """Distance (mm) between the positions of one point at the image centre by the given and the estimated intrinsics,
+    each with its own transform."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """Distortion beyond the model: polynomials over the image, in its widths (estimation/intrinsics_prior.py)."""
+    """Distortion that the camera model cannot express: e polynomials over the image (estimation/intrinsics_prior.py)."""
 
     likeliest: Numbers
+    """Estimated coefficients (e), in image widths."""
     covariance: Square
+    """Covariance of the coefficients (e,e)."""
     expressed: Square
-    """By how much the parameters (camera.parameters) express each polynomial where the images have points, (q,e)."""
+    """Matrix (q,e): parameters (camera.parameters) that best fit each polynomial at the points of the images."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointCovariance:
-    """Covariance of transform, scale and intrinsics together, from which the uncertainty of any point follows."""
+    """Joint covariance of transform, scale and intrinsics, from which the uncertainty of any seen point follows."""
 
     covariance: Square
+    """Covariance with rows and columns in `order`."""
     order: tuple[str, ...]
     """Names of the rows: COVARIANCE_ORDER, then fx, fy, cx, cy and the distortion."""
 
     @model_validator(mode="after")
     def _is_square(self) -> "JointCovariance":
+        """Raise ValueError unless the covariance has a row and a column for each name in `order`."""
         if self.covariance.shape != 2 * (len(self.order),):
             raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
         return self
@@ -316,18 +337,18 @@ class JointCovariance:
 
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
-    """One-sigma uncertainty of transform, scale and intrinsics; axes of the gripper, of the base for a fixed camera."""
+    """Uncertainty of transform, scale and intrinsics; axes of the gripper, or of the base for a fixed camera."""
 
     covariance: Covariance7
     """Covariance in COVARIANCE_ORDER."""
     budget: Budget | None = None
     """Parts of the covariance by cause; None where it was not divided."""
     joint: JointCovariance | None = None
-    """None where the intrinsics were not estimated."""
+    """Covariance with the intrinsics; None where the intrinsics were not estimated."""
     model_error: ModelError | None = None
     """Distortion that the model cannot express; None where the intrinsics were not estimated."""
     seen: SeenAndCorners | None = None
-    """Point uncertainty at the working distance; None of a fit outside the stage calibrate."""
+    """Point uncertainty at the working distance; None for the result of `solve_hand_eye`."""
     scene: SceneUncertainty | None = None
     """Uncertainty of the whole reconstruction in the base frame; None where no image was adjusted."""
 
@@ -373,7 +394,7 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance of COVARIANCE_ORDER and, where they were estimated, of the intrinsics."""
+        """Covariance in COVARIANCE_ORDER, followed by the intrinsics if these were estimated."""
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property
@@ -384,7 +405,10 @@ class Uncertainty:
     def with_error(
         self, added: Float[ndarray, "k k"], cause: Literal["intrinsics", "faults"] = "faults"
     ) -> "Uncertainty":
-        """Return the uncertainty with another error, whose covariance has 7 rows or those of `joint`."""
+        """Return the uncertainty with an independent error added, and attributed to `cause` in the budget.
+
+        `added` is the covariance of the error, in COVARIANCE_ORDER or with all rows of `joint`.
+        """
         joint, budget, of_transform = self.joint, self.budget, added[:7, :7]
         if joint is not None:
             together = joint.covariance.copy()
@@ -397,67 +421,73 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class PaperResiduals:
-    """Residuals of consecutive used poses, as the paper defines them."""
+    """Mean residuals of AX = XB over the motions between consecutive used images, as in the paper of this method."""
 
     translation: float
-    """Mean δ_t (m)."""
+    """Mean translation residual δ_t (m)."""
     rotation: float
-    """Mean δ_R, Frobenius norm."""
+    """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
 
 LengthName = Literal["board", "known length", "depth camera", "network"]
+"""Sources of known lengths that are compared with the robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LengthCheck:
-    """A length beside the robot's positions, compared with them."""
+    """Comparison of a known length with its value by the robot's positions."""
 
     name: LengthName
     robot_longer_percent: float
-    """By how much it is longer by the robot's positions than as stated (negative: shorter)."""
+    """Length by the robot's positions minus stated length, in percent of the stated length."""
     std_percent: float
-    """One sigma of its own, the robot's not counted."""
+    """Standard deviation of the stated length in percent, without that of the robot."""
     used: bool
-    """Whether it is part of the scale; not where two lengths contradict each other."""
+    """Whether the length is a prior of the scale; none is if two lengths contradict each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFound:
-    """A board, or the tags of one `--board`, in the adjusted images."""
+    """Adjusted board, or adjusted tags of one `--board` option: size, flatness, and positions in the base frame."""
 
     spec: str
+    """Value of the option `--board`."""
     bodies: int
-    """1 for a board."""
+    """Number of tags; 1 for a board."""
     images: int
+    """Number of images that show the board or a tag."""
     corners: int
+    """Number of different corners."""
     side_mm: float
     """Side of a square or tag (mm) by the robot's positions alone."""
     side_std_mm: float
+    """Standard deviation of `side_mm`."""
     stated_mm: float | None
-    """None: unknown."""
+    """Side that the user stated (mm); None: unknown."""
     rms_px: float
     """Root mean square of the corners' reprojection errors, per axis (px)."""
     bend_mm: float
-    """Between the lowest and the highest corner beside the plane; the largest of all bodies."""
+    """Height difference of the lowest and highest corner over the plane of a board or tag (mm); the largest of all."""
     centres_in_base: tuple[tuple[float, float, float], ...]
-    """Centres of the bodies in the base frame (m)."""
+    """Centres of board or tags in the base frame (m)."""
     tilts_deg: tuple[float, ...]
-    """Angles of the bodies from the base's horizontal plane."""
+    """Angles of board or tags to the base's horizontal plane (degrees)."""
     shape_mm: tuple[tuple[float, float, float], ...] = ()
-    """Corners of the body that bends most: x and y on the body, and height above its plane, by the robot's positions."""
+    """Corners (mm) of the board or tag with the largest `bend_mm`: x and y in its plane, and height over the plane."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """Attempt with one back end."""
+    """One attempt to reconstruct and calibrate a capture with one back end: its success and its times."""
 
     backend: str
     images_registered: int | None
-    """None where it failed."""
+    """Number of registered images; None if the back end failed."""
     reconstruct_s: float
+    """Time of the reconstruction (s)."""
     calibrate_s: float
-    """0 where there was nothing to calibrate."""
+    """Time of the calibration (s); 0 if the back end failed."""
     why_not: str | None
-    """Reason why the run does not keep it; None where it does."""
+    """Reason why the run does not keep this attempt; None if it does."""
     features: str | None = None
-    """Features that were matched between images, where the back end has a choice."""
+    """Features that were matched between images; None for back ends without a choice of features."""

@@ -1,4 +1,4 @@
-"""Input of a calibration: intrinsics, images with gripper poses, or poses alone."""
+"""Records of a calibration's input: intrinsics, images with gripper poses, further cameras, or pairs of poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,16 +19,16 @@ COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
     "thin_prism": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-"""Coefficients of each distortion in OpenCV's order; ROS calls them plumb_bob, rational_polynomial (with 8 or 12) and
-equidistant."""
+"""Names of each model's distortion coefficients in OpenCV's order. The names of the models in ROS are plumb_bob,
+rational_polynomial (8 or 12 coefficients) and equidistant."""
 LARGEST_PX = 100_000
-"""Width of the largest image; no camera's image is wider."""
+"""Largest width and height of an image (px)."""
 Pixels = Annotated[int, Field(ge=1, le=LARGEST_PX)]
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera with one of OpenCV's distortions, in pixels of a `width` x `height` image."""
+    """Intrinsics of a camera (px) for images of `width` x `height` pixels, with one of OpenCV's distortion models."""
 
     __pydantic_config__ = ConfigDict(allow_inf_nan=False)
     fx: Positive
@@ -38,21 +38,22 @@ class Intrinsics:
     width: Pixels
     height: Pixels
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Coefficients, as many as COEFFICIENTS has names for the model."""
+    """Distortion coefficients of the model, in the order of COEFFICIENTS."""
     model: DistortionModel = "pinhole"
 
     @property
     def matrix(self) -> Float[ndarray, "3 3"]:
-        """K (3,3)."""
+        """Camera matrix K (3,3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def with_std(self, std: Float[ndarray, " q"] | None) -> "IntrinsicsAndStd":
-        """Return the intrinsics with standard deviations in the order of camera.parameters; None: not estimated."""
+        """Return the intrinsics with standard deviations, in the order of camera.parameters; None: not estimated."""
         values: dict[str, Any] = vars(self) | {"std": None if std is None else tuple(std.tolist())}
         return IntrinsicsAndStd(**values)
 
     @model_validator(mode="after")
     def _has_coefficients_of_model(self) -> "Intrinsics":
+        """Raise ValueError unless there are as many distortion coefficients as the model has."""
         names = COEFFICIENTS[self.model]
         if len(self.distortion) != len(names):
             raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
@@ -68,6 +69,7 @@ class IntrinsicsAndStd(Intrinsics):
 
     @model_validator(mode="after")
     def _has_std_of_each(self) -> "IntrinsicsAndStd":
+        """Raise ValueError unless each parameter has a standard deviation, or none has."""
         if self.std is not None and len(self.std) != 4 + len(self.distortion):
             raise ValueError(
                 f"{len(self.std)} standard deviations, but a {self.model} model has "
@@ -82,68 +84,74 @@ Mount = Literal["gripper", "base"]
 
 @dataclass(frozen=True, kw_only=True)
 class CellCamera:
-    """A further camera of the robot's cell, and its images."""
+    """Camera of the robot's cell in addition to the capture's own one, with its images."""
 
     name: str
     mount: Mount
     images: tuple[str, ...]
-    """Paths relative to the folder."""
+    """Paths relative to `folder`."""
     image_size: tuple[int, int]
+    """Width and height (px)."""
     intrinsics: Intrinsics | None = None
+    """Given intrinsics; None: unknown, to be estimated."""
     intrinsics_std: Float[ndarray, " q"] | None = None
+    """Standard deviations of the given intrinsics, in the order of camera.parameters; NaN where none is stated."""
     folder: Path | None = None
-    """None: the capture's."""
+    """Folder of the images; None: the folder of the capture."""
     frame: Int[ndarray, " k"] | None = None
-    """Rows of the capture at whose gripper poses the images of a camera on the same gripper were taken; else None."""
+    """Row of the capture, for each image, with the gripper pose of that image; None unless on the capture's gripper."""
     arm: str | None = None
-    """The other arm that carries it; None: the capture's own, or none."""
+    """Name of another arm that carries the camera; None: the arm of the capture, or a fixed camera."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None
-    """Gripper poses of the other arm in its own base, one for each image."""
+    """Gripper poses of the other arm in its own base frame, one for each image; None without another arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """Images of one scene and the gripper pose at each, checked on reading."""
+    """Images of one scene with the gripper pose at each, after the checks of the reader."""
 
     folder: Path
     images: tuple[str, ...]
-    """Paths relative to `folder`; the names by which everything later speaks of an image."""
+    """Paths relative to `folder`, which are also the names of the images in all later records."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     image_size: tuple[int, int]
-    """Width, height in pixels after EXIF rotation; the same for all images."""
+    """Width and height of all images (px), after the EXIF rotation."""
     intrinsics: Intrinsics | None = None
-    """None: unknown, to be estimated."""
+    """Given intrinsics; None: unknown, to be estimated."""
     intrinsics_std: Float[ndarray, " q"] | None = None
-    """Standard deviations of the given ones, in the order of camera.parameters, not a number where one is not stated."""
+    """Standard deviations of the given intrinsics, in the order of camera.parameters; NaN where none is stated."""
     source: Path | None = None
-    """Source that it was read from, where that is not a capture.json in `folder`."""
+    """File or folder that the capture was read from; None: the capture.json in `folder`."""
     cameras: Path | None = None
-    """A COLMAP model that holds the cameras' poses already."""
+    """COLMAP model with the camera poses of the images; None: the images are to be reconstructed."""
     notes: tuple[str, ...] = ()
-    """Remarks of the reader: pairing of files, frames left out."""
+    """Remarks of the reader, for example on the pairing of files and on skipped frames."""
     joints: Float[ndarray, "n dof"] | None = None
-    """Joint angles (rad) at each image, from the base on; None: not recorded."""
+    """Joint angles (rad) at each image, from the base to the gripper; None: not recorded."""
     robot: str | None = None
-    """Name of the arm, one of jcr.estimation.arms.ROBOT_NAMES."""
+    """Name of the arm, one of jcr.estimation.arms.ROBOT_NAMES; None: unknown."""
     urdf: Path | None = None
-    """The arm's URDF file, not relative to `folder`; None where none was given."""
+    """Path of the arm's URDF file, not relative to `folder`; None: none was given."""
     orientation: int = 1
-    """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
+    """EXIF orientation of all images. 1: as read from the sensor; otherwise the images were rotated upright, and the
+    camera frame is that of the rotated images."""
     pose_convention: str | None = None
-    """Pose convention, a name of capture.controllers.CONVENTIONS; None where the file does not state one."""
+    """Convention of the poses in the source, a name in capture.controllers.CONVENTIONS; None: not stated."""
     depths: tuple[str | None, ...] | None = None
-    """Images of a depth camera, one for each image or None: aligned 16-bit PNG in mm, relative to `folder`."""
+    """Depth image of each image, or None for an image without one: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"
+    """Name of the camera."""
     mount: Mount = "gripper"
-    """base: a fixed camera, and the images show what the gripper carries."""
+    """Body that the camera is mounted on; base: a fixed camera, whose images show an object in the gripper."""
     others: tuple[CellCamera, ...] = ()
+    """Further cameras of the cell."""
 
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self.images)
 
     def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
-        """Return the capture with some of its images, in this order, without further cameras."""
+        """Return the capture with the images of these rows, in their order, and without further cameras."""
         chosen = np.asarray(rows, dtype=int).tolist()
         return replace(
             self,
@@ -157,15 +165,16 @@ class Capture:
 
 @dataclass(frozen=True, kw_only=True)
 class PosePairs:
-    """Gripper and camera poses of the same instants, the cameras found by somebody else: no image is needed."""
+    """Pairs of gripper and camera poses at the same instants, for a calibration without images."""
 
     source: Path
+    """File that the poses were read from."""
     images: tuple[str, ...]
     """Names of the samples."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     recon_from_camera: Float[ndarray, "n 4 4"]
     is_metric: bool
-    """The cameras' unit is the metre, as with a marker of known size."""
+    """Whether the unit of the camera poses is the metre, as with a marker of known size."""
     notes: tuple[str, ...] = ()
     backend: str = "poses given"
 
@@ -175,5 +184,5 @@ class PosePairs:
 
     @property
     def image_index(self) -> Int[ndarray, " n"]:
-        """Rows of the samples with a camera pose: all, as in a Reconstruction that registered every image."""
+        """Row of each camera pose among the samples: 0 … n-1, as in a Reconstruction that registered every image."""
         return np.arange(len(self))

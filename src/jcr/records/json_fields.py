@@ -1,4 +1,4 @@
-"""Fields of the JSON files that jcr writes: arrays as lists, covariances, transforms and numbers in other units."""
+"""Field types of the JSON files: arrays as lists, covariances, rigid transforms, and numbers in the file's units."""
 
 from functools import partial
 from typing import Annotated, Any
@@ -18,7 +18,7 @@ from pydantic import (
 
 
 class Part(BaseModel):
-    """A part of a file: what it names and nothing else, numbers that are finite; made of its fields, or of a record."""
+    """Base class of a JSON file's content: unknown keys and numbers that are not finite are errors."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -37,10 +37,12 @@ class Part(BaseModel):
 
 
 def _listed(array: Any) -> Any:
+    """Return an array as nested lists, and any other value unchanged."""
     return array.tolist() if isinstance(array, ndarray) else array
 
 
 def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
+    """Return a rigid transform from nested lists; raise InputError if it is not rigid."""
     from jcr.geometry import require_rigid  # SciPy, which help need not wait for
 
     matrix = np.array(rows)
@@ -49,15 +51,18 @@ def _rigid(rows: list[list[float]]) -> Float[ndarray, "4 4"]:
 
 
 LEAST_EIGENVALUE = 1e-14
-"""Least eigenvalue of a correlation matrix: below it the errors depend on each other, or digits were lost."""
+"""Smallest eigenvalue of a valid correlation matrix; a smaller one means linearly dependent errors or lost digits."""
 LOST_DIGITS = 1e-3
-"""By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
+"""Largest rounding error of a part's correlation matrix: its eigenvalues may be that far below 0."""
 EXACT = 1e-15
-"""Standard deviation below which an error of a part is rounding."""
+"""Smallest standard deviation by which a part's covariance is normalized; smaller ones are rounding errors."""
 
 
 def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Float[ndarray, "n n"]:
-    """Return a covariance; raise ValueError where an eigenvalue of its correlation matrix is below `least`."""
+    """Return a covariance matrix from nested lists.
+
+    Raises ValueError if it is not symmetric, or if an eigenvalue of its correlation matrix is below `least`.
+    """
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), EXACT**2))
     correlation = matrix / np.outer(std, std)
@@ -70,29 +75,37 @@ def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Floa
 
 
 def in_json(kind: Any) -> GetPydanticSchema:
-    """Return the annotation of a type that JSON has as `kind`."""
+    """Return the pydantic annotation of a field that is read and written as the type `kind`."""
     return GetPydanticSchema(lambda _source, handler: handler.generate_schema(kind))
 
 
 def rounded(value: float) -> float:
-    """Return a number with the 15 digits that survive a change of the unit and back."""
+    """Return a number rounded to 15 significant digits, which a conversion of the unit and back preserves."""
     return float(f"{value:.15g}")
 
 
 def in_unit(per_unit: float) -> GetPydanticSchema:
-    """Return the annotation of a number in metres or radians that JSON has in another unit, `per_unit` in each."""
+    """Return the pydantic annotation of a number in metres or radians that JSON states in another unit.
+
+    `per_unit` is the number of these units in a metre or radian.
+    """
 
     def from_unit(value: float) -> float:
+        """Convert a number of the file to metres or radians."""
         return value / per_unit
 
     def to_unit(value: float) -> float:
+        """Convert a number to the unit of the file."""
         return rounded(value * per_unit)
 
     return in_json(Annotated[float, AfterValidator(from_unit), PlainSerializer(to_unit, return_type=float)])
 
 
 def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:
-    """Return the annotation of arrays of this shape that JSON has as lists, made arrays by `made`; None: any length."""
+    """Return the pydantic annotation of arrays that JSON has as nested lists; `made` converts the lists to an array.
+
+    `counts` is the shape of the arrays; None: any length.
+    """
     lists: Any = float
     for count in reversed(counts):
         lists = Annotated[list[lists], Field(min_length=count, max_length=count)]
@@ -102,20 +115,20 @@ def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:
 
 
 HUGE = 1e15
-"""Largest number of a file."""
+"""Upper bound of the positive numbers in a file."""
 Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 Spread = Annotated[float, Field(ge=0)]
-"""Standard deviation, or a size."""
+"""Standard deviation or size: a number that is not negative."""
 Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
 Numbers = Annotated[Float[ndarray, " _"], _arrays(None)]
 Numbers3 = Annotated[Float[ndarray, "3"], _arrays(3)]
 Numbers7 = Annotated[Float[ndarray, "7"], _arrays(7)]
 Square = Annotated[Float[ndarray, "_ _"], _arrays(None, None)]
 Matrix = Annotated[Float[ndarray, "4 4"], _arrays(4, 4, made=_rigid)]
-"""Rigid transform."""
+"""Rigid transform, a 4x4 matrix."""
 _whole = partial(_covariance, least=LEAST_EIGENVALUE)
 Covariance6 = Annotated[Float[ndarray, "6 6"], _arrays(6, 6, made=_whole)]
 Covariance7 = Annotated[Float[ndarray, "7 7"], _arrays(7, 7, made=_whole)]
-"""Covariance of everything that was estimated: positive definite."""
+"""Positive definite covariance of all estimated quantities."""
 PartCovariance7 = Annotated[Float[ndarray, "7 7"], _arrays(7, 7, made=_covariance)]
-"""Part of a covariance that one cause adds, which may be nothing."""
+"""Positive semidefinite covariance due to one cause of error, which may be 0."""

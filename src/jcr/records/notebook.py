@@ -1,4 +1,4 @@
-"""Records as HTML tables, which notebooks show."""
+"""HTML tables of records for notebooks."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,7 +9,10 @@ TEMPLATE = """\
 
 
 def table(heading: str, rows: Iterable[Sequence[str]], note: str = "") -> str:
-    """Return an HTML table: a heading, rows whose first cell names them, and a note below; all of it text."""
+    """Return an HTML table with a heading above and a note below; the first cell of each row is its header.
+
+    All arguments are plain text, which is escaped.
+    """
     from jinja2 import Template  # which no command needs for its help
 
     return Template(TEMPLATE, autoescape=True).render(heading=heading, rows=rows, note=note)

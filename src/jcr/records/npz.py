@@ -1,4 +1,4 @@
-"""reconstruction.npz: a Reconstruction on disk, from which calibration and map can be made again."""
+"""Reading and writing of reconstruction.npz, a Reconstruction from which calibration and map can be made again."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -18,13 +18,13 @@ from jcr.geometry import require_rigid
 from jcr.records.reconstruction import Reconstruction
 
 FORMAT = "jcr.reconstruction/9"
-"""Changes with what the file holds."""
+"""Name and version of the format; the version increases with every change of the content."""
 ARRAY = "array"
-"""Key of the JSON that names an array of the file."""
+"""Key of the JSON object that stands for an array; its value is the name of the array in the file."""
 
 
 class ReconstructionContent(BaseModel):
-    """Content of the file: its JSON, with the arrays in place of their names."""
+    """Content of reconstruction.npz: its JSON, in which the arrays replace the objects that name them."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
     format: str
@@ -32,14 +32,14 @@ class ReconstructionContent(BaseModel):
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
-    """Write the record whole or not at all."""
+    """Write a reconstruction as an npz file; a failed write leaves an existing file unchanged."""
     arrays: dict[str, np.ndarray] = {}
     content = _named(reconstruction, "", arrays)
     write_npz(path, {"format": FORMAT, "reconstruction": content}, arrays)
 
 
 def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a value as JSON, with the names of its arrays, which are put into `arrays`."""
+    """Return a record, tuple or value as JSON, and add its arrays to `arrays` under names that begin with `name`."""
     if isinstance(value, np.ndarray):
         arrays[name] = value
         return {ARRAY: name}
@@ -54,7 +54,10 @@ def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
-    """Return the JSON of `_named` with the arrays of the file; raise KeyError or ValueError where one is not whole."""
+    """Return the JSON of `_named` with the arrays of the file in place of their names.
+
+    Raises KeyError for an array that the file lacks, and ValueError for one with values that are not finite.
+    """
     if isinstance(value, list):
         return tuple(_filled(one, file) for one in value)
     if not isinstance(value, dict):
@@ -67,7 +70,7 @@ def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
 
 
 def read_reconstruction(path: Path) -> Reconstruction:
-    """Read a reconstruction.npz; raise InputError where it is damaged or of another format."""
+    """Read a reconstruction.npz; raise InputError if it is missing, damaged or of another format."""
     with read_npz(path, FORMAT) as (text, file), jaxtyped("context"):
         found = ReconstructionContent.model_validate(_filled(json.loads(text), file)).reconstruction
         _check(found)
@@ -75,16 +78,17 @@ def read_reconstruction(path: Path) -> Reconstruction:
 
 
 def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays, and what is none as JSON, whole or not at all."""
+    """Write an npz file with named arrays and the JSON object `about`; a failed write leaves an old file unchanged."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
 
 
 @contextmanager
 def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
-    """Read the JSON, whose `format` is `expected`, and the arrays that `write_npz` wrote.
+    """Open an npz file of `write_npz`: yield its JSON text and its arrays by name.
 
-    What goes wrong in reading them raises InputError: no such file, damaged, or of another format.
+    Raises InputError if the file is missing or damaged, or if its `format` is not `expected`; also for errors in the
+    block that uses the arrays.
     """
     require_file(path)
     try:
@@ -108,7 +112,10 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
 
 
 def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
-    """Raise ValueError where an array, by name, has another shape than it should, or is not finite."""
+    """Raise ValueError if an array does not have its expected shape or holds values that are not finite.
+
+    `shapes` maps the name of an array to the array and its expected shape.
+    """
     for name, (array, shape) in shapes.items():
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, not {shape}")
@@ -117,7 +124,7 @@ def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> 
 
 
 def _check(found: Reconstruction) -> None:
-    """Raise ValueError where the arrays, whose shapes agree, hold what cannot be."""
+    """Raise ValueError for invalid values: indices out of range, lengths that are not positive, poses not rigid."""
     tracks, boards, maps = found.tracks, found.tracks.boards, found.pointmaps
     m, p, cameras = len(found.image_index), len(tracks.points_in_recon), [*found.recon_from_camera]
     rows = [("image_index", found.image_index, np.inf), ("tracks.image", tracks.image, m)]
