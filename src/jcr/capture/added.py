@@ -21,8 +21,8 @@ FOLDER, OWNER = "added", "added_to"
 def read_added(run_folder: Path, capture: Capture) -> Capture:
     """Read the images that were added to a run, oldest first; return a capture without images if none was added.
 
-    Raises InputError if an image file is missing, or if the images were added to the run of another capture than
-    `capture`.
+    `capture` is the capture of the run. Raises InputError if an image file is missing, or if the folder's images were
+    added to a run of another capture.
     """
     folder = run_folder / FOLDER
     file = folder / capture_json.FILE

@@ -70,7 +70,8 @@ class Recording:
     intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None] = lambda _: None
     """Function from an image size (width, height) to the recorded intrinsics; used without `options.camera_info`."""
     joints: Float[ndarray, "n j"] | None = None
-    """Joint angles (rad) of the arm in `options.urdf`; None if they are unknown."""
+    """Joint angles (rad) of the arm in `options.urdf`, one row per frame, one column per joint; None if they are
+    unknown."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
     """Function from a row to the depth image (mm) aligned with its frame; None without depth."""
 
@@ -141,9 +142,9 @@ def best_frames(
 ) -> tuple[Rows, tuple[str, ...]]:
     """Return the rows of the best `count` frames in order of time, and remarks on the choice for the user.
 
-    `speed` is in m/s (rotation as in motion_length). `usable` marks the frames with a valid pose. `sharpness_of` is
-    called once, with ascending rows. A stop gives at most one frame; if there are too few stops, the slowest frames
-    between them are added. Raises InputError if fewer than three frames are left.
+    `speed` is in m/s (rotation as in motion_length). `usable` marks the frames with a valid pose. `sharpness_of`
+    returns the sharpness of k ascending rows; it is called once. A stop gives at most one frame; if there are too few
+    stops, the slowest frames between them are added. Raises InputError if fewer than three frames are left.
     """
     moments = [
         run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]

@@ -141,7 +141,7 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Convert recorded positions to joint angles (rad); None if the URDF has no such chain of rotating joints."""
+        """Convert recorded positions to joint angles (rad), a column per joint; None if a joint does not rotate."""
         try:
             chain_of(self.urdf, len(self.joints), "the URDF")
         except InputError:
@@ -173,8 +173,8 @@ class RecordedArm:
     ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
         """Return recorded positions at time stamps (ns), and the largest gap (ns) between joint samples around each.
 
-        Positions are linear between the samples of each joint, which may be published separately. A joint turns the
-        shorter way, also across ±π.
+        Positions have one row per stamp and one column per joint, linear between the samples of the joint, which may be
+        published separately. A joint turns the shorter way, also across ±π.
         """
         rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
         for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):

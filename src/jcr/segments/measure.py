@@ -120,8 +120,9 @@ def _shape(
 ) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
     """Measure one object: height of its top, spread of the top, rotation, centre, side lengths, outline.
 
-    Top and spread are in m above the plane. Rotation (rad, about z, from x to the longer side) is estimated if
-    `given_rad` is None. Centre, side lengths and the convex outline are in m in the plane.
+    Top and spread are in m along the plane's normal. Rotation (rad, about the normal, from the x axis to the longer
+    side) is estimated if `given_rad` is None. Centre, side lengths and the k corners of the convex outline are in m in
+    the plane.
     """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])

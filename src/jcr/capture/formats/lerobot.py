@@ -231,9 +231,10 @@ def _video_frames(
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Return gripper poses computed from poses or joint angles in `state`, and the joint angles (rad).
+    """Return gripper poses computed from the k numbers per frame in `state`, and the angles (rad) of the j joints.
 
-    The joint angles are None without a URDF in which rotating joints alone move the gripper.
+    The numbers are poses or joint angles. The angles are None without a URDF in which rotating joints alone move the
+    gripper.
     """
     where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:
