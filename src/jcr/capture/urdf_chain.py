@@ -149,7 +149,7 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper from recorded positions; raise InputError if degrees were taken for radians."""
+        """Compute base_from_gripper of recorded positions (a column per joint); raise InputError on degrees as rad."""
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(
