@@ -1,1 +1,1 @@
-"""Report of a run as one HTML page."""
+"""Report of a run as one HTML page, and the parts of it that other pages use."""

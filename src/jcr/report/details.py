@@ -1,4 +1,4 @@
-"""Collapsed sections: cameras of the cell; measured objects; times, uncertainty budget, options and versions."""
+"""Collapsed sections of the report: cameras of the cell, measured objects, and details of calibration and options."""
 
 import platform
 from collections.abc import Mapping
@@ -18,14 +18,15 @@ from jcr.rounding import significant
 from jcr.segments.measure import Measurement
 
 StageOptions = Mapping[str, Mapping[str, Any]]
-"""Options by name, by the name of their stage."""
+"""Options of each stage: name of the stage, then name of the option, to value."""
 PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
+"""Packages whose versions the report states."""
 
 
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Content:
-    """Return blocks of names and values."""
+    """Return tables of names and values: facts of the calibration, history of the map, options, and versions."""
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {
@@ -38,7 +39,7 @@ def details_section(
 
 
 def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Content:
-    """Return height and box of every object with one standard deviation, beside the colour of its label."""
+    """Return a row for each object: name, colour of its label, and height, length, width (mm, ± one sigma) and place."""
     colors = label_colors(len(label_names)).tolist()
     rows = []
     for one in measured.objects:
@@ -54,7 +55,7 @@ def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Cont
 
 
 def cameras_section(cameras: CamerasFile) -> Content:
-    """Return a card for each camera, with its images, and for each arm."""
+    """Return a card for each camera of the cell, with transform and images, and one for each other arm."""
     cards = []
     for camera in cameras.cameras:
         arm = "" if camera.arm is None else f" of arm {camera.arm}"
@@ -81,7 +82,7 @@ def cameras_section(cameras: CamerasFile) -> Content:
 def _matrix(
     matrix: Float[ndarray, "4 4"] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, str | None]:
-    """Return the matrix as text, to read and to copy, and its standard deviations; None without a transform."""
+    """Return a transform as text to read and to copy, and its standard deviations; "matrix" is None if there is none."""
     if matrix is None or uncertainty is None:
         return {"matrix": None}
     return {

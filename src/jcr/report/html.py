@@ -1,4 +1,4 @@
-"""report.html: one file with the verdict on a calibration, the transform to copy, and the evidence."""
+"""File report.html: one page with the verdict on a calibration, the transform to copy, and the evidence."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -21,7 +21,7 @@ from jcr.result import RunResult
 from jcr.rounding import significant
 
 UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml")}
-"""Files that are called so in every capture."""
+"""Stems of file names that are the same in every capture, so that the folder names the capture."""
 LINKS = {
     "warnings": "Warnings",
     "transform": "Transform",
@@ -34,17 +34,16 @@ LINKS = {
     "notes": "Notes",
     "details": "Details",
 }
-"""Texts of the links to the sections, and headings of the collapsed ones, by the sections' names."""
+"""Sections by name: text of the link to the section, which is also the heading of a collapsed section."""
 OPEN = {"verdict", "failure", "tiles", "warnings", "transform", "view", "images"}
-"""Sections that are not collapsed."""
+"""Names of the sections that are not collapsed."""
 
 
 def report_html(result: RunResult, options: StageOptions | None = None) -> str:
-    """Return the report of a run, made with these options, as one HTML page that loads nothing else.
+    """Return the report of a run as one HTML page that loads no other file; `options` are those of the run, for display.
 
-    Sections whose record a run does not have are left out: of one from given camera poses the images, of one that found
-    no camera poses all but the reason, the remedy and the images. Raises InputError when an image of the capture has
-    become unreadable.
+    Sections without data are left out. A run from given camera poses has no images; a run that found no camera poses has
+    only the reason, the remedy, the images and the details. Raises InputError if an image of the capture cannot be read.
     """
     calibration, capture, options = result.calibration, result.capture, options or {}
     if not isinstance(capture, Capture):
@@ -80,8 +79,8 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
 
 
 def _page(about: str, source: Path, calibration: AnyCalibration, sections: Mapping[str, Content]) -> str:
-    """Return the whole page; `source` is the capture as the user named it."""
-    # The table or the bag's metadata are called alike in every capture: their folder has the name.
+    """Return the whole page; `about` is a line on the capture, `source` the path of the capture that the user gave."""
+    # Files with a usual name, such as capture.json, do not name the capture; their folder does.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"

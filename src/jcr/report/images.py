@@ -1,4 +1,4 @@
-"""Section of the images: each with its residuals and the reprojection errors of its features."""
+"""Section of the images in the report: each with its residuals and the reprojection errors of its features."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,23 +17,24 @@ from jcr.result import RunResult
 from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
-"""Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""
+"""Largest and smallest width (px) of the images in the report, and largest number of pixels of all together, which is
+about a megabyte."""
 MARKS, MAGNIFIED = 120, 20
-"""Features drawn over each image, and how many times their reprojection errors are drawn longer."""
+"""Largest number of features drawn over an image, and factor by which their reprojection errors are magnified."""
 SHOWN = 12
-"""Images that are not collapsed."""
+"""Number of images that are not collapsed."""
 GRID = 17
-"""Points to a side at which the pixels of an image's file are given; between them they are interpolated."""
+"""Points per side of the grid in `pixels_of_file`; the page interpolates between them."""
 
 
 def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
-    """Return file names without their folders, unless two of them would then be the same."""
+    """Return the file names of images without their folders, or with them if two names would be equal."""
     short = [Path(image.image).name for image in images]
     return short if len(set(short)) == len(short) else [image.image for image in images]
 
 
 def image_numbers(image: ImageVerdict) -> str:
-    """Return residuals and median reprojection error of one image as text, as far as there are any."""
+    """Return translation and rotation residual and median reprojection error of an image as text; none if unknown."""
     parts = [
         (image.translation_residual_mm, " mm"),
         (image.rotation_residual_deg, "°"),
@@ -43,7 +44,7 @@ def image_numbers(image: ImageVerdict) -> str:
 
 
 def images_section(capture: Capture, result: RunResult | None = None) -> Content:
-    """Return every image, of a calibration with its numbers, and the reason where it was rejected."""
+    """Return a card for each image; with a `result` also its residuals, feature marks, and reason of a rejection."""
     intrinsics = capture.intrinsics if result is None else result.intrinsics
     cards: list[dict[str, Any]] = [
         {"path": name, "name": name, "url": url, "numbers": "", "rejected": None, "marks": None}
@@ -68,7 +69,11 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
 
 
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:
-    """Return x and y, in the image file, of a grid of points over the displayed image, which is undistorted."""
+    """Return pixel coordinates x and y in the image file, as rows of GRID by GRID points of the displayed image.
+
+    The displayed image has `size` (width, height) and no distortion. The page uses the grid to show the pixel of the
+    file under the pointer.
+    """
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
     shown = np.stack(np.meshgrid(u, v), axis=-1)
     if intrinsics is not None and is_distorted(intrinsics):
@@ -78,7 +83,10 @@ def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:
-    """Return an SVG path per image of the capture: lines from some features to the projections of their 3D points."""
+    """Return an SVG path by row of the capture: lines from up to MARKS features to the projections of their 3D points.
+
+    The lines are magnified by MAGNIFIED.
+    """
     found, tracks = result.reconstruction, result.reconstruction.tracks
     straight = without_distortion(result.intrinsics or found.intrinsics)
     drawings, draw = {}, np.random.default_rng(0)
@@ -97,7 +105,7 @@ def _reprojections(result: RunResult) -> dict[int, str]:
 
 
 def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
-    """Return every image as a small JPEG, undistorted as in the 3D view; more images are smaller."""
+    """Return every image as data URL of a small undistorted JPEG; its width decreases with the number of images."""
     shape = capture.image_size[1] / capture.image_size[0]
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)

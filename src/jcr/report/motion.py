@@ -1,4 +1,4 @@
-"""Section of observability, uncertainty and the gripper poses to add."""
+"""Section of observability, uncertainty and gripper poses to add in the report."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -15,21 +15,22 @@ from jcr.result import RunResult
 from jcr.rounding import significant
 
 ANY_CONVENTION = "quat-xyzw"
+"""Pose convention in which poses are shown if the robot's convention is unknown."""
 MATRICES = {"franka": "the matrix by columns", "matrix": "the matrix by rows"}
-"""Conventions that write all 16 numbers."""
+"""Pose conventions that write all 16 numbers of the matrix, and their description."""
 PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
-"""Names of a direction's parts, in records.COVARIANCE_ORDER."""
+"""Names of the seven components of a direction, in records.COVARIANCE_ORDER."""
 NAMED = 0.4
-"""Share of a unit direction from which a part is named."""
+"""Absolute value from which a component of a unit direction is named."""
 GENERAL = 0.4
-"""Excitation that general motions reach: the full length of a bar."""
+"""Excitation that is drawn as a bar of full length; general motions reach it."""
 
 Bar = tuple[str, float, float, str]
-"""Name, begin and width (percent), and number."""
+"""Bar of a chart: name, left end and width (percent of the chart), and number as text."""
 
 
 def motion_section(result: RunResult) -> Content:
-    """Return excitation of the seven directions, standard deviations of their parts, and the poses to add."""
+    """Return bars of the excitation of seven directions and of the standard deviations, and the gripper poses to add."""
     calibration, spreads, seen = result.calibration, list[list[Bar]](), list[str]()
     observed, uncertainty = calibration.observability, calibration.uncertainty
     if uncertainty is not None:
@@ -58,7 +59,7 @@ def motion_section(result: RunResult) -> Content:
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
-    """Yield state, name, percent of a bar and number of each principal direction, least excited first."""
+    """Yield (CSS class, name, length in percent, number) of a bar for each principal direction, least excited first."""
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
         name = ", ".join(parts) or PARTS[int(direction.argmax())]
@@ -67,14 +68,14 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 
 
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
-    """Yield a bar for each axis, as wide as ± one standard deviation relative to the largest."""
+    """Yield a bar for each axis x, y, z: its width is ± one standard deviation, relative to the largest of the three."""
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"
 
 
 def _next_poses(result: RunResult) -> dict[str, Any] | None:
-    """Return the proposed gripper poses in the convention of the capture's robot, ready to copy; None without any."""
+    """Return the proposed gripper poses in the pose convention of the capture, ready to copy; None if there are none."""
     if not (poses := result.calibration.next_poses):
         return None
     capture, convention = result.capture, ANY_CONVENTION
@@ -89,7 +90,7 @@ def _next_poses(result: RunResult) -> dict[str, Any] | None:
 
 
 def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:
-    """Return a proposed pose in the convention of the robot, with its expected uncertainty."""
+    """Return a proposed gripper pose in a convention, with motion and expected uncertainty as cells of a table."""
     numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
     mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())
     percent = significant(100 * float(pose.expected_std[6]))

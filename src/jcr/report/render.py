@@ -1,4 +1,4 @@
-"""The templates of the pages, filled: every text is escaped, and a page loads nothing else; images and colours."""
+"""Rendering of HTML pages from templates, with every text escaped and all files embedded; images and label colours."""
 
 import base64
 import colorsys
@@ -15,29 +15,31 @@ from numpy import ndarray
 from PIL import Image
 
 REPORT = "jcr.report"
+"""Package whose templates all pages share."""
 TRACK_COLOR = (229, 40, 40)
+"""RGB of tracked features in 3D views."""
 JPEG_QUALITY = 80
 
 
 Content = Mapping[str, Any]
-"""Content of a section of the report: the variable `it` of its template."""
+"""Content of a section of the report; its template reads it as the variable `it`."""
 
 
 def render(template: str, content: Mapping[str, Any], package: str = REPORT) -> str:
-    """Return the page, or part of one, that a template in `templates/` of a package makes of its content."""
+    """Fill a template, a file in `templates/` of a package, with its content; return the HTML page or part of a page."""
     return _environment(package).get_template(template).render(content)
 
 
 @cache
 def _environment(package: str) -> Environment:
-    """Return the templates of a package and of the report, whose layout, style and macros all pages share."""
+    """Return the Jinja environment with the templates of a package and those of the report, which all pages share."""
     loader = ChoiceLoader([PackageLoader(name, "templates") for name in dict.fromkeys((package, REPORT))])
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
 
     def source(name: str) -> Markup:
-        """Return a style sheet or script of a package unescaped."""
+        """Return the unescaped text of a style sheet or script in the folder of the templates."""
         return Markup(loader.get_source(environment, name)[0])  # nosec B704: a file of this package, no text from outside
 
     environment.globals["source"] = source
@@ -46,7 +48,7 @@ def _environment(package: str) -> Environment:
 
 
 def label_colors(count: int) -> UInt8[ndarray, "k 3"]:
-    """Return colours far apart on the wheel for neighbouring labels; grey for label 0, none."""
+    """Return RGB (k,3) of `count` labels, with different hues for successive labels; label 0, none, is grey."""
     hue = np.arange(count) * 0.618034 % 1.0
     rgb = np.array([colorsys.hsv_to_rgb(h, 0.6, 0.88) for h in hue])
     rgb[0] = 0.6
@@ -54,7 +56,7 @@ def label_colors(count: int) -> UInt8[ndarray, "k 3"]:
 
 
 def image_url(pixels: UInt8[ndarray, "h w *c"]) -> str:
-    """Return grey or RGB pixels as the data URL of a JPEG."""
+    """Return the data URL of a JPEG of grey (h,w) or RGB (h,w,3) pixels."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "JPEG", quality=JPEG_QUALITY)
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""Section of residuals: a bar for each image, and the numbers of the whole fit."""
+"""Section of residuals in the report: a bar for each image, and the residuals of the whole fit."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from jcr.result import RunResult
 from jcr.rounding import significant
 
 NOTICEABLE = 1.05
-"""Times the random noise, from which the noise with systematic errors is named beside it."""
+"""Ratio of noise with systematic errors to random noise, above which the report states both."""
 
 
 def residuals_section(result: RunResult) -> Content:
-    """Return residuals by image and of the whole fit."""
+    """Return residuals of each image as numbers and bars, the robot pose noise, and residuals of the whole fit."""
     fit = result.found
     named = zip(shown_names(fit.images), fit.images, strict=True)
     rows = [(name, one) for name, one in named if one.translation_residual_mm is not None]

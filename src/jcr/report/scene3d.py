@@ -1,4 +1,4 @@
-"""Data of the 3D view that templates/scene3d.js draws."""
+"""Data of the 3D view, which templates/scene3d.js draws."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -17,18 +17,18 @@ from jcr.result import RunResult
 from jcr.scene.surface import point_size, sample_surface
 
 POINTS = 60_000
-"""Most points of each layer."""
+"""Largest number of points of a layer."""
 TRACK_SIZE = 0.006
-"""Side (m) of the squares that are drawn in place of tracked features."""
+"""Side (m) of the squares as which tracked features are drawn."""
 
 
 PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
-"""Points of one kind, which can be shown or hidden: name, points in the base frame, colours, and side (m) of the
-squares that are drawn in their place."""
+"""Layer of points that can be shown or hidden: name, points (m, base frame), RGB, and side (m) of the squares as which
+points are drawn."""
 
 
 def scene_section(result: RunResult) -> Content:
-    """Return the section of the 3D view: cameras, grippers and points in the base frame."""
+    """Return the section of the 3D view: its data (cameras, grippers, points), check boxes, and legend of labels."""
     calibration, reconstruction = result.found, result.reconstruction
     x, next_poses, base_from_recon = (
         calibration.gripper_from_camera,
@@ -88,7 +88,7 @@ def scene_section(result: RunResult) -> Content:
 
 
 def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:
-    """Return points in red."""
+    """Return a layer of points (m, base frame) in the colour and size of tracked features."""
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points_in_base), 1))
     return name, points_in_base, red, TRACK_SIZE
 
@@ -101,12 +101,12 @@ def scene_data(
     intrinsics: Intrinsics,
     shown_in_base: Float[ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """Return the data of scene3d.js: points as 16-bit steps through their box, images (`scene_view`), poses to add.
+    """Return the data of scene3d.js: layers of points, images (`scene_view`), gripper poses to add, and intrinsics.
 
-    `shown_in_base` are further points (m) that the box of coordinates contains.
+    Coordinates of points are 16-bit fractions of a box, which encloses most points and `shown_in_base` (m, base frame).
     """
     everything = np.vstack([points for _, points, *_ in layers] + [shown_in_base])
-    # A few stray points far away must not take the resolution, and the view, from all others.
+    # A few distant outliers must not enlarge the box, which sets the resolution and the view.
     low, high = np.percentile(everything, [1, 99], axis=0)
     margin = 0.25 * (high - low) + 0.05
     low, high = box = np.stack([low - margin, high + margin]).round(4)
@@ -136,7 +136,7 @@ def scene_view(
     base_from_gripper: Float[ndarray, "4 4"],
     base_from_camera: Float[ndarray, "4 4"] | None,
 ) -> dict[str, Any]:
-    """Return an image with its name, numbers, gripper pose and camera pose (None: unknown)."""
+    """Return an image of the 3D view: name, caption, whether it is used, gripper pose, camera pose (None: unknown)."""
     camera = None if base_from_camera is None else _rows(base_from_camera)
     return {
         "name": name,
@@ -148,12 +148,15 @@ def scene_view(
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
-    """Return the upper three rows, to a micrometre."""
+    """Return the upper three rows of a transform (m), rounded to six decimals."""
     return a_from_b[:3].round(6).tolist()
 
 
 def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
-    """Return the cell's further cameras with their poses and intrinsics."""
+    """Return the other cameras of the cell that have a pose: name, caption, intrinsics, and poses in the base frame.
+
+    `base_from_camera` are the poses of the calibrated camera at its registered images.
+    """
     if result.cameras is None:
         return []
     grippers = base_from_camera @ inverse(result.calibration.gripper_from_camera)

@@ -1,4 +1,4 @@
-"""Section of the hand-eye transform: notations of robot software, ready to copy, and a sketch to scale."""
+"""Section of the hand-eye transform in the report: notations of robot software to copy, and a sketch to scale."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -27,15 +27,15 @@ from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
 WIDTH, HEIGHT, MARGIN = 440, 320, 34
-"""Size of the sketch, small enough that its text can be read on a phone, and its margin (px)."""
+"""Width and height of the sketch, whose text can then be read on a phone, and its margin (px)."""
 EYE_DEG = (-55.0, 22.0)
-"""Azimuth of the eye about the parent's z axis, and elevation above its plane."""
+"""Direction from which the sketch is drawn: azimuth about the z axis of the parent frame, and elevation (degrees)."""
 FLANGE_M = 0.0315
-"""Radius of the drawn flange: ISO 9409-1-50."""
+"""Radius (m) of the drawn flange: ISO 9409-1-50."""
 
 
 def transform_section(hand_eye: Calibration) -> Content:
-    """Return the section of gripper_from_camera, or of base_from_camera for a fixed camera."""
+    """Return gripper_from_camera, or base_from_camera of a fixed camera in all notations, with covariance and sketch."""
     x, mount, std = hand_eye.parent_from_camera, hand_eye.mount, hand_eye.uncertainty.std
     parent = PARENT if mount == "gripper" else BASE
     rotation = Rotation.from_matrix(x[:3, :3])
@@ -85,9 +85,9 @@ def transform_section(hand_eye: Calibration) -> Content:
 def sketch(
     parent_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics | None, mount: Mount
 ) -> dict[str, Any]:
-    """Return the camera's pyramid and axes in the frame of the flange (z drawn downwards) or of the base.
+    """Return a sketch of the camera, as a pyramid with axes, in the gripper frame (z drawn downwards) or the base frame.
 
-    "shapes" are the tag, attributes and text of SVG elements, "label" is what a screen reader reads instead.
+    "shapes" are tag, attributes and text of SVG elements; "label" is the description for screen readers.
     """
     down = mount == "gripper"
     away = float(np.linalg.norm(parent_from_camera[:3, 3]))
@@ -105,12 +105,12 @@ def sketch(
     shapes = list[tuple[str, dict[str, str], str]]()
 
     def draw(tag: str, ends: Sequence[ndarray] | ndarray, kind: str) -> None:
-        """Draw a polyline or polygon through points."""
+        """Add an SVG polyline or polygon (`tag`) through points (px), with the CSS class `kind`."""
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)
         shapes.append((tag, {"class": kind, "points": points}, ""))
 
     def write(x: float, y: float, words: str, kind: str) -> None:
-        """Write a text whose baseline begins at x, y, or with the class "middle" is centred there."""
+        """Add a text at x, y (px) with the CSS class `kind`: left end of its baseline, or its centre with "middle"."""
         shapes.append(("text", {"x": f"{x:.1f}", "y": f"{y:.1f}", "class": kind}, words))
 
     if down:
@@ -134,7 +134,10 @@ def sketch(
 def _projection(
     x: Float[ndarray, "n 3"], down: bool
 ) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
-    """Return a parallel projection (n,3) m -> (n,2) px that shows all points, with z downwards or upwards."""
+    """Return a function that projects points (k,3) m to pixels (k,2) of the sketch, in parallel projection.
+
+    Its scale is such that all points `x` are visible; `down`: the z axis is drawn downwards, else upwards.
+    """
     azimuth, elevation = np.radians(EYE_DEG)
     up_z = -1.0 if down else 1.0
     eye = np.array(

@@ -1,4 +1,4 @@
-"""Head of the report: verdict with its reason, main numbers, and the reason of a failure."""
+"""Top of the report: verdict with its reason, main numbers and warnings, or the reason of a failure."""
 
 from collections.abc import Iterator
 
@@ -10,18 +10,18 @@ from jcr.report.render import Content
 from jcr.rounding import significant
 
 Tile = tuple[str, str, str, bool]
-"""Name, number, remark, and whether it is one of the main numbers."""
+"""Number in a box: its name, the number as text, a remark, and whether it is one of the main numbers."""
 
 
 def head(calibration: AnyCalibration) -> dict[str, Content]:
-    """Return the sections of verdict, main numbers and warnings."""
+    """Return the sections "verdict", "tiles" (main numbers) and, if there are any, "warnings"."""
     sections: dict[str, Content] = {"verdict": _verdict(calibration)}
     sections["tiles"] = {"tiles": list(_tiles(calibration))}
     return sections | ({"warnings": {"remarks": calibration.remarks}} if calibration.remarks else {})
 
 
 def failure_section(calibration: AnyCalibration) -> Content:
-    """Return the fault, its remedies, and the reason why each back end failed."""
+    """Return the reason why no camera poses were found, the remedies, and a row for each attempt with a back end."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
     remedies += filter(None, [remedy(failed)])
@@ -42,7 +42,7 @@ def failure_section(calibration: AnyCalibration) -> Content:
 
 
 def _verdict(calibration: AnyCalibration) -> dict[str, str]:
-    """Return the verdict, its reason and colour, and a sentence on the leave-one-out error."""
+    """Return the verdict, its colour ("kind"), its reason, and sentences on leave-one-out error and uncertainty."""
     required, short, verdict = calibration.requirement, calibration.short, calibration.verdict
     kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
     if calibration.doubt is not None:
@@ -59,7 +59,7 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
 
 
 def _leave_one_out(calibration: AnyCalibration) -> str:
-    """Return a sentence on the leave-one-out error and its limits."""
+    """Return a sentence with the leave-one-out error, and the errors that it cannot show."""
     if (held_out := calibration.held_out) is None:
         return "There were too few images for a leave-one-out error."
     error = f"Leave-one-out error {leave_one_out_text(held_out)} ({held_out.how})"
@@ -74,7 +74,10 @@ def _leave_one_out(calibration: AnyCalibration) -> str:
 
 
 def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
-    """Yield four tiles: accuracy of a point at the image centre and in a corner, images used, scale."""
+    """Yield tiles of the accuracy of a point at the image centre and in a corner, used images, and scale.
+
+    Tiles whose numbers the calibration does not have are left out or replaced by the rotation of the camera.
+    """
     uncertainty, required = calibration.uncertainty, calibration.requirement
     if required is not None:
         name = {"seen": "Point at the image centre", "camera": "Camera", "scene": "Mapped point"}[required.at]

@@ -1,1 +1,1 @@
-"""3D view of a run in the browser."""
+"""Interactive 3D view of a run in the browser, with viser."""

@@ -1,6 +1,6 @@
-"""3D view of a run in the browser: points, cameras, robot, slices of the map, a sphere to test.
+"""3D view of a run in the browser: points, cameras, robot, slices of the map, and a sphere for collision tests.
 
-What can only be shown or hidden has no control here: viser's list of the scene has a switch for each part.
+Parts that are only shown or hidden need no control here, because viser lists all parts with a switch for each.
 """
 
 import io
@@ -39,43 +39,50 @@ CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
 FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
 GREY = (110, 110, 110)
 CLOUD, MAP = "points as measured", "map"
+"""Names of the two kinds of points that can be drawn."""
 MAP_POINTS = 150_000
+"""Number of points that are drawn of the map's surface."""
 UNKNOWN_CELLS = 300_000
-"""Cells queried to find the border of unknown space."""
+"""Number of cells for which the map is queried to find the border of unknown space."""
 IMAGE_PX = 160
-"""Longer side of the images in the cameras."""
+"""Longer side (px) of the images that are drawn in the cameras."""
 FRUSTUM_M, POINT_M = 0.05, 0.005
-"""Distance from a camera to its drawn image plane, and size of a point (m)."""
+"""Distance from a camera to its drawn image plane, and size of a drawn point (m)."""
 CLICK_RAD = 0.006
-"""Angle about a click's ray within which points are found."""
+"""Largest angle (rad) between the ray of a click and a point that it selects."""
 FAR_M, SLICE_PIXELS = 0.2, 240
-"""Distance at which the colours of a slice end, and pixels along its longer side."""
+"""Distance (m) at which the colour scale of a slice ends, and pixels along the longer side of a slice."""
 HOST = "127.0.0.1"
-"""Other machines must not reach viser, which has no password and no encryption."""
+"""Address of the server: loopback, because viser has no password and no encryption."""
 Value = Float[ndarray, "3"]
+"""Point (m) or direction in the base frame."""
 SliceOf = Literal["distance", "occupancy"]
+"""Property of the map that a slice shows."""
 
 
 class LocalServer(viser.ViserServer):
-    """viser server that never opens a tunnel to the internet."""
+    """Server of viser that other machines cannot reach: it opens no tunnel to the internet, and prints nothing."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return no address: sharing is disabled."""
+        """Return None instead of a public address, because sharing is disabled."""
         return None
 
     def stop(self) -> None:
-        """Stop without printing: standard output belongs to the command."""
+        """Stop the server, without viser's messages on standard output."""
         with redirect_stdout(io.StringIO()):
             super().stop()
 
 
 def open_server(port: int, title: str) -> LocalServer:
-    """Return a running server at a port of 127.0.0.1 (0: any free one); raise InputError where the port is taken."""
+    """Start a server at a port of 127.0.0.1 (0: any free one) and return it; `title` is the title of its page.
+
+    Raises InputError if the port is invalid or in use.
+    """
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
     with redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=title, verbose=False)
-    if port not in (0, server.get_port()):  # viser takes the next free port silently
+    if port not in (0, server.get_port()):  # viser uses the next free port without an error
         server.stop()
         raise InputError(
             f"cannot listen on port {port} of {HOST}; choose another with --port (0 takes any free one)"
@@ -85,10 +92,11 @@ def open_server(port: int, title: str) -> LocalServer:
 
 
 def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndarray, 'n dof']]":
-    """Return the robot with its visual meshes, and its configuration at each image (rad or m).
+    """Return the robot of a URDF with its visual meshes, and its joint values (n,dof) at each image (rad or m).
 
-    The capture's joints are the first that move in the URDF; others, such as fingers, stay at 0. Raises InputError
-    for a URDF that cannot be read or moves fewer joints, and for a capture without joint values.
+    The joint values of the capture are those of the first movable joints in the URDF; other joints, such as fingers,
+    are at 0. Raises InputError if the URDF cannot be read or has fewer movable joints, or the capture has no joint
+    values.
     """
     import yourdfpy
 
@@ -105,13 +113,13 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
         )
     try:
         robot = yourdfpy.URDF.load(str(urdf))
-    except Exception as error:  # whatever the readers of meshes raise
+    except Exception as error:  # the readers of meshes raise errors of many types
         raise InputError(f"{urdf}: a mesh cannot be read ({error})") from error
     return robot, np.pad(joints, ((0, 0), (0, len(moving) - joints.shape[1])))
 
 
 class Viewer:
-    """Scene and controls of a viser server that shows a run."""
+    """3D view of a run: fills a viser server with the scene and its controls, and handles their events."""
 
     def __init__(
         self,
@@ -120,7 +128,7 @@ class Viewer:
         urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Fill the server; `urdf` replaces the one of the capture."""
+        """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture."""
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
@@ -158,7 +166,7 @@ class Viewer:
         report("view", 1.0)
 
     def _add_capture(self) -> None:
-        """Add base, cameras with their images, grippers, and the controls of the chosen image."""
+        """Add base frame, cameras with their images, gripper frames, and the controls of the selected image."""
         server, gui, intrinsics = self.server, self.server.gui, self.reconstruction.intrinsics
         server.scene.add_frame("/base", axes_length=0.1, axes_radius=0.003)
         server.scene.add_label("/base/name", "base")
@@ -197,7 +205,7 @@ class Viewer:
         self.image.on_update(lambda _: self.choose_image())
 
     def _add_points(self) -> None:
-        """Add the controls of the drawn points."""
+        """Add the controls that select the drawn points and their colours."""
         names = [MAP] * (self.scene is not None) + [CLOUD] * (self.cloud is not None) + ["none"]
         gui, several = self.server.gui, self.scene is not None and len(self.scene.label_names) > 1
         with gui.add_folder("Points", expand_by_default=False):
@@ -209,7 +217,7 @@ class Viewer:
             control.on_update(lambda _: self.show_points())
 
     def _add_map(self, scene: SceneMap) -> None:
-        """Add the border of unknown space, which viser's list shows, and the level slice with its controls."""
+        """Add the border of unknown space, hidden at first, and a horizontal slice of the map with its controls."""
         gui, (low, high) = self.server.gui, scene.box
         with gui.add_folder("Map", expand_by_default=False):
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
@@ -230,7 +238,7 @@ class Viewer:
             control.on_update(lambda _: self.show_slice())
 
     def _add_sphere(self) -> None:
-        """Add the sphere that shows collisions, 0.15 m above the support."""
+        """Add the sphere that a user moves to test for collisions, 0.15 m above the support, and its controls."""
         gui = self.server.gui
         with gui.add_folder("Sphere to drag", expand_by_default=False):
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
@@ -246,7 +254,7 @@ class Viewer:
         self.move_sphere()
 
     def _add_click(self) -> None:
-        """Add the answer to a click on a point."""
+        """Add the text and the mark that answer a click on a point."""
         with self.server.gui.add_folder("Click a point", expand_by_default=False):
             self.clicked = self.server.gui.add_markdown("Click a point to see its values.")
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
@@ -256,7 +264,7 @@ class Viewer:
             self.click(np.array(event.ray_origin), np.array(event.ray_direction))
 
     def choose_image(self) -> None:
-        """Show the numbers of the chosen image, mark its camera and move the robot to its pose."""
+        """Show the residuals of the selected image, mark its camera, and move the robot to its joint values."""
         with self._lock:
             row = self.image.value
             image = self.calibration.images[row]
@@ -273,7 +281,7 @@ class Viewer:
                 self.robot.update_cfg(self._configurations[row])
 
     def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
-        """Choose the image of a registered camera and move the client's view to it."""
+        """Select the image of a registered camera, by its row, and move the view of a client to the camera's pose."""
         self.image.value = int(self.image_index[camera])
         if client is None:
             return
@@ -283,7 +291,7 @@ class Viewer:
             client.camera.fov = self._fov
 
     def show_points(self) -> None:
-        """Draw the chosen points: the surface of the map, the cloud, or none; and the tracked features."""
+        """Draw the selected points (surface of the map, measured cloud, or none) and, if switched on, the features."""
         with self._lock:
             x, color, legend = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
             if self.shown.value == CLOUD and self.cloud is not None:
@@ -300,7 +308,7 @@ class Viewer:
             self._draw("/tracks", tracks, np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1)), 0.004)
 
     def _draw(self, name: str, x: Float[ndarray, "n 3"], color: UInt8[ndarray, "n 3"], size: float) -> None:
-        """Replace a point cloud of the view; none for no points."""
+        """Replace the point cloud `name` by points (m, base frame) drawn with `size` (m); remove it for no points."""
         if len(x) == 0:
             self.server.scene.remove_by_name(name)
             return
@@ -309,8 +317,8 @@ class Viewer:
         )
 
     def show_slice(self) -> None:
-        """Draw the chosen slice."""
-        assert self.scene is not None  # or there would be no such control
+        """Draw the horizontal slice of the map with the selected property and height, or hide it."""
+        assert self.scene is not None  # the control exists only with a map
         with self._lock:
             of, height = self.slice_of.value, self.slice_at.value
             self._slice.visible = of != "none"
@@ -320,8 +328,8 @@ class Viewer:
                 self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
 
     def move_sphere(self) -> None:
-        """Test the sphere for collision; it becomes red where it touches something."""
-        assert self.scene is not None  # or there would be no sphere
+        """Test the sphere for a collision with the map; colour it red if there is one, and show distance and verdict."""
+        assert self.scene is not None  # the sphere exists only with a map
         with self._lock:
             center, radius = np.asarray(self.gizmo.position, float)[None], self.radius.value / 1e3
             unknown: Unknown = self.unknown.value
@@ -337,7 +345,7 @@ class Viewer:
             self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
-        """Show and return the values of the first drawn point along a ray."""
+        """Show and return the values at the first drawn point along the ray of a click; `direction` is a unit vector."""
         with self._lock:
             x = self.points
             along = (x - origin_in_base) @ direction
@@ -353,7 +361,7 @@ class Viewer:
             return self.clicked.content
 
     def _values(self, point: Value) -> str:
-        """Return a table of the map's values at a point, and of the nearest measured point."""
+        """Return a Markdown table with the map's values at a point (m), and with the nearest measured point."""
         rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
         if self.scene is not None:
             at = self.scene.query(point[None])
@@ -371,14 +379,14 @@ class Viewer:
         return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
 
     def _support(self) -> float:
-        """Return the most frequent height (m) of the surface, inside the workspace."""
+        """Return the height (m) of the support: the most frequent z of the surface, limited to the workspace."""
         assert self.scene is not None
         counts, edges = np.histogram(self._solid[:, 2], bins=100)
         low, high = self.scene.box[:, 2]
         return float(np.clip(edges[counts.argmax()], low, high - 0.02))
 
     def _place_eye(self) -> None:
-        """Set the initial view obliquely from above, with points and cameras in it."""
+        """Set the initial view: obliquely from above, far enough to show the points and the cameras."""
         target = _middle(self._solid)
         cameras = self.base_from_camera[:, :3, 3]
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
@@ -387,12 +395,12 @@ class Viewer:
 
 
 def _middle(points: Float[ndarray, "n 3"]) -> Value:
-    """Return the median of points; the origin where there are none."""
+    """Return the median of points (n,3) along each axis; the origin if there are none."""
     return np.median(points, axis=0) if len(points) else np.zeros(3)
 
 
 def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:
-    """Return vertices (m) and triangles of the surface around unknown space; none where all or nothing was seen."""
+    """Return vertices (v,3) m and triangles (f,3) of the surface of unknown space; none if all or no space was seen."""
     low, high = scene.box
     pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
     axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
@@ -405,7 +413,10 @@ def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndar
 
 
 def slice_image(scene: SceneMap, height: float, unknown: Unknown, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
-    """Return the map at z = height (m) as RGBA in the colours of SLICE_LEGENDS: columns along x, rows downwards in y."""
+    """Return an RGBA image of a property of the map at z = `height` (m), in the colours of SLICE_LEGENDS.
+
+    Columns follow the x axis of the base; rows follow y from the largest value to the smallest.
+    """
     low, high = scene.box
     pitch = float((high - low)[:2].max() / SLICE_PIXELS)
     a, b = (np.arange(low[k] + pitch / 2, high[k], pitch) for k in (0, 1))
@@ -427,9 +438,9 @@ SLICE_LEGENDS: dict[str, str] = {
     "distance": f"yellow: at a surface; violet: {100 * FAR_M:.0f} cm and more; red: solid",
     "occupancy": "white: free; blue: occupied; grey: unknown",
 }
-"""Legends of the slices."""
+"""Legend of the colours of a slice, by its property."""
 
 
 def _wxyz(a_from_b: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:
-    """Return the rotation as a quaternion w, x, y, z."""
+    """Return the rotation of a transform as a quaternion in the order w, x, y, z."""
     return Rotation.from_matrix(a_from_b[:3, :3]).as_quat()[[3, 0, 1, 2]]
