@@ -141,7 +141,7 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Convert recorded positions to joint angles (rad), a column per joint; None if a joint does not rotate."""
+        """Convert recorded positions (a column per joint) to joint angles (rad); None if `chain_of` finds no arm."""
         try:
             chain_of(self.urdf, len(self.joints), "the URDF")
         except InputError:
