@@ -18,28 +18,28 @@ from jcr.least_squares import Loss, minimise
 from jcr.records import Intrinsics
 
 FOCAL_FACTORS = np.geomspace(0.4, 2.5, 14)
-"""Factors of the focal length from which the search starts where the focal length is free."""
+"""Factors on the given focal length that are tried as initial values of a free focal length."""
 LOSS_SCALE = 2.0
-"""Scale of the Cauchy loss, standard deviations."""
+"""Scale of the Cauchy loss, in standard deviations."""
 MEDIAN = 2 * np.log(2.0)
 """Median of the squared length of a whitened residual of two components."""
 INEFFICIENCY = 1.09
-"""Variance of the estimate under that loss over that of least squares, for normal errors (Huber 1981, section 3.2)."""
+"""Variance of the estimate with the Cauchy loss over that of least squares, for normal errors (Huber 1981)."""
 LEAST_STD_PX = 0.05
-"""Lower bound of the estimated noise of the pixels."""
+"""Lower bound of the estimated pixel noise."""
 ROUNDS, SETTLED = 10, 1e-2
-"""Largest number of estimates of the noise, each followed by least squares; a step (in σ) that ends them."""
+"""Largest number of rounds of noise estimate and least squares, and the step (in σ) that ends them."""
 BEHIND_PX = 1e4
-"""Residual of a point behind the camera."""
+"""Assumed residual (px) of a point behind the camera."""
 AMBIGUOUS = 1.5
-"""Largest ratio of the rms errors of the two poses of a plane that the pixels do not tell apart."""
+"""Ratio of the rms errors of the two poses of a plane, up to which they are ambiguous."""
 APART = np.radians(5.0)
-"""Smallest rotation between the two poses of a plane that counts as an ambiguity."""
+"""Smallest angle (rad) between the two poses of a plane that counts as an ambiguity."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPose:
-    """Pose of a camera in the frame of the points, called a."""
+    """Result of `absolute_pose`: camera pose in the frame of the points (a), covariance, intrinsics and inliers."""
 
     a_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "p p"]
@@ -47,12 +47,13 @@ class CameraPose:
     camera: Intrinsics
     """Intrinsics, with the estimated focal length if free."""
     inlier: Bool[ndarray, " k"]
+    """Mask of the points that agree with the pose."""
     std_px: float
-    """Estimated standard deviation of the pixels' coordinates."""
+    """Estimated standard deviation of one pixel coordinate."""
     rms_px: float
-    """Root mean square distance of the inliers from their pixels."""
+    """Root mean square reprojection error of the inliers."""
     rival: Float[ndarray, "4 4"] | None = None
-    """Second pose of a plane that fits nearly as well; None without."""
+    """Second pose of planar points that fits nearly as well; None: there is none."""
 
 
 def absolute_pose(
@@ -65,11 +66,11 @@ def absolute_pose(
     planar: bool = False,
     loss: Loss = "cauchy",
 ) -> CameraPose | None:
-    """Return the pose that most points agree on within `gate_px`; None where fewer than six (planar: four) agree.
+    """Return the pose with the most points within `gate_px`; None if fewer than six (planar: four) agree.
 
-    `planar` states that the points lie in a plane; then both poses of the plane are refined and the better one is
-    returned. The standard deviation of the pixels is estimated from the residuals beside `point_covariance`.
-    `loss` "linear" is for detected corners, whose identity is certain.
+    `planar`: the points lie in a plane; both possible poses are refined and the better one is returned. The pixel noise
+    is estimated in addition to `point_covariance`. `focal` "free": the focal length is estimated. `loss` "linear" is for
+    detected corners, which have no wrong matches.
     """
     least, p = 4 if planar else 6, 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
@@ -103,7 +104,7 @@ def absolute_pose(
 
 
 _Start = tuple[Float[ndarray, "4 4"], Intrinsics, Bool[ndarray, " k"]]
-"""Pose a_from_camera, intrinsics and the points that agree."""
+"""Initial estimate: pose a_from_camera, intrinsics, and mask of the points that agree."""
 
 
 def _scaled(camera: Intrinsics, factor: float) -> Intrinsics:
@@ -114,9 +115,9 @@ def _scaled(camera: Intrinsics, factor: float) -> Intrinsics:
 def ransac_pose(
     x_px: Float[ndarray, "k 2"], points: Float[ndarray, "k 3"], focal_px: float, gate_px: float
 ) -> tuple[Float[ndarray, "4 4"], Bool[ndarray, " k"]] | None:
-    """Return a_from_camera by SQPNP in RANSAC, and the points that agree; None where none is found.
+    """Return a_from_camera by SQPNP in RANSAC, and the mask of agreeing points; None if no pose is found.
 
-    `x_px` are pixels from the principal point of a camera without distortion.
+    `x_px` are undistorted pixels relative to the principal point.
     """
     done, rotation, shift, rows = cv2.solvePnPRansac(
         points, x_px, np.diag([focal_px, focal_px, 1.0]), None,
@@ -138,12 +139,15 @@ def _refined(
     least: int,
     loss: Loss,
 ) -> CameraPose | None:
-    """Return the pose of least reprojection error under a loss; noise and inliers are estimated in turn."""
+    """Return the pose with the least robust reprojection error from `start`; noise and inliers are estimated in rounds.
+
+    `p` is the number of unknowns: 6, or 7 with the focal length; `least` is the smallest number of inliers.
+    """
     scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
     (pose, camera, inlier), found = start, None
     for _ in range(ROUNDS):
         residual, jacobian = _reprojection(x_px, points, pose, camera, p)
-        # A point moves the residual as the camera's translation does, with the other sign.
+        # The derivative by a point is minus the derivative by the camera's translation.
         added = jacobian[..., :3] @ spread @ np.swapaxes(jacobian[..., :3], 1, 2)
         std_px = _noise(residual[inlier], added[inlier], p)
         root = np.linalg.inv(np.linalg.cholesky(std_px**2 * np.eye(2) + added))
@@ -180,7 +184,10 @@ def _refined(
 
 
 def _noise(residual: Float[ndarray, "k 2"], added: Float[ndarray, "k 2 2"], p: int) -> float:
-    """Return the standard deviation (px) at which the whitened residuals have the median length of normal ones."""
+    """Return the pixel noise (px) for which the whitened residuals have the median length of normal errors.
+
+    `added` is the covariance of each residual by its point's error.
+    """
     values, axes = np.linalg.eigh(added)
     squared = np.einsum("kij,ki->kj", axes, residual) ** 2
     low, high = LEAST_STD_PX, max(float(np.sqrt(squared.sum(1).max())), 2 * LEAST_STD_PX)
@@ -199,7 +206,7 @@ def _reprojection(
     camera: Intrinsics,
     p: int,
 ) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 p"]]:
-    """Return the distances of projected points from their pixels, and the derivative by pose and log focal length."""
+    """Return projected minus observed pixels, and their derivative by pose (6) and log focal length (if p is 7)."""
     arm = points - pose[:3, 3]
     x_in_camera = arm @ pose[:3, :3]
     x_in_camera[x_in_camera[:, 2] <= 0] = np.nan  # a point behind the camera has no pixel

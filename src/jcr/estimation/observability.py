@@ -1,9 +1,9 @@
 """Observability of the hand-eye transform and the scale by the motions of a capture.
 
-The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over the
-images, one metre along it moves the reported gripper positions, after base_from_recon has followed as well as it can;
-rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4 for general motion, and the
-sine of the deviation for a nearly degenerate one.
+The excitation of a direction of (translation, rotation, scale) is the rms change (m) of the predicted gripper poses per
+metre along that direction, after base_from_recon is fitted again. Angles are multiplied by geometry.ARM, the scale by
+the spread of the camera centres. The excitation is about 0.4 for general motion; for a motion near a degenerate one it
+is the sine of the deviation.
 """
 
 from collections.abc import Sequence
@@ -21,20 +21,20 @@ from jcr.geometry import ARM, Poses, Transform, transform
 from jcr.records import Excitation, Observability
 
 MIN_SPREAD = 0.1
-"""Metres; camera centres closer together than this show little of scale."""
+"""Smallest assumed spread of camera centres (m), for a capture with nearly equal centres."""
 WEAK = 0.06
-"""Excitation below which a direction is named as weakly observed: 3 degrees of deviation give 0.03 to 0.05."""
+"""Excitation below which a direction is weakly observable; motion 3° off a degenerate one gives 0.03 to 0.05."""
 EXACT = 0.005
-"""Excitation below which a direction is unobservable: no better measurement would help."""
+"""Excitation below which a direction is unobservable, whatever the measurement errors."""
 
 
 def excitation(
     base_from_gripper: Poses, gripper_from_camera: Transform | None, priors: Sequence[LinearPrior] = ()
 ) -> Excitation:
-    """Return the excitation of X and λ by gripper poses (n,4,4); without an X the camera is assumed at the gripper."""
+    """Return the excitation of X and λ by n gripper poses; without an estimate of X, the camera is at the gripper."""
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
-    # An unobserved offset may have any value; the excitation hardly depends on a plausible one.
+    # The offset is limited, because an unobservable one may have any value; the excitation hardly depends on it.
     offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
     x = transform(np.eye(3), offset)
     camera = base_from_gripper @ x
@@ -59,19 +59,22 @@ def observability(
     recon_from_camera: Poses | None = None,
     priors: Sequence[LinearPrior] = (),
 ) -> Observability:
-    """Return a finding for each unobservable direction; camera poses distinguish an orbit from a fixed tool."""
+    """Return a finding for each unobservable or weakly observable direction of X and scale.
+
+    Camera poses allow to distinguish an orbit about the scene from rotations about a tool point.
+    """
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
     found = excitation(base_from_gripper, gripper_from_camera, priors)
-    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
+    # Few images have low excitation by chance: three general ones as low as twenty with 3° of deviation.
     few = min(1.0, (n - 2) / 4)
     unseen = found.value < WEAK * few
     if not unseen.any():
         return Observability()
     findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
     if found.value[0] >= EXACT * few:
-        # A weak direction has a standard deviation, and that decides (hand_eye.judged); the motions only explain it.
+        # A weak direction has a standard deviation, by which hand_eye.judged decides; the finding only explains it.
         findings = [
             replace(one, severity="warns", details={**one.details, "nearly": 1.0}) for one in findings
         ]
@@ -79,7 +82,7 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """Return a finding of a direction that a kind of motion does not show, with an axis or a point of a frame."""
+    """Return the finding that a kind of motion leaves a direction unobservable, with its axis or point in a frame."""
     where: dict[str, Any] = (
         {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )
@@ -89,7 +92,8 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 def _explained(
     base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
 ) -> list[Finding]:
-    # The mean rotation shrinks every direction that rotates; one it keeps long is a common axis.
+    """Return findings that name the degenerate motion; `unseen` is the mask of unobservable directions."""
+    # The mean of the rotation matrices preserves the length of a common axis and shortens all other directions.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():
@@ -106,11 +110,11 @@ def _explained(
         axis = translation if is_translation else rotation
         what = "translation" if is_translation else "rotation"
         return [_unseen(f"weak {what}", axis / np.linalg.norm(axis), "gripper")]
-    # A point fixed to the gripper stays where it is, which makes the scale unobservable.
+    # A point of the gripper that does not move in the base makes the scale unobservable.
     tool = still_point(base_from_gripper)[0]
     if recon_from_camera is None:
         return [_unseen("one point", tool, "gripper")]
-    # The cameras determine the point better than X, whose offset trades against the lost scale.
+    # Camera poses determine this point better than X, which is correlated with the unobservable scale.
     in_camera, moves, spread = still_point(recon_from_camera)
     if moves > 0.5 * spread:
         return [_unseen("own centre")]
@@ -120,7 +124,7 @@ def _explained(
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the point of frame b that moves least in a, its motion, and that of b's origin (rms)."""
+    """Return the point of frame b that moves least in frame a, its rms motion, and the rms motion of b's origin."""
     rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
     rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
     point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]

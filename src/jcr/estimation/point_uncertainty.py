@@ -1,9 +1,9 @@
-"""Uncertainty of points in the frames of gripper and base: of pixels at a distance, and of reconstructed points.
+"""Uncertainty of points in gripper and base frame: pixels at a known distance, and reconstructed points.
 
 A pixel x at a distance d is the point p = d·u(K, x) in the camera, with unit ray u, and X·p in the gripper. Its error
-comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale. The three were
-estimated together: an error of the principal point that a rotation of the camera compensates has no effect where both
-are used. Their joint covariance is therefore propagated (Kogan, mrcal, "Projection uncertainty").
+comes from the intrinsics K, from X and, for distances in the reconstruction, from the scale. These errors are
+correlated, since a rotation of the camera can compensate an error of the principal point, so the joint covariance is
+propagated (Kogan, mrcal, "Projection uncertainty").
 """
 
 import numpy as np
@@ -41,18 +41,18 @@ Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
 Covariances = Float[ndarray, "*points 3 3"]
 ScenePoints = tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 p 3"], Float[ndarray, "p 3 3"]]
-"""Some points in the frame of the first arm (m), their shared covariance, and that of each triangulation (m²)."""
+"""p points in the base frame (m); their covariance by camera poses (m²); covariance of each by triangulation (m²)."""
 SCENE_POINTS = 300
-"""Number of points, drawn at random, that represent a scene."""
+"""Largest number of random points that represent a scene."""
 
 
 def point_covariance(
     x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> Covariances:
-    """Return the covariance (m²) of points on the gripper, in camera axes, without the robot's pose errors.
+    """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
-    `x` is gripper_from_camera, whose uncertainty is joint with that of the `intrinsics`. `x_px` (...,2) are pixels of
-    the distorted image, `distance_m` (...) is along the ray, in the metres of the reconstruction.
+    `x` is gripper_from_camera; `uncertainty` is the joint one of X, scale and `intrinsics`. `x_px` (...,2) are pixels of
+    the distorted image, `distance_m` (...) is along the ray, and depends on the scale.
     """
     return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
 
@@ -68,8 +68,7 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
     """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariance.
 
-    `noise` is that of the reported gripper pose, in the region of the capture, whose errors add to those of intrinsics,
-    X and scale.
+    `noise` adds the errors of the gripper pose, for a pose in the workspace of the capture.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
@@ -91,14 +90,14 @@ def bounds_at(
     x_px: Float[ndarray, "2"],
     distance_m: float,
 ) -> Seen:
-    """Return the bounds of 95 % of the errors of a point: across the ray, along it, and in direction."""
+    """Return the bounds that 95 % of the errors of a pixel's point do not exceed: total, across, along ray, in angle."""
     ray = unproject(intrinsics, x_px)
-    # Two directions across the ray, and the ray: rows.
+    # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
     by_unknown, by_pixel, of_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
     by_unknown, by_pixel = axes @ by_unknown, axes @ by_pixel
     moved = _covariance(uncertainty, by_unknown, by_pixel, of_pixel)
-    # The direction is not changed by a translation; the rotation about the ray takes the place of the distance.
+    # A translation does not change the direction. The third row becomes the rotation about the ray.
     by_unknown[:, :3] = by_unknown[2] = 0.0
     by_unknown[2, 3:6] = distance_m * axes[2] @ x[:3, :3].T
     rotated = _covariance(uncertainty, by_unknown, by_pixel, of_pixel) / distance_m**2
@@ -115,9 +114,9 @@ def bounds_at(
 def seen_points(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
 ) -> SeenAndCorners:
-    """Return the uncertainty of points at the centre and the worst corner of the image.
+    """Return the point uncertainty at the centre and at the worst corner of the image, at a distance.
 
-    Camera poses that were given have no intrinsics; the ray along the optical axis is then exact.
+    `camera` None (given camera poses): the point is on the optical axis, without errors of intrinsics.
     """
     if camera is None:
         at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)
@@ -133,10 +132,10 @@ def seen_points(
 def with_given_intrinsics(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, given: Intrinsics, distance_m: float
 ) -> WithGivenIntrinsics | None:
-    """Return the transform that belongs to given intrinsics, compared with the estimate at the centre of the image.
+    """Return the gripper_from_camera to use with `given` intrinsics, and its uncertainty; None if none were estimated.
 
-    The transform is the mean of the joint distribution where the intrinsics are `given`, with a thin prism of 0 where
-    they have none. Its difference from the estimate counts as uncertainty. None where no intrinsics were estimated.
+    The transform is the conditional mean of X for the `given` intrinsics. Its difference from the estimated X counts as
+    uncertainty. The comparison is at the centre of the image, at a distance.
     """
     joint = uncertainty.joint
     if camera is None or joint is None:
@@ -145,7 +144,7 @@ def with_given_intrinsics(
     same_model = with_thin_prism(given) if camera.model == "thin_prism" else given
     off = parameters(same_model) - parameters(camera)
     step = cross @ np.linalg.pinv(of_camera, rcond=1e-12, hermitian=True) @ off
-    # The pair is used with other distances, and without the scale.
+    # The scale is not changed: the pair is used with distances that do not depend on the reconstruction.
     step[6] = 0.0
     moved = np.r_[step, off]
     pair = uncertainty.with_error(np.outer(moved, moved))
@@ -161,7 +160,7 @@ def with_given_intrinsics(
 
 
 def within_95(covariance: Float[ndarray, "n n"]) -> float:
-    """Return the bound of the length of 95 % of normal errors, to 1 % (Imhof 1961, Pearson's moments)."""
+    """Return the length that 95 % of normal errors of this covariance do not exceed, to 1 % (Imhof 1961)."""
     spread = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     mean, second, third = (float((spread**power).sum()) for power in (1, 2, 3))
     if third <= 0:
@@ -171,7 +170,7 @@ def within_95(covariance: Float[ndarray, "n n"]) -> float:
 
 
 def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
-    """Return the uncertainty of a scene as a whole, and of its shape, by some of its points."""
+    """Return the uncertainty of the scene's pose and scale as a whole, and of its shape, from some of its points."""
     in_base, shared, own = points
     middle, count = np.median(in_base, axis=0), len(in_base)
     by_step = by_similarity(in_base - middle).reshape(3 * count, 7)
@@ -190,10 +189,9 @@ def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
 
 
 def scene_points(solution: Solution) -> ScenePoints:
-    """Return some of the points of a solution with their covariance.
+    """Return up to SCENE_POINTS random points of a solution with their covariance.
 
-    The mixed model has eliminated the rigs and the points. Their covariance follows by back substitution: of the rigs
-    given the unknowns of the mixed model, then of the points given rigs and cameras.
+    The covariance follows by back substitution: of rigs given the unknowns, then of points given rigs and cameras.
     """
     likely, images = solution.most_likely, solution.images
     count = len(images.state.points_in_world)
@@ -218,7 +216,7 @@ def scene_points(solution: Solution) -> ScenePoints:
 def _triangulation(
     solution: Solution, some: Int[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of points by the columns of the images, and their covariance where these are fixed."""
+    """Return the derivative of n points by the d image columns, and the points' covariance for fixed columns."""
     images, problem = solution.images, solution.problem
     _, rows_point, rows_rig, _ = problem.rows
     rows = np.flatnonzero(np.isin(rows_point, some))
@@ -237,9 +235,9 @@ def _triangulation(
 
 
 def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
-    """Return the derivative of the columns of the images by the unknowns, and their covariance where these are fixed.
+    """Return the derivative of the d image columns by the p unknowns, and the columns' covariance for fixed unknowns.
 
-    That covariance is what images and reported poses leave of the rigs.
+    The covariance is nonzero for the arms' rigs only.
     """
     problem, equations, (follow, _, rig_covariance) = (
         solution.problem,
@@ -265,7 +263,7 @@ def _covariance(
     by_pixel: Float[ndarray, "*points 3 2"],
     of_pixel: Float[ndarray, "*points 2 2"],
 ) -> Covariances:
-    """Return the covariance of points with these derivatives."""
+    """Return the covariance (m²) of points from derivatives by j unknowns and by pixels; `of_pixel` is the pixels'."""
     of_unknowns = by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2)
     return of_unknowns + by_pixel @ of_pixel @ np.swapaxes(by_pixel, -1, -2)
 
@@ -273,9 +271,10 @@ def _covariance(
 def _derivatives(
     x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"], Float[ndarray, "*points 2 2"]]:
-    """Return derivatives of points on the gripper, in camera axes, by the joint unknowns and by their pixels.
+    """Return derivatives of points relative to the gripper, in camera axes: by j unknowns, and by pixels.
 
-    Return also the covariance of the pixels by the remaining error of the camera model.
+    The unknowns are X (6), log scale and the intrinsics, if estimated. The third result is the pixels' covariance by the
+    remaining distortion.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)
@@ -291,6 +290,6 @@ def _derivatives(
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
     if uncertainty.joint is None:
         return by_unknown, by_pixel, of_pixel
-    # The pixel is fixed: the ray compensates a change of the projection by the parameters.
+    # For a fixed pixel the ray compensates the change of the projection by the intrinsics.
     by_intrinsics = -by_pixel @ by_parameters(intrinsics, ray)
     return np.concatenate([by_unknown, by_intrinsics], axis=-1), by_pixel, of_pixel

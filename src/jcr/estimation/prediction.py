@@ -1,8 +1,8 @@
-"""Predicted uncertainty of a calibration whose images do not exist yet, and the poses that would reduce it most.
+"""Predicted uncertainty of a calibration before its images exist, and choice of the poses that reduce it most.
 
-Points are put on a surface with relief where the cameras look, and the equations are those of pose_equations.py at
-residuals of 0: the uncertainty hardly depends on the scene. Poses are added one by one, each time the one that leaves
-the least predicted uncertainty (A-optimal design: Pukelsheim, Optimal Design of Experiments, 1993, chapter 9).
+Simulated points lie on a surface with relief in front of the cameras, and all residuals are 0; the uncertainty hardly
+depends on the scene. Poses are chosen one by one, each with the least predicted uncertainty (A-optimal design:
+Pukelsheim, Optimal Design of Experiments, 1993, chapter 9).
 """
 
 from collections.abc import Callable
@@ -36,36 +36,36 @@ from jcr.least_squares import one_blas_thread
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 
 FEWEST = 3
-"""Smallest number of poses from which a calibration is predicted."""
+"""Smallest number of poses for a prediction."""
 COLUMNS = 9
-"""Columns of the grid of rays of an image that end in points of the scene."""
+"""Columns of the grid of pixels in each image whose rays give the points of the simulated scene."""
 MOST_POINTS = 400
-"""Largest number of points of a scene; with 1000 the predictions differ by 0.1 %."""
+"""Largest number of points of the simulated scene; with 1000 predictions change by 0.1 %."""
 RELIEF = 0.1
-"""Relief of the scene to either side of its surface, as a share of the working distance: objects on a table."""
+"""Amplitude of the scene's relief over the working distance, as of objects on a table."""
 TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
-"""Information (1/px²) of an image and size of the camera-model error (image widths): means of eleven captures."""
+"""Information of an image (1/px²) and size of the remaining distortion (image widths): means of eleven captures."""
 LEAST_MODEL_ERROR = 1e-9
-"""Size of the camera-model error of an exact model, image widths."""
+"""Lower bound of the size of the remaining distortion, in image widths."""
 UNCONNECTED = 1e-2
-"""Information (1/m², 1/rad²) added to the pose of each image, above the rounding of the elimination."""
+"""Information (1/m², 1/rad²) added to all image columns, against rounding for images without common points."""
 SAME_FEATURE = np.radians(40.0), 2.0
-"""Largest rotation of the line of sight and largest ratio of distances at which a matcher finds a feature again."""
+"""Largest angle (rad) between lines of sight, and ratio of distances, at which a feature is matched again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictedCamera:
-    """A camera with the prior of its intrinsics, and the information of its images."""
+    """Camera of a prediction: prior of its intrinsics, and information per image."""
 
     camera: CameraPrior
     information_per_px2: float = TYPICAL_INFORMATION
-    """Mean over the images of the sum of the inverse variances of the observations of one coordinate."""
+    """Sum of the weights (1/px²) of an image's observations, mean over the images."""
     model_error: float = TYPICAL_MODEL_ERROR
-    """Size of the remaining distortion of the camera's model, in widths of the image."""
+    """Size of the remaining distortion of the camera's model, in image widths."""
 
     @staticmethod
     def of(solution: Solution) -> "PredictedCamera":
-        """Return the first camera of a solution, whose next images are like those of the solution."""
+        """Return the first camera of a solution, assuming that further images are like its images."""
         images, problem = solution.images, solution.problem
         own = problem.columns.model_error[0]
         return PredictedCamera(
@@ -77,24 +77,25 @@ class PredictedCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions:
-    """Quantities besides the gripper poses that determine the uncertainty of a calibration."""
+    """Assumptions of a prediction, apart from the gripper poses: hand-eye transform, distance, noise, camera, scale."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     distance_m: float
     """Distance from the camera to the scene."""
     noise: RobotNoise
+    """Errors of the gripper poses."""
     camera: PredictedCamera | None = None
-    """None: the camera poses are given, and exact."""
+    """None: the camera poses are given and exact."""
     scale_std: float | None = None
-    """Relative standard deviation of a scale that is known beforehand; None: unknown."""
+    """Relative standard deviation of a known scale; None: the scale is unknown."""
     faults: Float[ndarray, "7 7"] | None = None
-    """Covariance that findings add; None: nothing."""
+    """Covariance of X and scale that findings add; None: nothing."""
 
 
 def assumed(
     base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None = None
 ) -> Assumptions:
-    """Return assumptions before any result: a usual robot, and a camera at its gripper.
+    """Return assumptions before any calibration: typical robot errors, and a camera at the gripper.
 
     `noise` (m, rad) is a lower bound on the random errors of the robot.
     """
@@ -121,9 +122,9 @@ def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
 def typical_camera(
     intrinsics: Intrinsics | None, size: tuple[int, int], std: Float[ndarray, " q"] | None = None
 ) -> PredictedCamera:
-    """Return a camera whose images are not matched yet.
+    """Return a typical camera of a prediction, before any images are matched.
 
-    `size` is width and height (px), `std` the standard deviations that `camera_about` takes.
+    `size` is (width, height) in px; `std` are standard deviations of given `intrinsics`, as in `camera_about`.
     """
     camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
@@ -133,9 +134,9 @@ def typical_camera(
 def predict(
     assumptions: Assumptions, base_from_gripper: Poses, systematic: Float[ndarray, "s s"]
 ) -> Uncertainty:
-    """Return the uncertainty that a calibration from these gripper poses is predicted to report.
+    """Return the predicted uncertainty of a calibration from these n gripper poses.
 
-    `systematic` is the covariance of their systematic errors at 1 rad.
+    `systematic` (6n,6n) is the covariance of their systematic errors for a size σ_s of 1 rad.
     """
     camera, x = None, assumptions.gripper_from_camera
     if assumptions.camera is None:
@@ -155,9 +156,9 @@ def predict_covariance(
     systematic: Float[ndarray, "s s"],
     averaged: bool = True,
 ) -> Float[ndarray, "7 7"]:
-    """Return the predicted covariance of X and scale from exact, metric camera poses.
+    """Return the predicted covariance of X and scale for exact camera poses in metres.
 
-    Without `averaged` it is the covariance where the sizes of the robot's errors are known.
+    `averaged`: over the sizes of the robot's errors; else these are known exactly.
     """
     x, noise = assumptions.gripper_from_camera, assumptions.noise
     problem, state = pose_problem(
@@ -181,7 +182,7 @@ def _predicted_solution(
     systematic: Float[ndarray, "s s"],
 ) -> Solution:
     """Return the predicted solution of a problem with images of a simulated scene."""
-    # Far outside the image a distortion may fold; its size hardly changes how well it becomes known.
+    # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
     straight = parameters(camera.camera.intrinsics)
     straight[4:] = 0.0
     intrinsics = with_parameters(camera.camera.intrinsics, straight)
@@ -208,17 +209,17 @@ def _predicted_solution(
 
 
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
-    """Return points where the rays of a grid in each image meet the scene, and their observations.
+    """Return simulated points, where the rays of a pixel grid in each image meet the scene, and their observations.
 
-    An image shows a point that is inside it where a matcher finds it: from about where its source camera is.
+    An image observes a point inside it if direction and distance are similar to those of the point's source image.
     """
     size = np.array([intrinsics.width, intrinsics.height])
     rows = max(2, round(COLUMNS * intrinsics.height / intrinsics.width))
     grid = np.stack(np.meshgrid(np.arange(COLUMNS) + 0.5, np.arange(rows) + 0.5), axis=-1).reshape(-1, 2)
     rays = unproject(intrinsics, grid / [COLUMNS, rows] * size)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # The surface is across the mean optical axis; rays along it end at twice its distance. The relief is a pattern of
-    # the rays, alike in all images.
+    # The surface is perpendicular to the mean optical axis; no ray is longer than twice the distance. The relief is the
+    # same function of the ray in all images.
     centre, axis = cameras[:, :3, 3], cameras[:, :3, 2]
     normal = axis.mean(0)
     normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
@@ -246,20 +247,20 @@ def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) 
 
 
 CANDIDATES = 600
-"""Number of candidate poses."""
+"""Number of candidate gripper poses."""
 SCENE_DISTANCE = (0.1, 2.0)
 """Smallest and largest distance of a scene (m)."""
 UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""Errors that count alike: 1 mm, 0.1°, 0.2 % of scale."""
+"""Errors of X and scale with equal weight: 1 mm, 0.1°, 0.2 %."""
 
 
 def choose_poses(
     count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]
 ) -> list[int]:
-    """Return the rows of `count` candidates, chosen one by one, best first.
+    """Return the rows of `count` candidates, chosen greedily, best first.
 
-    `uncertainty_of` returns the uncertainty that some rows leave, which the next row reduces most. A candidate gains
-    less after others are chosen, so only those with the largest earlier gains are evaluated again (accelerated greedy
+    `uncertainty_of` returns the uncertainty after the poses of some rows are added; each choice reduces it most. Gains
+    fall as poses are added, so only candidates with the largest earlier gains are evaluated again (accelerated greedy
     selection: Minoux, Optimization Techniques, 1978).
     """
     chosen, gain = list[int](), np.full(candidates, np.inf)
@@ -275,10 +276,9 @@ def choose_poses(
 
 
 def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "3"] | None = None) -> float:
-    """Return the sum of the variances of camera, rotation and scale in UNIT.
+    """Return the sum of the variances of X and scale, each divided by its UNIT squared.
 
-    With a `point` (m, from the camera in gripper axes) its place, which the scale moves, counts instead of camera and
-    scale.
+    With a `point` (m, from the camera in gripper axes), the variances of its position and of the rotation are summed.
     """
     counted = np.eye(7) / UNIT[:, None]
     if point is not None:
@@ -290,7 +290,7 @@ def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:
     """Return the Fisher information of each gripper pose about the 13 unknowns, for random errors (m, rad)."""
-    # The frame and unit of the reconstruction are arbitrary: those of the base, in metres.
+    # The frame of the reconstruction is arbitrary; here it is the base frame, in metres.
     camera = base_from_gripper @ gripper_from_camera
     _, j = pose_residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
     j /= np.repeat(noise, 3)[:, None]
@@ -298,16 +298,16 @@ def pose_information(
 
 
 def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
-    """Return the row of the existing pose that each pose is nearest to."""
+    """Return for each pose the row of the nearest existing pose."""
     return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
 def candidate_poses(
     base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
 ) -> Float[ndarray, "k 4 4"]:
-    """Return gripper poses whose cameras look at the scene from about as far as the capture did.
+    """Return random gripper poses with the camera looking at the scene, at distances similar to those of the capture.
 
-    `reach` is the box (m, base) that gripper positions stay in; None: the box of the capture enlarged by a quarter.
+    `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the capture, enlarged by a quarter.
     """
     camera = base_from_gripper @ x
     center = camera[:, :3, 3]
@@ -327,7 +327,7 @@ def candidate_poses(
         aim = scene + rng.uniform(-0.04, 0.04, (n, 3))
         position = aim + far[:, None] * away
         rotation = tilt @ camera[like, :3, :3]
-        # The shortest rotation that takes the z axis onto the line of sight.
+        # The smallest rotation turns the z axis onto the line of sight.
         to_aim = (aim - position) / far[:, None]
         cross = np.cross(rotation[:, :, 2], to_aim)
         sine = np.linalg.norm(cross, axis=1, keepdims=True)
@@ -336,7 +336,7 @@ def candidate_poses(
         roll = rotation_exp(rng.uniform(-np.pi / 3, np.pi / 3, n)[:, None] * [0.0, 0.0, 1.0])
         gripper = transform(rotation @ roll, position) @ inverse(x)
         inside = ((gripper[:, :3, 3] >= reach[0]) & (gripper[:, :3, 3] <= reach[1])).all(1)
-        # In a box that hardly any view fits in the search would not end, so the box grows little by little.
+        # The box grows slowly, so that the search ends also in a box with hardly any possible pose.
         kept = np.concatenate([kept, gripper[inside]])
         widening *= 1.05
         reach = np.stack([reach[0] - 0.002 * widening, reach[1] + 0.002 * widening])
@@ -344,7 +344,7 @@ def candidate_poses(
 
 
 def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
-    """Return the point nearest to all optical axes, and the distance of each camera from it (m)."""
+    """Return the scene centre, the point nearest to all optical axes, and each camera's distance from it (m)."""
     axis, center = camera[:, :3, 2], camera[:, :3, 3]
     scene = nearest_to_lines(center, axis)
     distance = np.linalg.norm(center - scene, axis=1)
@@ -356,15 +356,15 @@ def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
 
 
 def median_distance(camera: Poses) -> float:
-    """Return the median distance (m) of cameras in the base frame from the scene."""
+    """Return the median distance (m) of the cameras (poses in the base frame) from the scene centre."""
     return float(np.median(scene_of(camera)[1]))
 
 
 def assumed_camera(base_from_gripper: Poses) -> Transform:
-    """Return an assumed gripper_from_camera: a camera at the gripper that looks along one of the gripper's axes.
+    """Return an assumed gripper_from_camera: a camera at the gripper's origin that looks along one of its axes.
 
-    The axis is the one whose lines over all poses pass nearest to a common point, relative to the distance of that
-    point: views of one scene have such a point.
+    All views look at one scene, so the axis is chosen whose lines over all poses pass nearest to a common point,
+    relative to the distance of the point.
     """
     center, best, least = base_from_gripper[:, :3, 3], np.eye(3)[2], np.inf
     for axis in np.concatenate([np.eye(3)[::-1], -np.eye(3)[::-1]]):
