@@ -1,1 +1,1 @@
-"""Every camera of a robot cell in one frame: fixed ones, several on a wrist, and those of another arm."""
+"""Calibration of all cameras of a robot cell in one frame: fixed, on the same wrist, and on other arms."""

@@ -1,4 +1,4 @@
-"""Cameras added to a run after its calibration: copies of their images in the run folder."""
+"""Fixed cameras that are added to a run after its calibration; their images are copied to the run folder."""
 
 import json
 import re
@@ -15,10 +15,11 @@ from jcr.records import Capture, CellCamera
 from jcr.records.capture_json import NAME
 
 FOLDER, FILE = "cameras", "cameras.json"
+"""Folder of the added cameras' images in the run folder, and the file of the cameras in it."""
 
 
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
-    """Read the cameras added to a run; raise InputError where their file or an image was damaged."""
+    """Read the cameras that were added to a run; raise InputError if their file or an image is damaged."""
     folder = run_folder / FOLDER
     if not (folder / FILE).is_file():
         return ()
@@ -35,10 +36,10 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
 def added_camera(
     name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str], folder: Path
 ) -> CellCamera:
-    """Return a fixed camera of image files, copied to `folder`; raise InputError where they cannot be of one camera.
+    """Return a fixed camera with images copied to `folder`; raise InputError if the files cannot be of one camera.
 
-    `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
-    that other cameras have.
+    `intrinsics` is a JSON file with the intrinsics as in capture.json, at the top level or under "intrinsics". `taken`
+    are the names of the other cameras.
     """
     if not re.fullmatch(NAME, name):
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
@@ -57,7 +58,7 @@ def added_camera(
 
 
 def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> None:
-    """Make the camera part of the run: its images copied, its entry written."""
+    """Add the camera to the run folder: copy its images and write its entry."""
     folder = run_folder / FOLDER
     for image in camera.images:
         write_bytes(folder / image, ((camera.folder or capture.folder) / image).read_bytes())

@@ -1,8 +1,8 @@
 """Removal of the static background from the images of a fixed camera.
 
-Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many images
-show the same colour at a pixel, that is what stands there; an image keeps what differs from it, and fades to grey
-elsewhere, softly, for a sharp border would be a feature of its own.
+The background often has more features than the object in the gripper. A pixel's background is the colour that many
+images share. Each image keeps the pixels that differ from the background and fades to grey elsewhere, smoothly, because
+a sharp border would produce features.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,15 @@ from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
 
 LEVELS = 14.0
-"""Least difference (of 255) of two colours that are not the same; noise and JPEG are less, after averaging."""
+"""Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
 REDUCED = 320
-"""px across, at which images are compared."""
+"""Width (px) at which images are compared."""
 LEAST_SHARE, LEAST = 0.3, 3
-"""Share and number of the images that must agree on a pixel of the background."""
+"""Smallest share and number of images that must agree on a background pixel."""
 GREY = 128
+"""Grey level of the removed background."""
 GROWN, SOFT = 0.012, 0.008
-"""Growth of the moving part, and sigma of the fading around it, as shares of the width."""
+"""Dilation of the moving part, and sigma of the blur of its border, as shares of the image width."""
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
@@ -49,10 +50,10 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
 
 
 def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w 3"], ndarray]:
-    """Return at each pixel the colour on which most images agree, and whether enough of them do."""
+    """Return for each pixel the colour of most images, and a mask of the pixels where enough images agree."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
-    )  # (n,h,w): images like each
+    )  # (n,h,w): number of images with the same colour as each image
     best = agreeing.argmax(0)
     rows, columns = np.indices(best.shape)
     enough = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(reduced))
@@ -60,6 +61,6 @@ def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w
 
 
 def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
-    """Write those of the images of a folder under the same names in another; PNG, whatever the names end with."""
+    """Write the images `names` of `source`, background removed, to `folder` with the same names; PNG in any case."""
     for name, image in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
         write_bytes(folder / name, encode_png(image))

@@ -1,9 +1,8 @@
-"""Eye-to-hand: a fixed camera that watches what the gripper carries. The hand-eye equation with its roles exchanged.
+"""Eye-to-hand calibration: a fixed camera observes an object in the gripper.
 
-In the frame of the carried object the camera moves as a wrist camera does in the base: with the inverse gripper poses
-everything that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only
-the robot's errors are not those of inverse poses, so that the answer and its covariance are found once more with the
-errors where they are (estimation/pose_equations.py).
+In the frame of the object the camera moves like a wrist camera moves in the base frame. With inverse gripper poses, a
+fixed camera is therefore calibrated like a wrist camera. Robot errors are errors of the gripper poses, not of their
+inverses, so the result and its covariance are estimated again with the actual poses (estimation/pose_equations.py).
 """
 
 from dataclasses import replace
@@ -25,10 +24,10 @@ from jcr.records import Capture, Reconstruction
 
 
 def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
-    """Return the capture of a fixed camera as that of a camera that moves about the carried object.
+    """Return the capture of a fixed camera as a capture of a camera that moves around the carried object.
 
-    Base and gripper are exchanged. The arm's name, URDF and joints are left out, for the kinematics are those of the
-    poses as they were. Images without the static background are written to the folder `moving`, and taken from there.
+    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses. Images
+    without the static background are written to the folder `moving` and used, if it is given.
     """
     if moving is not None:
         write_moving_parts(capture.folder, capture.images, moving)
@@ -50,10 +49,10 @@ def refined(
     found: Calibration,
     options: CalibrateOptions | None = None,
 ) -> Calibration:
-    """Refine the calibration of the exchanged capture with the errors of the reported gripper poses.
+    """Return the calibration `found` from inverse gripper poses after refinement with the reported gripper poses.
 
-    The result is that of a camera mounted on the base; residuals are of the gripper poses as they were reported. One
-    that is rejected stays as it was, or is named as a camera on the gripper.
+    The result is for a camera fixed to the base. A rejected calibration is not refined; it gets the finding WRONG_MOUNT
+    if the camera turns out to be on the gripper.
     """
     options = options or CalibrateOptions()
     rows = reconstruction.image_index

@@ -1,4 +1,4 @@
-"""All images of a cell, those of the capture's own camera first, and how they are adjusted with its arms."""
+"""Estimation problem of a whole cell: images of all cameras, the capture's own first, and poses of all arms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
-"""Standard deviation (m, rad) of given poses, beside what is known of their errors."""
+"""Standard deviation (m, rad) added to the covariance of given camera poses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellImages:
-    """Problem and initial state of a cell; cameras by their numbers, the capture's own is 0."""
+    """Estimation problem of a cell, its initial state and observations; camera 0 is the capture's own."""
 
     problem: Problem
-    """Without its observations."""
+    """Problem without its observations."""
     state: State
     observations: Observations
 
     def solved(self) -> Solution:
-        """Adjust images and arms together."""
+        """Return the joint solution of all images and arms."""
         return solve(*with_observations(self.problem, self.state, self.observations))
 
     def with_freed(
@@ -39,9 +39,10 @@ class CellImages:
         arm: int | None = None,
         errors: Float[ndarray, "s b"] | None = None,
     ) -> "CellImages":
-        """Return the cell with combinations of the columns of a camera's hypotheses.Alternatives free, too.
+        """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
 
-        The poses of an arm have confirmed `errors` of one standard deviation each.
+        `combinations` (e,p) are columns over the parameters of hypotheses.Alternatives. `errors` (s,b) are pose errors
+        by confirmed effects of one standard deviation each.
         """
         problem = self.problem
         if combinations is not None:
@@ -55,13 +56,13 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return all images; those of the further cameras follow the own camera's, camera by camera, as they are used.
+    """Return the problem of a cell: images of the capture's own camera, then the used images of each other camera.
 
-    Given intrinsics that the own camera's images contradict count as estimated.
+    Given intrinsics of the own camera are not used as a prior if its images contradict them.
     """
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
-    # Where bundle adjustment did not decide the calibration, the images' own geometry is not used here either.
+    # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
     if hand_eye.source == "poses" or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
         prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
     rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
@@ -87,7 +88,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
     for member in members:
         own = member.camera
         prior_of_it = camera_about(member.intrinsics, own.intrinsics is not None, own.intrinsics_std)
-        # A mount is free only beside another camera on its rig.
+        # A mount is estimated only for a camera that shares its rig with another camera.
         cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
         mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
     arms, starts = rigs.arm_poses()
@@ -119,7 +120,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:
-    """Return the distribution of the used images' poses, where other than features found in the images decided them."""
+    """Return the distribution of the own camera's used poses, for poses that do not come from image features."""
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:

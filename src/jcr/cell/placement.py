@@ -1,4 +1,4 @@
-"""Placement of further cameras and arms of a cell: the records, and their file cameras.json."""
+"""Records of the placement (pose in the cell) of further cameras and arms, and their file cameras.json."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -29,15 +29,15 @@ FILE, FORMAT = "cameras.json", "jcr.cameras/1"
 
 
 class TransformUncertainty(Part):
-    """One-sigma uncertainty of a transform, along axes of its parent frame."""
+    """Uncertainty (one sigma) of a transform, along the axes of its parent frame."""
 
     translation_std_mm: Spread3
     rotation_std_deg: Spread3
     covariance: Covariance6
-    """Covariance of the step (geometry.retract) to the true transform: translation (m) and rotation vector (rad), in
-    axes of its parent."""
+    """Covariance of the step (geometry.retract) to the true transform: translation (m), then rotation vector (rad), in
+    axes of the parent frame."""
     at_scene_mm: Spread | None = None
-    """One sigma along the worst axis of a point `scene_distance_m` before the camera."""
+    """One sigma, along the worst axis, of a point on the optical axis at `scene_distance_m`."""
     scene_distance_m: Spread | None = None
 
     @classmethod
@@ -47,7 +47,7 @@ class TransformUncertainty(Part):
         parent_from_camera: Float[ndarray, "4 4"] | None = None,
         scene_distance_m: float | None = None,
     ) -> "TransformUncertainty":
-        """Return the uncertainty; for a camera also that of a point on its optical axis at a distance (m)."""
+        """Return the record of a covariance; with a pose and distance (m), also that of a point on the optical axis."""
         std, at_scene = np.sqrt(np.diag(covariance)), None
         if parent_from_camera is not None and scene_distance_m is not None:
             by_step = np.hstack([np.eye(3), -skew(scene_distance_m * parent_from_camera[:3, 2])])
@@ -62,7 +62,7 @@ class TransformUncertainty(Part):
 
     @property
     def in_words(self) -> str:
-        """Standard deviations as one line."""
+        """Standard deviations in one line of text."""
         x, y, z = self.translation_std_mm
         rx, ry, rz = self.rotation_std_deg
         scene = ""
@@ -72,24 +72,24 @@ class TransformUncertainty(Part):
 
 
 class ImageUse(Part):
-    """Use of one image of a further camera."""
+    """Use of one image of a further camera in its placement."""
 
     image: str
     used: bool
     points: int
-    """Points shared with the images of the capture's own camera."""
+    """Number of points shared with the images of the capture's own camera."""
     reprojection_px: float | None
     reason: str | None
     """Reason why the image was not used."""
 
 
 class CameraPlacement(Part):
-    """Pose of one further camera; without transforms where it was not placed."""
+    """Placement of one further camera: pose, uncertainty, intrinsics, findings; no pose if it could not be placed."""
 
     name: str
     mount: Mount
     arm: str | None
-    """null: the capture's own arm."""
+    """Name of the camera's arm; null: the capture's own arm."""
     base_from_camera: Matrix | None = None
     """Pose of a fixed camera; null for one on a gripper."""
     gripper_from_camera: Matrix | None = None
@@ -103,7 +103,7 @@ class CameraPlacement(Part):
     """Verdict of the worst finding."""
     converged: bool
     warnings: list[str]
-    """Findings that reject or warn, in words."""
+    """Messages of the findings that reject or warn."""
 
     @classmethod
     def of(
@@ -115,10 +115,10 @@ class CameraPlacement(Part):
         px: Mapping[int, float] = {},
         **placed: Any,
     ) -> "CameraPlacement":
-        """Return the placement of a camera with its findings; `placed` are transform, uncertainty and intrinsics.
+        """Return the placement of a camera with its findings; `placed` are fields: transform, uncertainty, intrinsics.
 
-        `points` are the shared points of each image, `px` the reprojection errors of the used ones, and `reasons` why
-        others are not used.
+        `points` has the number of shared points of each image. By image number, `px` has the reprojection errors (px) of
+        used images, and `reasons` the reasons why other images are not used.
         """
         images = [
             ImageUse(
@@ -135,7 +135,7 @@ class CameraPlacement(Part):
 
     @model_validator(mode="after")
     def _is_whole(self) -> "CameraPlacement":
-        """Check that transform, uncertainty and findings belong together."""
+        """Check that transform, uncertainty, findings and verdict are consistent; raise ValueError if not."""
         if (self.parent_from_camera is None) is not (self.uncertainty is None):
             raise ValueError("a transform without its uncertainty, or the other way round")
         if self.base_from_camera is not None and self.mount == "gripper":
@@ -147,23 +147,23 @@ class CameraPlacement(Part):
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"] | None:
-        """base_from_camera of a fixed camera, else gripper_from_camera of its own arm."""
+        """Pose base_from_camera of a fixed camera, else gripper_from_camera; None if not placed."""
         pose = self.base_from_camera if self.mount == "base" else self.gripper_from_camera
         return None if pose is None else np.array(pose)
 
     @property
     def covariance(self) -> Float[ndarray, "6 6"] | None:
-        """Covariance of the transform."""
+        """Covariance (6,6) of `parent_from_camera`; None if not placed."""
         return None if self.uncertainty is None else np.array(self.uncertainty.covariance)
 
     @property
     def doubt(self) -> str | None:
-        """Reason of the rejection; None where it is accepted."""
+        """Reason of the rejection; None if the placement is accepted."""
         return doubt_of(self.findings)
 
     @property
     def in_words(self) -> list[str]:
-        """A few lines for the terminal."""
+        """Lines of text for the terminal: pose, uncertainty, warnings, unused images."""
         if self.parent_from_camera is None or self.uncertainty is None:
             return [f"{self.name}: not placed: {self.doubt}"]
         arm = "" if self.arm is None else f" of arm {self.arm}"
@@ -181,16 +181,16 @@ class CameraPlacement(Part):
 
 
 class ArmPlacement(Part):
-    """Pose of the base of another arm."""
+    """Placement of another arm: pose of its base in the base frame of the capture's own arm."""
 
     name: str
     base_from_other_base: Matrix
-    """The transform from its base to that of the capture's own arm."""
+    """Pose of the other arm's base in the base frame of the capture's own arm."""
     uncertainty: TransformUncertainty
 
 
 class CamerasFile(Part):
-    """Content of cameras.json."""
+    """Content of the file cameras.json: placements of all further cameras and arms."""
 
     format: Literal["jcr.cameras/1"] = FORMAT
     cameras: list[CameraPlacement]
@@ -203,9 +203,10 @@ class CamerasFile(Part):
         found: CameraPlacement,
         base_from_gripper: Mapping[int, Float[ndarray, "4 4"]],
     ) -> list[Float[ndarray, "4 4"]]:
-        """Return base_from_camera of every used image of a placed camera whose gripper pose is known.
+        """Return base_from_camera of every used image of a camera, as far as its gripper poses are available.
 
-        `base_from_gripper` is that of the capture's own arm, by the row of the capture.
+        `base_from_gripper` has poses of the capture's own arm by image number of the capture. The list is empty if the
+        camera was not placed.
         """
         parent_from_camera = found.parent_from_camera
         names = {image.image for image in found.images if image.used}
@@ -219,20 +220,20 @@ class CamerasFile(Part):
         return [base_from_gripper[row] @ parent_from_camera for row in rows if row in base_from_gripper]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content as it is written."""
+        """Return the content as a JSON object, with the names of the file."""
         return self.model_dump(by_alias=True)
 
 
 @dataclass(frozen=True)
 class CellPlacement:
-    """Placement of all further cameras and arms, with the solution that it comes from."""
+    """Placement of all further cameras and arms, with the underlying solution."""
 
     cameras: tuple[CameraPlacement, ...]
     arms: tuple[ArmPlacement, ...] = ()
     solution: "Solution | None" = None
-    """None where no camera could be placed."""
+    """Joint solution of the cell; None if no camera was placed."""
     poses: "dict[str, Callable[[State], Float[ndarray, '4 4']]]" = field(default_factory=dict)
-    """parent_from_camera of each placed camera as a function of the solution's state."""
+    """Function for each placed camera, by name, that returns parent_from_camera from a state."""
 
     def file(self, version: str) -> CamerasFile:
         """Return the content of cameras.json."""
@@ -240,12 +241,12 @@ class CellPlacement:
 
 
 def write_cameras(folder: Path, content: CamerasFile) -> None:
-    """Write cameras.json of a run folder, whole or not at all."""
+    """Write cameras.json to a run folder, atomically."""
     write_text(folder / FILE, json.dumps(content.as_json(), indent=2, allow_nan=False) + "\n")
 
 
 def read_cameras(folder: Path) -> CamerasFile | None:
-    """Read cameras.json of a run folder, None where it has none; raise InputError where it was damaged."""
+    """Read cameras.json of a run folder, None if there is no such file; raise InputError if it is damaged."""
     file = folder / FILE
     if not file.is_file():
         return None
@@ -259,7 +260,7 @@ def read_cameras(folder: Path) -> CamerasFile | None:
 
 
 def in_words(content: CamerasFile) -> list[str]:
-    """Return a few lines for each camera and arm."""
+    """Return lines of text for the terminal for each camera and arm."""
     lines = [line for camera in content.cameras for line in camera.in_words]
     for arm in content.arms:
         rows = _rows(np.array(arm.base_from_other_base))
@@ -268,6 +269,6 @@ def in_words(content: CamerasFile) -> list[str]:
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[str]:
-    """Return a matrix as indented lines."""
+    """Return a transform as four indented lines of text."""
     with np.printoptions(precision=6, suppress=True):
         return [f"  {row}" for row in str(a_from_b).splitlines()]

@@ -1,7 +1,7 @@
-"""Images of further cameras, localised in the reconstruction, and the rigs on which they move.
+"""Localisation of further cameras' images in the reconstruction, and their rigs (camera poses that move together).
 
-Rigs are the places of the capture's own camera, of fixed cameras, and of the cameras of other arms. A camera whose
-images contradict how it is mounted is refused here, before anything is adjusted.
+There is a rig for each used pose of the capture's own camera, for each fixed camera, and for each pose of another arm's
+camera. A camera whose images contradict its stated mount is rejected here, before the joint adjustment.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,28 +29,28 @@ from jcr.records import CellCamera, Intrinsics
 from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
 
 CLEARLY_MORE = 1.1
-"""Factor of the points that agree with given intrinsics, from which RANSAC alone does not explain more."""
+"""Ratio of RANSAC inliers with estimated over given focal length, above which the given one is wrong."""
 SAME_PLACE = (0.02, np.radians(2.0))
-"""m, rad: gripper poses that differ by less are one."""
+"""Difference (m, rad) below which two gripper poses are equal."""
 MAP_STD = (4e-3, np.radians(0.25))
-"""m, rad: standard deviations of a place by errors of map and intrinsics, which its covariance does not contain."""
+"""Standard deviations (m, rad) of a localised pose by errors of map and intrinsics, not in its covariance."""
 APART = float(chi2.isf(1e-6, 6))
-"""Squared Mahalanobis distance from which two places of a camera differ."""
+"""Squared Mahalanobis distance above which two poses of a camera differ."""
 AT_A_FRAME = (0.01, np.radians(1.0))
-"""m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
+"""Distance (m, rad) to a pose of the wrist camera below which a camera stated as fixed is likely the wrist camera."""
 EXACT_SCALE = 1e-4
-"""Relative standard deviation of the scale between two cameras in one reconstruction."""
+"""Assumed relative standard deviation of the scale between two cameras of one reconstruction."""
 LEAST_POSES = 3
-"""Fewest images of another arm, or of another camera on the gripper."""
+"""Smallest number of localised images of another arm's camera."""
 
 
 def localise(
     known: KnownImages, image: UInt8[ndarray, "h w 3"], camera: CellCamera
 ) -> tuple[Registration | None, int]:
-    """Return the registration of an image, None where too few points are shared, and the number of shared points.
+    """Return the registration of an image in the reconstruction and the number of shared points; None if too few.
 
-    A focal length is estimated where none is given, or where another one explains clearly more points: wrong intrinsics
-    leave the points that agree with a wrong pose.
+    The focal length is estimated if none is given, or if another value gives clearly more inliers, because wrong
+    intrinsics give a wrong pose with fewer inliers.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
@@ -64,28 +64,29 @@ def localise(
 
 
 def _count(found: Registration | int) -> int:
-    """Return the number of shared points."""
+    """Return the number of shared points of a registration, or of a failed one (the number itself)."""
     return len(found.x_px) if isinstance(found, Registration) else found
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraViews:
-    """Used images of one camera by their numbers, the rigs that they belong to, and why others are not used."""
+    """Images of one further camera: registrations of the used ones, their rigs, and reasons for the unused ones."""
 
     camera: CellCamera
     points: Sequence[int]
     """Number of points that each image shares with the scene."""
     used: Mapping[int, Registration]
+    """Registrations of the used images, by image number."""
     reasons: Mapping[int, str]
-    """Reasons why images are not used, by their numbers."""
+    """Reasons why images are not used, by image number."""
     rig: Int[ndarray, " k"] = field(default_factory=lambda: np.zeros(0, int))
-    """Rig of each used image, once the camera is mounted."""
+    """Rig of each used image; empty before `Rigs.add`."""
     rig_from_camera: Float[ndarray, "4 4"] | None = None
-    """Pose on the rig; None for the rig's first camera."""
+    """Pose of the camera on its rig; None for the first camera of a rig."""
     number: int = 1
-    """Number among the adjusted cameras; the capture's own is 0."""
+    """Number of the camera in the estimation problem; the capture's own camera is 0."""
     arm: int | None = None
-    """Number of its arm; None for a fixed camera."""
+    """Number of the camera's arm in the estimation problem; None for a fixed camera."""
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -100,45 +101,42 @@ class CameraViews:
 
     @property
     def places(self) -> Float[ndarray, "k 4 4"]:
-        """recon_from_camera of the used images."""
+        """Poses recon_from_camera of the used images."""
         return np.stack([one.pose.a_from_camera for one in self.used.values()])
 
     @property
     def covariances(self) -> Float[ndarray, "k 6 6"]:
-        """Covariances of the steps of `places`."""
+        """Covariances of the steps of `places` (m, rad)."""
         return np.stack([one.pose.covariance[:6, :6] for one in self.used.values()])
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Given intrinsics, or those of the image with most points."""
+        """Given intrinsics, else those estimated from the image with most inliers."""
         given, _ = usable_intrinsics(self.camera.intrinsics)
         return given or max(self.used.values(), key=_count).pose.camera
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":
-        """Return the views without further images, which are not used for these reasons."""
+        """Return the views after the images with the numbers in `reasons` are removed from the used ones."""
         used = {k: one for k, one in self.used.items() if k not in reasons}
         return replace(self, used=used, reasons={**self.reasons, **reasons})
 
     def refused(
         self, why: FindingKind | Sequence[Finding], concerns: Concerns = "none", *images: str, **numbers: Any
     ) -> CameraPlacement:
-        """Return the camera rejected for findings, or for one as Finding.of makes it."""
+        """Return a rejected placement with these findings, or with one finding of a kind, made by Finding.of."""
         if isinstance(why, FindingKind):
             why = (Finding.of(why, "rejects", concerns, *images, **numbers),)
         return CameraPlacement.of(self.camera, why, self.points, self.reasons)
 
     def parent_from_camera(self, state: State) -> Float[ndarray, "4 4"]:
-        """Return base_from_camera of a fixed camera, else gripper_from_camera."""
+        """Return base_from_camera of a fixed camera, else gripper_from_camera, for a state of the solution."""
         if self.arm is None:
             return state.z[0] @ scale_translation(state.world_from_rig[self.rig[0]], state.scale)
         return state.x[self.arm] @ scale_translation(state.rig_from_camera[self.number], state.scale)
 
 
 def known_images(case: Case) -> KnownImages:
-    """Return the used images of the own camera with their features and their poses.
-
-    Their poses are in metres: the equations that follow are better for it, and distances can be spoken of.
-    """
+    """Return the used images of the capture's own camera with their features and their poses in metres."""
     capture, reconstruction, used = case.capture, case.reconstruction, case.used
     images = [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index[used]]
     places = scale_translation(reconstruction.recon_from_camera[used], case.hand_eye.scale)
@@ -146,9 +144,9 @@ def known_images(case: Case) -> KnownImages:
 
 
 class Rigs:
-    """Rigs: the capture's own camera at each used image, then those that other cameras add.
+    """All rigs of a cell: poses of the capture's own camera at each used image, then rigs of the added cameras.
 
-    `case` is the calibration of the own camera, `known` its used images with poses in metres.
+    `case` is the calibration of the own camera, `known` are its used images with poses in metres.
     """
 
     def __init__(self, case: Case, known: KnownImages) -> None:
@@ -158,7 +156,7 @@ class Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Add the images of a camera to the rigs; return a rejected placement where it cannot be placed."""
+        """Assign the images of a camera to rigs, new ones if needed; return a rejected placement if this fails."""
         if not seen.used:
             most = int(np.argmax(seen.points))
             best, count = seen.camera.images[most], float(seen.points[most])
@@ -179,6 +177,7 @@ class Rigs:
         return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
+        """Assign the images of another camera on the own gripper to the rigs of the images taken with them."""
         assert seen.camera.frame is not None
         capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}
         frame = {k: int(seen.camera.frame[k]) for k in seen.used}
@@ -221,6 +220,7 @@ class Rigs:
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
+        """Add a rig for each used image of the camera of another arm, after a hand-eye fit to that arm's poses."""
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
@@ -242,7 +242,7 @@ class Rigs:
         return replace(kept, rig=rig, arm=len(self.arms))
 
     def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
-        """Return the arms, the capture's own first, and initial X and base_from_world of each."""
+        """Return the reported poses of each arm, the capture's own first, and initial X and base_from_world of each."""
         case = self.case
         poses = case.capture.base_from_gripper[self.rows]
         kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
@@ -266,7 +266,10 @@ class Rigs:
 def fit_views(
     seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
 ) -> tuple[Calibration, tuple[Finding, ...]]:
-    """Return the fit of a camera to the poses of what carries it, and the effect of the order, such as a slip."""
+    """Return the hand-eye fit of a camera to poses `carrier` of its gripper or rig, and findings such as a slip.
+
+    Both are in metres; `scale_std` is the relative standard deviation of the scale between them.
+    """
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
     known = (scale_prior(1.0, scale_std),)
     return found, effects_of_fit(carrier, seen.places, found, seen.names, priors=known)
@@ -275,6 +278,6 @@ def fit_views(
 def _apart(
     places: Float[ndarray, "*#k 4 4"], others: Float[ndarray, "*#k 4 4"]
 ) -> tuple[Float[ndarray, "..."], Float[ndarray, "..."]]:
-    """Return distance (m) and angle (rad) between poses, which broadcast."""
+    """Return the distance (m) and the angle (rad) between poses; the arrays broadcast."""
     step = step_between(places, others)
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)

@@ -1,8 +1,7 @@
 """Placement of the further cameras of a cell, given the calibration of the capture's own camera.
 
-Every image of another camera is localised in the reconstruction (rigs.py); all images are adjusted together with the
-arms' poses (estimation/). The calibration of the capture's own camera stays as it was found: what is found here of
-others rests on the same images.
+Every image of another camera is localised in the reconstruction (rigs.py); then all images are adjusted together with
+the arms' poses (estimation/). The calibration of the capture's own camera is not changed.
 """
 
 from collections.abc import Sequence
@@ -35,13 +34,13 @@ from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 
 CONTRADICTS = 5.0
-"""Factor of the median reprojection error of all images of the cell from which an image contradicts a pose."""
+"""Reprojection error of an image, as a multiple of the median of all images, from which it contradicts the pose."""
 LEAST_PX = 1.0
-"""Smallest median reprojection error (px) that contradicts a pose, for images up to 1600 px wide."""
+"""Lower bound (px) of the median reprojection error that contradicts a pose, for images up to 1600 px wide."""
 LEAST_SPREAD = 0.05
-"""Smallest share of the image's area that the points should span; crowded points determine a pose badly."""
+"""Smallest share of the image area that the points should span; crowded points determine a pose badly."""
 FAR_FROM_GRIPPER = 0.5
-"""Distance (m) from the gripper's frame beyond which a camera is likely to be mounted elsewhere."""
+"""Distance (m) from the gripper frame beyond which a camera is probably not on the gripper."""
 
 
 @one_blas_thread
@@ -53,7 +52,7 @@ def place_cameras(
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
 ) -> CellPlacement:
-    """Place the cameras of `others` that see the scene of a capture whose own camera is calibrated.
+    """Return the placement of the cameras `others`, which observe the scene of a calibrated capture.
 
     A camera that cannot be placed is in the result with the reason.
     """
@@ -109,10 +108,10 @@ def place_cameras(
 
 
 def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
-    """Return the finding of a fixed camera whose images were taken from different places; none where they agree.
+    """Return the finding that the images of a fixed camera have different poses; no finding if they agree.
 
-    The images are adjusted with a rig each. The distance of two is compared with its covariance, in which errors of the
-    intrinsics and of the wrist camera move both alike.
+    The images are adjusted with one rig each. The difference of two poses is compared with its covariance, in which
+    common errors, as of the intrinsics, cancel.
     """
     alone = Rigs(rigs.case, rigs.known)
     alone.poses += list(views.places)
@@ -137,16 +136,15 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
 def _examined(
     images: CellImages, mounted: Sequence[CameraViews], hand_eye: Calibration
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
-    """Adjust all images, and test those of each camera (calibration/checks/effects.py).
+    """Return the joint solution of all images, and for each camera the findings of calibration/checks/effects.py.
 
-    The adjustment adopts the effects on the cameras: of one image given intrinsics that are wrong would weigh more than
-    what it shows. The poses of the capture's own arm were tested with its own camera, those of another arm are with its
-    camera.
+    Confirmed effects on cameras are adopted in the solution. Another arm's poses are tested with its camera; those of
+    the capture's own arm were tested in its calibration.
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
         prior = images.problem.cameras[one.number]
-        # Exact, as of a camera that is compared with itself, or known to have moved.
+        # Exact intrinsics are not tested, and neither is a camera that is known to have moved.
         if not len(prior.std) or any(fault.shift is not None for fault in one.findings):
             found.append(())
             continue
@@ -180,12 +178,12 @@ def _examined(
 def _placement(
     views: CameraViews, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
-    """Return the placement of a camera with its findings; the shifts of `faults` add to its covariance."""
+    """Return the placement of a camera with its findings; the covariances of `faults` add to its covariance."""
     c, problem = views.number, solution.problem
     assert problem.observations is not None
     transform, covariance = solution.transform(views.parent_from_camera)
-    # Faults of the own calibration, such as a slip, are the part of its covariance beside images and robot, and move
-    # everything that varies with it.
+    # Findings of the own calibration, such as a slip, increase its covariance; the increase is propagated to this camera
+    # by the correlation of both poses.
     own = solution.covariance[:7, :7]
     follows = solution.derivative(views.parent_from_camera) @ np.linalg.solve(own, solution.covariance[:7]).T
     covariance = (
@@ -203,13 +201,13 @@ def _placement(
     limit_px = max(
         CONTRADICTS * float(np.median(of_all)), LEAST_PX * max(1.0, views.camera.image_size[0] / 1600)
     )
-    if px[worst] > limit_px:  # which also makes the pose uncertain
+    if px[worst] > limit_px:  # a reason for uncertainty too, which is therefore not reported
         image, details = views.camera.images[worst], {"value": px[worst], "mount": views.camera.mount}
         findings.insert(0, Finding.of(FindingKind.IMAGE_MISSES, "rejects", "mount", image, **details))
     else:
         findings += _uncertain(views.camera, covariance, float(std[0]) / intrinsics.fx)
     used = list(views.used.values())
-    # Share of the image's area that the standard deviations of the points span.
+    # The span of the points is four standard deviations along their principal axes.
     sides = [4 * np.sqrt(np.linalg.eigvalsh(np.cov(one.x_px.T))) for one in used]
     widest = max(float(side.prod()) for side in sides) / float(np.prod(views.camera.image_size))
     if widest < LEAST_SPREAD:
@@ -238,7 +236,7 @@ def _placement(
 def _uncertain(
     camera: CellCamera, covariance: Float[ndarray, "6 6"], focal_std: float = 0.0
 ) -> list[Finding]:
-    """Return the finding of a pose that is too uncertain; for unknown intrinsics with the relative focal length's."""
+    """Return a finding if the pose is too uncertain; `focal_std` is the relative std of an unknown focal length."""
     metres, radians = np.sqrt(np.diag(covariance)).reshape(2, 3).max(1).tolist()
     if metres <= MAX_STD[0] and radians <= MAX_STD[1]:
         return []
