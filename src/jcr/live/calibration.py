@@ -129,9 +129,9 @@ class LiveCalibration:
             return self.update()
 
     def finish(self, out: str | Path | None = None) -> "RunResult":
-        """Calibrate all images by `jcr.calibrate`.
+        """Calibrate all images with all their observations, by `jcr.calibrate`, and write a run folder.
 
-        `out` is the run folder; None: the folder `result` of the capture. Raises as `jcr.calibrate` does.
+        `out` is the run folder; None: the subfolder `result` of the capture. Raises the errors of `jcr.calibrate`.
         """
         from jcr.pipeline.run import calibrate
         from jcr.result import RunOptions

@@ -49,10 +49,10 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class Frame:
-    """Image of a camera with the time at which it was taken."""
+    """Image of a camera with its time and, from a depth camera, its depth."""
 
     image: UInt8[ndarray, "h w 3"]
-    """RGB."""
+    """RGB image."""
     time_s: float
     """Time (s) by this machine's monotonic clock; in a recording, by its frame rate or its time stamps."""
     depth_mm: UInt16[ndarray, "h w"] | None = None
@@ -143,7 +143,7 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
     is_file = not is_device and "://" not in source
     if is_file and not Path(source).is_file():
         raise InputError(f"--camera {source}: no such video file; name a file, a device number or a stream")
-    # OpenCV and FFmpeg write warnings of their own to stderr; the error that we raise is all a user needs.
+    # OpenCV and FFmpeg would also write warnings to stderr, which add nothing to the InputError.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     with ExitStack() as stack:
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -359,7 +359,7 @@ class ImageSummary:
 
     @staticmethod
     def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":
-        """Return the summary of an RGB image."""
+        """Return the reduced grey levels and the sharpness of an RGB image."""
         size = GRID_PX, max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)

@@ -153,7 +153,7 @@ class LiveFolder:
         self._earlier.clear()
 
     def capture(self) -> Capture | None:
-        """Return the images kept so far as a capture; None before the first image."""
+        """Return a capture of all images that the folder has now; None before the first image."""
         images = self.images
         return None if not images or self.size is None else self._capture_of(images, self.size)
 

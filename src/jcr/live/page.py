@@ -221,5 +221,5 @@ def _small(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 
 
 
 def _jpeg(image: UInt8[ndarray, "h w 3"]) -> bytes:
-    """Return an RGB image as JPEG."""
+    """Return an RGB image encoded as JPEG."""
     return cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()

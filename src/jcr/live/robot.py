@@ -109,7 +109,7 @@ def pose_of_numbers(
 
 
 def pose_columns(convention: ConventionName, units: UnitsName) -> str:
-    """Return names and units of the numbers of a pose."""
+    """Return a text with names and units of the numbers of a pose in a convention, for prompts and messages."""
     if convention == "auto":
         unit = "m, rad" if units == "auto" else units.replace("-", ", ")
         return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
@@ -277,5 +277,5 @@ def typed_poses(
         try:
             numbers = [float(word) for word in line.replace(",", " ").split()]
             yield pose_of_numbers(numbers, "typed", convention, units)
-        except ValueError as error:  # InputError is one, too.
+        except ValueError as error:  # InputError is a subclass of ValueError.
             show(f"refused: {error}")

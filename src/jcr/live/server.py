@@ -101,7 +101,7 @@ class LiveServer(ThreadingHTTPServer):
             raise InputError(f"{where}: {error}; choose an address of this machine and a free port") from None
         names = (LOOPBACK, "localhost") if self.host == LOOPBACK else (self.host,)
         self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
-        """Accepted values of the header Host."""
+        """Accepted values of the header `Host`: name and port of this server."""
         self.address = f"http://{self.hosts[0]}/{self.key}/"
         """URL of the page, which includes the key."""
 

@@ -30,7 +30,7 @@ SAME_PLACE = (0.005, np.radians(1.0))
 ENOUGH_IMAGES, MOST_IMAGES = 12, 40
 """Default largest number of images: of a capture, and of one with --until-accurate."""
 LEAST_IMAGES = 3
-"""Least number of images of a calibration."""
+"""Smallest number of images from which a calibration is computed."""
 LONGEST_S, INTERRUPTED_S = 60.0, 10.0
 """Longest wait (s) for the calibration of the last images: at the end of a capture, and after an interruption."""
 
@@ -40,7 +40,7 @@ Answer = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions:
-    """Options of taking images."""
+    """Options of a live capture: number of images, waiting time, reach, and required accuracy."""
 
     images: int | None = None
     """Stop with this many images; unset: 12, and with --until-accurate 40."""
@@ -65,10 +65,10 @@ class SessionOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SessionState:
-    """Consistent state of a capture at one moment, for the live page."""
+    """State of a live capture at one moment: images, last event, and calibration. It is immutable; the page shows it."""
 
     version: int = 0
-    """Number that grows with every change."""
+    """Number that increases with every change of the state."""
     event: str = ""
     """Last event in words; empty if the other fields show it."""
     is_refusal: bool = False

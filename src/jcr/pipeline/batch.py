@@ -77,7 +77,7 @@ class BatchRow:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether the calibration is accepted, with warnings or without."""
+        """Whether the calibration is accepted, with or without warnings."""
         return self.status in ("accepted", "accepted with warnings")
 
 

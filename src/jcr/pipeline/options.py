@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
-    """Options of the batch."""
+    """Options of a batch of runs: processes, Ray cluster, and resources of each capture."""
 
     processes: int | None = None
     """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""

@@ -168,12 +168,12 @@ def add_camera(
     *,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Locate a fixed camera from its images of the scene of the run folder `out`.
+    """Locate a fixed camera in the base frame, from its images of the scene of the run folder `out`.
 
-    `images` are one file or more. `intrinsics` is a JSON file in the form of capture.json; None: they are estimated. The
-    camera becomes part of the run, of cameras.json and of the report. Raises InputError if the images are not from one
-    camera or do not fit the intrinsics, and RejectedError, writing nothing, if they do not determine the camera's pose
-    or the run is rejected.
+    `name` is the new camera's name, `images` one or several files. `intrinsics` is a JSON file with the fields of
+    capture.json; None: the intrinsics are estimated. The camera is added to the run, to cameras.json and to the report.
+    Raises InputError if the images are not from one camera or do not fit the intrinsics. Raises RejectedError, without
+    writing anything, if the images do not determine the camera's pose or the run is rejected.
     """
     files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
     if not files:
@@ -201,9 +201,9 @@ def add_camera(
 
 
 def measure(out: str | Path) -> "Measurement":
-    """Measure the support plane of a run and the objects on it, from its cloud and its calibration.
+    """Measure the support plane and the objects on it, from the cloud and the calibration of the run folder `out`.
 
-    Raises InputError if there is no map, or if there is no support plane.
+    Raises InputError if the run has no map, or the scene no support plane.
     """
     from jcr.segments.measure import measure_objects
 

@@ -270,13 +270,13 @@ def keep_calibration(out: Path, content: AnyCalibration) -> None:
 
 
 def write_calibration_and_log(out: Path, content: AnyCalibration) -> None:
-    """Write calibration.json and log.txt."""
+    """Write a calibration to calibration.json and, as text, to log.txt in the run folder `out`."""
     write_calibration(out / CALIBRATION, content)
     write_text(out / LOG, log(content))
 
 
 def write_state(result: RunResult) -> None:
-    """Write run.json."""
+    """Write the state of a run (capture, options, attempts, fingerprints) to run.json."""
     content = result.state.model_dump(mode="json", warnings=False)
     write_text(result.out / STATE, json.dumps(content, indent=2) + "\n")
 
@@ -335,7 +335,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     from jcr.segments.tabletop import fit_support
 
     options, capture, hand_eye, added = result.state.options, result.capture, result.found, result.added
-    assert options.map is not None  # or this stage is left out
+    assert options.map is not None  # `stages_of` leaves this stage out otherwise
     made = result.reconstruction
     if len(added):
         x, base_from_recon = hand_eye.gripper_from_camera, hand_eye.base_from_recon

@@ -223,7 +223,7 @@ def _fixed_cameras(
     The old and the new pose of the camera are estimated together, so that errors of the wrist camera's calibration
     cancel in their difference. Raises RejectedError if the images share too few features with the scene.
     """
-    from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
+    from jcr.cell.stage import place_cameras  # imports pycolmap, which the command-line help does not need
 
     _, capture, reconstruction = run.of_wrist_camera()
     calibrate_options = run.state.options.calibrate

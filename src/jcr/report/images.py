@@ -117,6 +117,7 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
         undistort = undistortion(small, without_distortion(small))
 
     def thumbnail(name: str) -> str:
+        """Return one image as a data URL."""
         pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
         return image_url(pixels if undistort is None else undistort(pixels))
 

@@ -1,4 +1,4 @@
-"""Metric point cloud in the base frame from pointmaps and a calibration (JCR, section IV-C), and its file cloud.ply."""
+"""Point cloud (m, base frame) from pointmaps and a calibration (JCR paper, section IV-C), and its file cloud.ply."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -171,7 +171,7 @@ def read_cloud(path: Path) -> PointCloud:
             label_names=tuple(word[3] for word in words if word[:2] == ["comment", "label"]),
             **columns,
         )
-    except InputError:  # a pipe
+    except InputError:  # read_bytes refuses the path, such as a pipe
         raise
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None

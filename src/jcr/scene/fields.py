@@ -27,6 +27,10 @@ class Lattice(nn.Module):
     def __init__(
         self, lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], nodes: Int[Tensor, " k"]
     ) -> None:
+        """Create a grid of `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m) on.
+
+        `nodes` are the flat indices of the selected nodes.
+        """
         super().__init__()
         self.cell, self.shape = cell, shape
         row = torch.zeros(math.prod(shape), dtype=torch.int32, device=lower.device)
@@ -189,7 +193,7 @@ class Field(nn.Module):
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Return the outputs (n, outputs) of every head at points (n,3)."""
+        """Return by property its outputs (n, outputs) at points (n,3) m."""
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
@@ -205,14 +209,15 @@ class Fields(nn.Module):
     """All fields of a map, each with one or several properties, and the lattices that they share."""
 
     of: Iterable[Field]
-    """The fields."""
+    """Fields of the map."""
 
     def __init__(self, fields: Sequence[Field], lattices: Sequence[Lattice] = ()) -> None:
+        """Combine fields and the lattices on which they interpolate their features."""
         super().__init__()
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return the outputs (n, outputs) of the named heads at points (n,3)."""
+        """Return by property its outputs (n, outputs) at points (n,3) m, for the properties in `names`."""
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):
@@ -231,6 +236,7 @@ def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple
     wanted = any(column.requires_grad for column in columns)
 
     def answer(piece: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """Return the results of `ask` for one piece."""
         with torch.inference_mode(not wanted):
             return ask(*piece)
 

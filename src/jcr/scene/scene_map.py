@@ -40,6 +40,7 @@ class Sample:
     def __init__(
         self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], *, unknown: str, tensors: bool
     ) -> None:
+        """Take the points of a query; `tensors`: the results are tensors, else arrays."""
         self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
 
     @property
@@ -73,6 +74,7 @@ class Sample:
         scene = self._map
 
         def label(x: Tensor) -> tuple[Tensor]:
+            """Return the label of each point (n,), 0 in unseen space."""
             if "label" not in scene.properties:
                 return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
             return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
@@ -92,6 +94,7 @@ class Sample:
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
+            """Return occupancy (n,), and the mask (n,) of unknown points."""
             state = self._map.seen.at(x)
             # The field is evaluated at seen points only, because most of a workspace is unseen.
             unknown = state == 0
@@ -113,6 +116,7 @@ class Sample:
         grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
 
         def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
+            """Return signed distance (n,) m and gradient (n,3)."""
             answer = torch.where(self._map.seen.index(x)[1][:, None], grid.at(x), torch.nan)
             return answer[:, 0], answer[:, 1:]
 
@@ -141,6 +145,7 @@ class SceneMap:
         label_names: tuple[str, ...],
         history: dict[str, str] | None = None,
     ) -> None:
+        """Create a map from trained fields and the grid of seen space; `label_names` names the labels, 0 = none."""
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
@@ -163,7 +168,7 @@ class SceneMap:
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
-        """Return a copy of the map on another device, e.g. "cuda"."""
+        """Return a copy of the map on a device, e.g. "cuda", which then computes the queries."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
 
@@ -274,6 +279,7 @@ class SceneMap:
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
+            """Return the mask (n,) of spheres that collide."""
             nearest = torch.clamp(x, lower, upper)
             distance, beyond = grid.distance(nearest), (x - nearest).norm(dim=1)
             if unknown == "occupied":
@@ -301,6 +307,7 @@ class SceneMap:
         behind = SeenGrid(self.seen.lower, self.cell, skin.to(torch.uint8))
 
         def is_solid(x: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"]]:
+            """Return the mask (n,) of points that count as solid."""
             inside = self.fields(x, ("occupancy",))["occupancy"][:, 0] >= 0
             if unknown == "occupied":
                 return (inside | ((self.seen.at(x) & CROSSED) == 0),)
@@ -374,5 +381,5 @@ def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unkno
     """Return the result of each body from those of its k spheres: OCCUPIED before UNKNOWN before FREE."""
     if unknown != "report":
         return np.asarray(states.any(-1))
-    rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; its own inverse
+    rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too
     return rank[rank[states].max(-1, initial=0)]

@@ -73,6 +73,6 @@ def point_size(points: Float[ndarray, "n 3"]) -> float:
     """Return the side (m) of squares that close most gaps between points (n,3) m when they are drawn as squares."""
     if len(points) < 2:
         return 0.01
-    tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # built in a third of the time
+    tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # takes a third of the time
     nearest = tree.query(points[:: max(len(points) // 1000, 1)], k=2)[0][:, 1]
     return round(2.2 * float(np.median(nearest)), 5)

@@ -110,7 +110,7 @@ def workspace_rays(
     x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
     toward = origin - x
     distance = np.linalg.norm(toward, axis=1, keepdims=True)
-    leave = np.full_like(toward, np.inf)  # a ray along a wall of the box never meets it
+    leave = np.full_like(toward, np.inf)  # a ray parallel to a side of the box does not meet this side
     np.divide(np.where(toward > 0, box[1], box[0]) - x, toward, out=leave, where=toward != 0)
     confidence = cloud.confidence[inside]
     weight = np.clip(confidence / max(np.median(confidence), 1e-12), 0.25, 4.0)
@@ -118,6 +118,7 @@ def workspace_rays(
     weight /= 1.0 + (cloud.margin[inside] ** 2 + depth_std**2) / cell**2
 
     def tensor(array: ndarray) -> Tensor:
+        """Return an array as a float32 tensor on the training device."""
         return torch.as_tensor(array, dtype=torch.float32, device=device)
 
     targets = {"color": tensor(cloud.color[inside] / np.float32(255))}
@@ -152,6 +153,7 @@ def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samp
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
     def uniform(rows: int, columns: int = 1) -> Tensor:
+        """Return random numbers in [0, 1), shape (rows, columns)."""
         return torch.rand(rows, columns, generator=generator, device=device)
 
     a, b = rays[: n // 2], rays[n // 2 :]
@@ -192,6 +194,7 @@ def train(
     ]
 
     def draw(batch: Rays) -> Samples:
+        """Return the samples of a batch: along its rays for occupancy, else its surface points."""
         if "occupancy" in field.heads:
             return draw_samples(batch, seen, generator)
         return batch.x, torch.ones_like(batch.weight), batch.weight  # others are known on surfaces only
