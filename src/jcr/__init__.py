@@ -28,18 +28,18 @@ from typing import Any
 
 import lazy_loader
 
-# The library of pycolmap 4.1 and later exports a deflate of its own. On Linux a libz that is loaded after pycolmap calls
-# parts of that one, and the next PNG or zip archive that anybody in the process writes (Pillow, OpenCV, Python's own
-# zlib) aborts the process; reading is not concerned. So the system's zlib is loaded first.
+# The library of pycolmap 4.1 and later exports its own deflate functions. On Linux, a libz that is loaded after pycolmap
+# calls some of them, and writing a PNG file or zip archive (by Pillow, OpenCV or Python's zlib) aborts the process.
+# Therefore the system's zlib is loaded first.
 if "pycolmap" in sys.modules:
     warnings.warn(
         "pycolmap was imported before jcr: import jcr first, or writing PNG files may abort Python",
         stacklevel=2,
     )
-with suppress(OSError):  # other systems have no library of this name, nor the conflict
+with suppress(OSError):  # other systems have neither a library of this name nor the conflict
     ctypes.CDLL("libz.so.1")
 
-# SciPy and COLMAP take seconds to import: the stub __init__.pyi names the modules, each imported when it is first used.
+# SciPy and COLMAP take seconds to import. The modules that the stub __init__.pyi names are imported on first use.
 _attribute, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
 if not find_spec("torch"):
     __all__ = [name for name in __all__ if name not in ("DistanceGrid", "Sample", "SceneMap")]

@@ -1,4 +1,4 @@
-"""Main memory of the process: return of freed blocks, and limits that are checked before an allocation."""
+"""Main memory of the process: checks of the available memory, and return of freed memory to the system."""
 
 import ctypes
 import os
@@ -8,15 +8,15 @@ from jcr.errors import InputError
 
 GB = 1e9
 ADDRESS_SPACE = 2_000_000_000
-"""Bytes. A small calibration without torch uses 1.6 GB of address space, most of which is never touched."""
+"""Smallest limit of the address space (bytes); a small calibration without torch uses 1.6 GB, most of it unused."""
 MORE_MEMORY = "use fewer or smaller images, end other programs, or raise its limit (ulimit -v)"
-"""Remedy where the memory ends."""
+"""Remedy in messages about a lack of memory."""
 
 
 def require_address_space() -> None:
-    """Raise InputError where a limit (ulimit -v) leaves less address space than the libraries need.
+    """Raise InputError if the limit of the address space (ulimit -v) is below ADDRESS_SPACE.
 
-    With less, OpenBLAS ends the process and libraries cannot be loaded, both without a reason.
+    Below it, OpenBLAS ends the process, or libraries fail to load, without a clear message.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
@@ -27,9 +27,9 @@ def require_address_space() -> None:
 
 
 def require_memory(size: int, claimant: str) -> None:
-    """Raise InputError where `size` (bytes), which `claimant` states, exceeds the memory of the machine.
+    """Raise InputError if `size`, the bytes that the file `claimant` needs, exceeds the memory of the machine.
 
-    Linux grants such allocations and ends the process when the pages are written.
+    Linux allows such an allocation and ends the process when the memory is written.
     """
     physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if size > physical:
@@ -39,7 +39,7 @@ def require_memory(size: int, claimant: str) -> None:
 
 
 def give_back() -> None:
-    """Return freed blocks to the system; glibc keeps hundreds of MB after work in threads."""
+    """Return freed memory to the system; glibc keeps hundreds of MB after multithreaded work."""
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)

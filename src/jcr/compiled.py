@@ -1,4 +1,4 @@
-"""Numba's compiler as the loops over pixels use it."""
+"""Decorators that compile loops over pixels with Numba, and a random number generator for them."""
 
 from collections.abc import Callable
 from typing import Any, no_type_check
@@ -6,28 +6,28 @@ from typing import Any, no_type_check
 import numpy as np
 from numba import njit
 
-# Sums keep their order. Where the compiler may change it, a loop gives other bits fresh than from the cache, for it is
-# inlined otherwise; on 12 images of 400x300 that freedom saved no time.
+# The options do not allow the compiler to reorder sums: freshly compiled and cached loops, which are inlined
+# differently, would give different results. On 12 images of 400x300, reordering saved no time.
 _OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": {"nnan", "ninf", "nsz"}, "error_model": "numpy"}
 _PART: dict[str, Any] = _OPTIONS | {"forceinline": True, "_nrt": False}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Compile the function when it is first called, and keep it on disk where that can be written.
+    """Decorate a function to be compiled at its first call and cached on disk if the cache is writable.
 
-    Such functions carry no shapes to check and say `@no_type_check`: a checker around them could not be compiled.
+    The function needs `@no_type_check`, because Numba cannot compile a wrapper that checks types.
     """
     try:
         return njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # neither beside the source nor in the user's cache
+    except RuntimeError:  # neither the folder of the source nor the user's cache is writable
         return njit(**_OPTIONS)(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a function that is inlined where compiled functions call it; it must allocate nothing.
+    """Decorate a function to be inlined into the compiled functions that call it; it must not allocate memory.
 
-    Then the arrays that it is given need not be counted, which takes as long as the window of a pixel, and longer where
-    two threads count one array.
+    Without allocations, Numba needs no reference counts of the arguments, which would take as long as the work for one
+    pixel.
     """
     return njit(**_PART)(function)
 
@@ -35,14 +35,14 @@ def inlined(function: Callable[..., Any]) -> Any:
 @compiled
 @no_type_check
 def random_state(seed):
-    """State of `uniform`, the same for a seed in every thread and version."""
+    """Return the initial state of `uniform` for a seed; it does not depend on thread or version."""
     return np.array([np.uint64(88172645463325252) ^ (np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15))])
 
 
 @inlined
 @no_type_check
 def uniform(state):
-    """Return a number from 0 to 1 (Marsaglia, "Xorshift RNGs", 2003)."""
+    """Return a random number between 0 and 1 and update `state` (Marsaglia, "Xorshift RNGs", 2003)."""
     x = state[0]
     x ^= x << np.uint64(13)
     x ^= x >> np.uint64(7)

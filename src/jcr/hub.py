@@ -1,4 +1,4 @@
-"""Weights of networks in the local cache of the Hugging Face hub, and their download by `jcr models get`."""
+"""Access to weights of networks in the local cache of the Hugging Face hub, and download for `jcr models get`."""
 
 import hashlib
 import re
@@ -9,8 +9,9 @@ from jcr.errors import InputError
 from jcr.extras import extra, is_installed
 
 HUB_FILES = ("config.json", "model.safetensors")
-"""Files of the weights of every network."""
+"""Names of the files that the weights of every network consist of."""
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+"""Pattern of a hub id: owner/name."""
 
 
 @dataclass(frozen=True)
@@ -18,27 +19,27 @@ class Weights:
     """Weights of a network on this machine."""
 
     path: Path
-    """File of the weights, or folder of their files."""
+    """File with the weights, or folder with their files."""
     name: str
-    """Path or hub id that the user named."""
+    """Path or hub id that the user gave, or the hub id of the published weights."""
     licence: str
 
     @property
     def note(self) -> str:
-        """Note on the weights and their licence for the result."""
+        """Note for the result that names the weights and their licence."""
         return f"weights {self.name}: licence {self.licence}"
 
 
 def cached_files(hub_id: str, revision: str | None = None) -> list[Path]:
-    """Return the HUB_FILES of a hub id from the cache of this machine: of one commit, or of the newest downloaded one.
+    """Return the paths of the HUB_FILES of a hub id in the local cache; empty unless all are there.
 
-    The network is not asked. The list is empty unless all files are there.
+    `revision` is a commit; None: the newest downloaded one. The network is not accessed.
     """
     if not is_installed("huggingface_hub"):
         return []
     from huggingface_hub import constants
 
-    # Its client for the network takes a tenth of a second to import, which most machines can spare.
+    # The import of the hub's client takes 0.1 s, so it is skipped if the cache has no folder for the hub id.
     if not (Path(constants.HF_HUB_CACHE) / f"models--{hub_id.replace('/', '--')}").is_dir():
         return []
     from huggingface_hub import try_to_load_from_cache
@@ -46,16 +47,17 @@ def cached_files(hub_id: str, revision: str | None = None) -> list[Path]:
     found = [
         try_to_load_from_cache(hub_id, name, constants.HF_HUB_CACHE, revision=revision) for name in HUB_FILES
     ]
-    # The result is no path where a file is missing here, or known to be missing on the hub.
+    # try_to_load_from_cache returns no text for a file that is missing in the cache or on the hub.
     paths = [Path(path) for path in found if isinstance(path, str)]
     return paths if len(paths) == len(HUB_FILES) else []
 
 
 def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> Path:
-    """Download the HUB_FILES of a hub id, of a commit or of the newest one, and return their folder in the cache.
+    """Download the HUB_FILES of a hub id to the local cache and return their folder.
 
-    Files in the cache are not downloaded again; every file is compared with its published checksum. Raises InputError
-    where the hub cannot be reached, has no such files, or sent other bytes than it publishes; these are deleted.
+    `revision` is a commit; None: the newest one. Files in the cache are not downloaded again, but compared with their
+    published checksums. Raises InputError if the hub cannot be reached, lacks a file, or if a checksum differs; that
+    file is then deleted.
     """
     extra("huggingface_hub", "networks", "jcr models get")
     from huggingface_hub import constants, snapshot_download
@@ -67,7 +69,7 @@ def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> P
         disable_progress_bars()
     try:
         folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=list(HUB_FILES)))
-    except Exception as error:  # those of its transport (requests, httpx) differ by its version
+    except Exception as error:  # network errors depend on the client's version
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(
             f"{hub_id}: not downloaded ({reason}); try again, check the network, HTTPS_PROXY, or set HF_ENDPOINT to a "
@@ -88,9 +90,9 @@ def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> P
 
 
 def _is_as_published(path: Path) -> bool:
-    """Test whether a file has the checksum by which the hub's cache names it: SHA-256, or git's SHA-1 of a small file.
+    """Test whether a cached file has the checksum in its name: SHA-256, or git's SHA-1 for a small file.
 
-    The result is true where a system without symbolic links keeps no such name.
+    Return True for a file without a checksum in its name, as on systems without symbolic links.
     """
     published = path.resolve().name
     if re.fullmatch("[0-9a-f]{64}", published):

@@ -1,4 +1,4 @@
-"""Options given in Python, checked as the command line checks its own."""
+"""Validation of options that are given in Python."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -10,9 +10,9 @@ Options = TypeVar("Options")
 
 
 def checked_options(options: object, kind: type[Options]) -> Options:
-    """Return the options as a record of that kind, from such a record, a dict of its fields, or None for the defaults.
+    """Return validated options of the class `kind`, from an object of it, a dict of its fields, or None (defaults).
 
-    Text stands for a path and a list for a tuple. Raises InputError with the field for anything else.
+    Text is converted to paths, and lists to tuples. Raises InputError that names the field for invalid values.
     """
     if options is None:
         return kind()
@@ -28,7 +28,7 @@ def checked_options(options: object, kind: type[Options]) -> Options:
         record = next(filter(is_dataclass, (hints[name], *get_args(hints[name]))), None)
         if isinstance(record, type) and value is not None:
             content[name] = checked_options(value, record)
-    from pydantic import TypeAdapter, ValidationError  # half a second, which the help need not wait for
+    from pydantic import TypeAdapter, ValidationError  # takes 0.5 s, which the help avoids
 
     try:
         return TypeAdapter(kind).validate_python(content)

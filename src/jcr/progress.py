@@ -1,4 +1,4 @@
-"""Progress on stderr: one bar a stage, with the time left."""
+"""Progress bars on stderr, one for each stage, with the remaining time."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -8,15 +8,15 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 Progress = Callable[[str, float], None]
-"""Gets the stage's name and the fraction of it that is done."""
+"""Callback of progress; its arguments are the name of the stage and the finished fraction, 0 to 1."""
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Progress that is not shown."""
+    """Ignore the progress; a callback that shows nothing."""
 
 
 def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:
-    """Yield the items one by one, and report their share of the stage before and after each."""
+    """Yield the items one by one, and report the finished fraction of the stage before each item and at the end."""
     for k, item in enumerate(items):
         progress(stage, k / len(items))
         yield item
@@ -25,7 +25,7 @@ def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Ite
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Yield the callable that stages report to; bars are drawn where stderr is a terminal."""
+    """Yield a progress callback as a context; it draws bars if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield silent
         return
@@ -43,8 +43,9 @@ def progress_bars() -> Iterator[Progress]:
     bars = Progress(*columns, console=Console(file=sys.stderr))
 
     def report(stage: str, fraction: float) -> None:
+        """Draw the bar of a stage."""
         if stage not in tasks:
-            bars.start()  # with the first stage: an error before it is a line of its own
+            bars.start()  # not before the first stage, so that an earlier error message is not mixed with bars
             tasks[stage] = bars.add_task(stage, total=1.0)
         bars.update(tasks[stage], completed=fraction)
 

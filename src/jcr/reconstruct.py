@@ -1,7 +1,7 @@
-"""Table of back ends: each makes a Reconstruction of a capture.
+"""Table of the back ends, which make a Reconstruction of a capture, and the selection of one by the options.
 
-A back end of this package is a file and a row here. Another package adds rows by entry points of the group
-`jcr.backends`, each the name and a `Backend` (examples/backend_mapanything).
+Another package adds a back end by an entry point of the group `jcr.backends`: its name and a `Backend` object
+(examples/backend_mapanything).
 """
 
 import logging
@@ -25,32 +25,34 @@ from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
-"""The package's other requirements, numpy below 2 among them, are not used by its network."""
+"""Command that installs Depth Anything 3 without those requirements that its network does not use, as numpy < 2."""
 DECIMALS = 9
-"""Number of decimals of a pose that count for the order of images, so that rounding by a file format changes nothing."""
+"""Number of decimals of poses that are compared to sort images, so that rounding by a file format has no effect."""
 GROUP = "jcr.backends"
 """Group of the entry points of back ends from other packages."""
 MARKER = "marker"
-"""Name of the back end that uses the board and nothing else."""
+"""Name of the back end that uses only the corners of a board."""
 NEEDED = {
     "board": "the board with --board, such as chessboard:9x6:0.025",
     "predictions": "the file with --predictions FILE.npz (jcr docs predictions)",
     "cameras": "the COLMAP model with --cameras PATH",
 }
-"""Options without which a back end cannot run, in words."""
+"""Text of a message about a missing option, for each option that some back end requires."""
 
 logger = logging.getLogger(__name__)
 
 
 def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
-    """Return a back end by "module:function", imported when it runs, and the options that it takes beside the capture.
+    """Return a function that imports and runs the back end `function`, given as "module:function".
 
-    Of these, `weights` are found and `device` is chosen first; both are of networks, which need torch.
+    `arguments` are the names of the options that are passed to it between capture and progress. For networks, the
+    option `weights` is replaced by the weights found, and `device` by the device chosen; both need torch.
     """
 
     def reconstruct(
         capture: Capture, options: "ReconstructOptions", progress: Progress | None
     ) -> Reconstruction:
+        """Run the back end with its options."""
         if "device" in arguments:
             extra("torch", "networks", f"--backend {options.backend}")
         chosen = {"weights": network_weights, "device": device_of}
@@ -62,53 +64,53 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """Row of the table of back ends."""
+    """Back end: its reconstruction function, the options that it uses, and its packages, weights and licence."""
 
     name: str
-    """Name for --backend."""
+    """Value of the option --backend that selects this back end."""
     reconstruct: Callable[..., Reconstruction]
-    """Function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
+    """Function of capture, ReconstructOptions and progress; slow imports should be inside the function."""
     licence: str
-    """Licence of the code, or of the weights where there are some."""
+    """Licence of the weights; of the code for a back end without weights."""
     metric: bool | None = False
-    """Whether the scale is in metres already; None: its input states it."""
+    """Whether the unit of the reconstruction is the metre; None: the input of the back end states it."""
     auto: bool = False
-    """Whether `auto` may take it where its package and its weights are on this machine."""
+    """Whether --backend auto may try this back end, if its package and its weights are on this machine."""
     tests_camera: bool = True
-    """Whether its calibrations are tested for wrong intrinsics, by points that are found in the images alone."""
+    """Whether the calibration is tested for wrong intrinsics, which needs points from features of the images."""
     options: tuple[str, ...] = ()
-    """Fields of ReconstructOptions that it uses and not every back end does."""
+    """Fields of ReconstructOptions that this back end uses, without those that all back ends use."""
     selected_by: str = ""
-    """The one of these by which `auto` takes it."""
+    """Option that makes --backend auto select this back end, one of `options`; empty: none."""
     needs: str = ""
-    """The one of these without which it cannot run, a key of NEEDED."""
+    """Option that is required, one of `options` and a key of NEEDED; empty: none."""
     hub_id: str = ""
-    """Hub id of its published weights; empty: it needs none."""
+    """Hub id of the published weights; empty: no weights are needed."""
     package: str = ""
-    """Package that must be installed beside the core."""
+    """Optional package that must be installed; empty: none."""
     install: str = ""
-    """Command that installs the package."""
+    """Command that installs `package`."""
     keeps_order: bool = False
-    """Whether its input or its options count images in the capture's own order."""
+    """Whether the images must keep the order of the capture, because the input refers to images by number."""
     accuracy: str = ""
     """Measured accuracy and the page with the measurement; empty: not measured here."""
     revision: str = ""
-    """Commit of its weights that `jcr models get` downloads."""
+    """Commit of the weights that `jcr models get` downloads."""
     parameters: int = 0
-    """Parameters of the network in millions."""
+    """Number of parameters of the network, in millions."""
     download_gb: float = 0.0
-    """Size of the weights."""
+    """Size of the weights (GB)."""
     commercial: bool = True
-    """Whether the licence of its weights allows commercial use."""
+    """Whether the licence of the weights allows commercial use."""
     sees_all_views: bool = False
-    """Whether it is a network that processes all views at once."""
+    """Whether the back end is a network that processes all views at once, and not pairs of views."""
 
     def is_installed(self) -> bool:
-        """Test whether the package it needs is there, without importing it."""
+        """Test whether the optional package of this back end is installed, without importing it."""
         return not self.package or is_installed(self.package)
 
     def has_weights(self) -> bool:
-        """Test whether its published weights are on this machine, or none are needed; nothing is downloaded."""
+        """Test whether the published weights are on this machine, or none are needed; nothing is downloaded."""
         return not self.hub_id or bool(cached_files(self.hub_id, self.revision or None))
 
 
@@ -154,7 +156,7 @@ _FIRST = (
         selected_by="features",
         accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
     ),
-    # Its files have one more head, which is left out, and points in metres.
+    # MASt3R is DUSt3R with points in metres and an additional head, which is not used.
     replace(
         _DUST3R,
         name="mast3r",
@@ -218,7 +220,7 @@ _LAST = (
     ),
 )
 
-# Names of entry points are known without importing their packages.
+# The names of entry points are available without importing their packages.
 if TYPE_CHECKING:
     BackendName = str
 else:
@@ -260,7 +262,7 @@ class ReconstructOptions:
 
 
 def check_board(options: ReconstructOptions) -> None:
-    """Raise InputError, before any work, for a --board that names none."""
+    """Raise InputError if the option --board does not describe a board."""
     if options.board is not None:
         from jcr.boards.detection import boards
 
@@ -270,9 +272,9 @@ def check_board(options: ReconstructOptions) -> None:
 def reconstruct(
     capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
-    """Reconstruct a capture by the back end that `options` names.
+    """Reconstruct a capture with the back end that `options` select; for `auto`, the first candidate.
 
-    Raises InputError for a back end that is not there, RejectedError when it finds too little.
+    Raises InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
     """
     options = options or ReconstructOptions()
     row = BACKENDS[candidates(options)[0]]
@@ -294,19 +296,19 @@ def reconstruct(
 
 
 def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " n"]:
-    """Return rows of gripper poses in the order of reconstruction, independent of names; equal poses keep their order.
+    """Return the indices that sort images by gripper pose, for a reconstruction that does not depend on image names.
 
-    Matches, RANSAC's draws and the first pair of a map depend on the order: by names, calibrations differed by up to
-    1.7 σ.
+    Matching, RANSAC and the initial pair depend on the order; with different names, calibrations differed by up to
+    1.7 σ. Equal poses keep their order.
     """
-    # Adding zero makes -0 and 0 the same. A pose is sorted by its position, x first, then by its rotation.
+    # Adding zero turns -0 into 0. Poses are sorted by position, x first, then by rotation.
     pose = np.round(base_from_gripper, DECIMALS) + 0.0
     keys = np.concatenate([pose[:, :3, 3], pose[:, :3, :3].reshape(-1, 9)], axis=1)
     return np.lexsort(keys.T[::-1])
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """Return the reconstruction with its images in the capture's own order; row k was given as order[k]."""
+    """Return the reconstruction of sorted images in the order of the capture; sorted image k is row order[k] there."""
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
@@ -330,12 +332,12 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
 
 
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
-    """Return the back ends that `auto` may take here, the best first, or the one that was named.
+    """Return the names of the back ends to try, best first; only the named one unless the back end is `auto`.
 
-    An option that only one back end uses selects that one. A network whose weights were named is followed by the best
-    back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for
-    a back end that is not there, for options that select different ones, and for an option that none of the answer
-    uses.
+    For `auto`, an option such as `features` selects its back end. With given weights, their network is followed by the
+    best back end without weights; with a board, back ends that use it together with features are followed by the board
+    alone. Raises InputError for an unknown back end, for options that select different back ends, and for an option
+    that none of the returned back ends uses.
     """
     given = _given_options(options)
     selecting = [row for row in BACKENDS.values() if row.selected_by in given]
@@ -373,10 +375,10 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
 
 
 def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
-    """Return the options of every attempt that `auto` may make, the best first.
+    """Return the options of all attempts to make until a result is accepted, best first.
 
-    COLMAP with SIFT, then with learned features where these are installed; then the best network that sees pairs, the
-    best that sees all views, and direct alignment. Raises as `candidates` does.
+    For `auto`: COLMAP with SIFT, then with learned features if these are installed; the best network that processes
+    pairs of views, and the best that processes all views; direct alignment. Raises InputError as `candidates` does.
     """
     names = candidates(options)
     all_views, pairs = (
@@ -397,14 +399,17 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
 
 
 def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:
-    """Return the options for one of `candidates`, without those of other back ends."""
+    """Return the options for one back end, with options that it does not use set to their defaults."""
     unused = _given_options(options).keys() - set(BACKENDS[name].options)
     defaults = {field.name: field.default for field in fields(options) if field.name in unused}
     return replace(options, backend=name, **defaults)
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """Return the options with the capture's own camera poses, where it has some and the options select no other."""
+    """Return the options with `cameras` set to the capture's own COLMAP model.
+
+    They are unchanged if the capture has none, or if the options select another back end.
+    """
     if capture.cameras is None or options.cameras is not None:
         return options
     selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
@@ -413,9 +418,9 @@ def with_cameras_of(capture: Capture, options: ReconstructOptions) -> Reconstruc
 
 
 def network_weights(options: ReconstructOptions) -> Weights:
-    """Return the weights of the network that `options` names: a path, or the pinned commit in the cache.
+    """Return the weights for the network of the selected back end, from a given path or from the local cache.
 
-    Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
+    Nothing is downloaded. Raises InputError that names the command to download the weights if they are missing.
     """
     row = BACKENDS[options.backend]
     name = options.weights or row.hub_id
@@ -441,26 +446,29 @@ def network_weights(options: ReconstructOptions) -> Weights:
 
 
 def weights_command(row: Backend) -> str:
-    """Return the command that downloads the published weights of a network, with size and licence."""
+    """Return a text with the command that downloads the published weights of a network, their size and licence."""
     size = f" ({row.download_gb:g} GB)" if row.download_gb else ""
     licence = "" if row.commercial else ", non-commercial"
     return f"jcr models get {row.name} downloads {row.hub_id}{size}{licence}"
 
 
 def _given_options(options: ReconstructOptions) -> dict[str, Any]:
-    """Return the options that not every back end uses and that differ from their defaults."""
+    """Return names and values of the options that differ from their defaults and are specific to some back ends."""
     own = {name for row in BACKENDS.values() for name in row.options}
     unset = {field.name: field.default for field in fields(options) if field.name in own}
     return {name: value for name in unset if (value := getattr(options, name)) != unset[name]}
 
 
 def _flag(name: str) -> str:
-    """Return the flag of an option on the command line."""
+    """Return the command-line flag of an option, such as --known-length for known_length."""
     return f"--{name.replace('_', '-')}"
 
 
 def device_of(options: ReconstructOptions) -> str:
-    """Return cuda or cpu; `auto` is cuda where there is one. Raise InputError where cuda is named and absent."""
+    """Return "cuda" or "cpu" for the option `device`; for `auto`, "cuda" if a CUDA device is available.
+
+    Raises InputError if `device` is "cuda" and no CUDA device is available.
+    """
     if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
         return "cpu"
     torch = extra("torch", "networks", "--device cuda")
@@ -472,7 +480,7 @@ def device_of(options: ReconstructOptions) -> str:
 
 
 def _third_party() -> list[Backend]:
-    """Return the rows of other packages; a package that cannot be loaded is logged and left out."""
+    """Return the back ends of other packages; one that cannot be loaded is logged and skipped."""
     rows = []
     for point in entry_points(group=GROUP):
         try:
@@ -486,8 +494,8 @@ def _third_party() -> list[Backend]:
 
 
 BACKENDS: dict[str, Backend] = {row.name: row for row in (*_FIRST, *_third_party(), *_LAST)}
-"""Rows by name, in the order in which `auto` tries them.
+"""Back ends by name, in the order in which `auto` tries them.
 
-COLMAP comes first: it needs no weights, and its points test the camera. Networks follow, those that see pairs, whose
-uncertainty is known, before those that see all views. Direct alignment needs the most time, and comes last.
+COLMAP is first, because it needs no weights and its points allow tests of the intrinsics. Networks follow: those for
+pairs of views, whose uncertainty is known, then those for all views. Direct alignment is slowest and last.
 """

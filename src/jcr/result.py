@@ -1,6 +1,6 @@
-"""Options and result of a run: records that are read from the run folder when they are first used.
+"""Options, state and result of a run; parts of the result are read from the run folder on first use.
 
-A run folder is input like any other: it may have been edited or cut. An invalid file raises InputError of one line.
+A file of the run folder may be invalid, because the user has edited it; reading then raises InputError.
 """
 
 from dataclasses import dataclass, field, replace
@@ -37,27 +37,27 @@ if TYPE_CHECKING:
     from jcr.segments.measure import Measurement
 
 STATE = "run.json"
-"""Capture, options and attempts of a run, and what its files were made from."""
+"""File of a RunState: capture, options and attempts of a run, and fingerprints of its inputs and files."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
 CLOUD, REPORT = "cloud.ply", "report.html"
 CAPTURE = "capture"
-"""Images and poses that were read from another format than capture.json."""
+"""Folder for a copy of images and poses that were read from another format than capture.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Options of every stage."""
+    """Options of all stages of a run."""
 
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions | None = field(default_factory=MapOptions)
-    """Options of the map; None: no cloud, no map, and no dense depth, which only these need."""
+    """Options of the map; None: neither map, point cloud nor dense depth is made."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
 
     def for_capture(self, capture: Capture, backend: str | None = None) -> "RunOptions":
-        """Return the options with another back end, or the one that takes the capture's own camera poses."""
+        """Return the options for a capture: with `backend` if given, and with the camera poses that the capture has."""
         reconstruct = self.reconstruct if backend is None else replace(self.reconstruct, backend=backend)
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
@@ -70,33 +70,35 @@ class RunState(BaseModel):
     """Folder of the capture."""
     options: RunOptions
     attempts: tuple[Attempt, ...] = ()
-    """Attempts from which the reconstruction was selected."""
+    """Attempts with different back ends, from which the reconstruction was selected."""
     made: dict[str, str] = {}
-    """Fingerprints of the inputs: `reconstruct`, of the reconstruction, and of a finished run `run`, of all of them."""
+    """Fingerprints of inputs: key "reconstruct" for those of the reconstruction, key "run" (only for a finished run)
+    for all inputs."""
     files: dict[str, str] = {}
-    """Identity of each file of a run whose stages have all finished; empty of another."""
+    """Fingerprint of each file of a finished run, by file name; empty for an unfinished run."""
 
 
 class RunResult:
-    """Result of a run, and content of its folder `out`; attributes of its calibration are its own, too.
+    """Result of a run in the folder `out`; it also has all attributes of its `calibration`.
 
-    A part that this process has not made is read when it is first used; InputError where it is damaged.
+    Parts that this process has not computed are read from the folder on first use; a damaged file raises InputError.
     """
 
     out: Path
+    """Run folder."""
     is_unchanged: bool = False
-    """Whether the folder had the files of the same run already, and nothing was made."""
+    """Whether nothing was computed, because the folder held the results of the same run already."""
 
     def __init__(self, out: str | Path, **parts: Any) -> None:
-        """Open a run folder, with the parts that are there already."""
+        """Open a run folder; `parts` are properties that are known already, such as `calibration`."""
         vars(self).update(parts, out=Path(out))
 
     def with_parts(self, **parts: Any) -> "RunResult":
-        """Return the result with other parts."""
+        """Return the result with some parts, such as `calibration`, replaced."""
         return RunResult(**(vars(self) | parts))
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the calibration."""
+        """Return the attribute of this name of the calibration."""
         if name.startswith("_"):
             raise AttributeError(name)
         return getattr(self.calibration, name)
@@ -108,14 +110,14 @@ class RunResult:
 
     @property
     def found(self) -> Calibration:
-        """The calibration; RejectedError where nothing was found."""
+        """Calibration of a successful run; raises RejectedError for a failed calibration."""
         if isinstance(self.calibration, FailedCalibration):
             raise RejectedError(f"no calibration was found: {self.calibration.doubt}")
         return self.calibration
 
     @cached_property
     def state(self) -> RunState:
-        """Content of run.json; InputError where there is no run."""
+        """Content of run.json; raises InputError if the folder holds no run."""
         file = self.out / STATE
         try:
             return RunState.model_validate_json(read_bytes(file), strict=True)
@@ -130,49 +132,49 @@ class RunResult:
 
     @cached_property
     def capture(self) -> Capture:
-        """Images and poses of the run; InputError where they are gone."""
+        """Capture of the run; raises InputError if it was moved or deleted."""
         try:
             return read_capture(self.state.capture)
-        except OSError as error:  # a path that no file system takes
+        except OSError as error:  # a path that is invalid for the file system
             raise InputError(f"{self.out / STATE}: capture: {error.strerror}; run `jcr run` again") from None
 
     @cached_property
     def added(self) -> Capture:
-        """Images for the map alone that were added to the run later."""
+        """Images that were added to the run later, for the map only."""
         return read_added(self.out, self.capture)
 
     @cached_property
     def others(self) -> tuple[CellCamera, ...]:
-        """Other cameras of the cell, those of the capture and those added to the run."""
+        """Further cameras of the cell: those of the capture, and those that were added to the run."""
         if self.capture.mount == "base":
             return ()
         return (*self.capture.others, *read_added_cameras(self.out, self.capture))
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
-        """Camera poses, tracks, and depth where there is some."""
+        """Reconstruction of the run, with pointmaps if the run has depth."""
         found = read_reconstruction(self.out / RECONSTRUCTION)
         if found.pointmaps is not None or not (self.out / DEPTH).is_file():
             return found
         try:
             capture = self.capture
-        except InputError:  # no longer there; the points are grey
+        except InputError:  # the images are missing, so the points have no colours
             capture = None
         return replace(found, pointmaps=read_depth(self.out / DEPTH, found, capture))
 
     @cached_property
     def cloud(self) -> PointCloud | None:
-        """Points in the base frame; None without a map."""
+        """Point cloud in the base frame; None for a run without a map."""
         return read_cloud(self.out / CLOUD) if (self.out / CLOUD).is_file() else None
 
     @cached_property
     def scene(self) -> "SceneMap | None":
-        """Map of the run; None where there is none."""
+        """Map of the run; None for a run without a map."""
         return load_map(self.out) if (self.out / MAP).is_file() else None
 
     @cached_property
     def measured(self) -> "Measurement | None":
-        """Support plane and objects; None without a map, and where no plane carries the scene."""
+        """Support plane and objects on it; None without a map or without a support plane."""
         from jcr.segments.measure import measure_objects
 
         try:
@@ -182,24 +184,25 @@ class RunResult:
 
     @cached_property
     def cameras(self) -> CamerasFile | None:
-        """Further cameras of the cell; None where there are none."""
+        """Calibration of the further cameras of the cell; None without further cameras."""
         return read_cameras(self.out)
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:
-        """Rows of the images that have a camera pose."""
+        """Rows of the capture of the registered images."""
         return self.reconstruction.image_index
 
     @property
     def scale_std(self) -> float:
-        """Relative standard deviation of the scale."""
+        """Relative standard deviation of the scale; 0 for a failed calibration."""
         uncertainty = self.calibration.uncertainty
         return 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100
 
     def of_wrist_camera(self) -> tuple[Calibration, Capture, Reconstruction]:
-        """Return calibration, capture and reconstruction of a camera on the gripper, which belong together.
+        """Return calibration, capture and reconstruction of a run with a camera on the gripper.
 
-        Raises InputError where one is missing or damaged, nothing was found, or they are not of the same images.
+        Raises InputError if one is missing or damaged, if the calibration failed or is of a fixed camera, or if the
+        three do not have the same images.
         """
         calibration = self.calibration
         if calibration.mount == "base":
@@ -224,10 +227,10 @@ class RunResult:
         return calibration, capture, reconstruction
 
     def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
+        """Return the calibration as an HTML table, which notebooks display."""
         return self.found.as_html(str(self.out / REPORT))
 
 
 def load_run(out: str | Path) -> RunResult:
-    """Return the run in the folder `out`; InputError where there is none, or its calibration.json was damaged."""
+    """Return the result of the run in the folder `out`; raise InputError if calibration.json is missing or damaged."""
     return RunResult(out, calibration=read_calibration(Path(out)))

@@ -1,25 +1,26 @@
-"""Numbers and labelled lines for people."""
+"""Formatting of numbers and labelled lines for reports and the terminal."""
 
 import numpy as np
 
 MOST_DECIMALS = 9
+"""Largest number of decimals of a number with a standard deviation."""
 
 
 def decimals_of(std: float) -> int:
-    """Return the decimals of a number with this standard deviation: none is below a tenth of it."""
+    """Return the number of decimals for a value with this standard deviation: the last is worth std/10 to std."""
     if not np.isfinite(std) or std <= 0:
         return MOST_DECIMALS if std == 0 else 0
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
 
 
 def with_std(value: float, std: float) -> str:
-    """Return the number and its standard deviation with the decimals that these leave: 25.40 ± 0.05."""
+    """Return a value and its standard deviation as text, both with `decimals_of` decimals, such as "25.40 ± 0.05"."""
     decimals = decimals_of(std)
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Return the number with this many significant digits, never in powers of ten; at most six decimals."""
+    """Return the number as text with `digits` significant digits and at most six decimals, without an exponent."""
     if not np.isfinite(value):
         return "unknown"
     if abs(value) < 0.5e-6:
@@ -29,5 +30,5 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def labelled(label: str, *lines: str) -> list[str]:
-    """Return lines behind a label in a column of 12 characters."""
+    """Return the lines indented by 12 characters, with `label` at the start of the first."""
     return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]

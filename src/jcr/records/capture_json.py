@@ -1,4 +1,4 @@
-"""Content of a capture.json: frames, intrinsics and further cameras, as they are read and written."""
+"""Models of the content of a capture.json: frames, intrinsics and further cameras."""
 
 import json
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount
 from jcr.records.json_fields import Positive
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
-"""Pattern of the names of cameras and arms."""
+"""Regular expression of valid names of cameras and arms."""
 Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
 MOST_ROTATION = 6 * np.pi + 0.01
-"""Largest joint angle, rad: no joint rotates farther to either side."""
+"""Largest absolute joint angle (rad); a larger one is probably in degrees."""
 Std = Annotated[float, Field(ge=0, lt=HUGE)] | None
 
 
@@ -38,14 +38,14 @@ def other_size(
     whose: str = "images",
     remedy: str = "take all with one camera at one resolution",
 ) -> InputError:
-    """Return the error of an image, depth image or intrinsics of another resolution than the images'."""
+    """Return the error that `what` has the resolution `size`, while `whose` have the resolution `expected`."""
     return InputError(
         f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
     )
 
 
 def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
-    """Return a rigid 4x4 from nested lists; raise InputError that says how it differs from rigid."""
+    """Return a rigid 4x4 matrix from nested lists; raise InputError with the deviation if it is not rigid."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -60,46 +60,49 @@ RigidMatrix = Annotated[
     BeforeValidator(lambda value: value if isinstance(value, ndarray) else read_rigid(value)),
     PlainSerializer(lambda pose: pose.tolist()),
 ]
-"""Rigid transform (4,4) in a file; an array is one already, and stays as it is to the last bit."""
+"""Rigid transform (4,4), in files as nested lists; an array is accepted unchanged and unchecked."""
 
 
 def _plausible(angles: list[float]) -> list[float]:
-    """Return joint angles (rad); raise ValueError where they look like degrees."""
+    """Return joint angles (rad); raise ValueError if one is so large that they are probably in degrees."""
     if (largest := max(map(abs, angles))) > MOST_ROTATION:
         raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
     return angles
 
 
 class Entry(BaseModel):
-    """Part of a capture.json; other keys than its fields are ignored."""
+    """Base class of the objects in a capture.json; unknown keys are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
 
 class IntrinsicsEntry(Entry):
-    """Intrinsics in a capture.json, px; the size of the images is that of the capture."""
+    """Intrinsics in a capture.json (px), which apply to images of the capture's size."""
 
     fx: Positive
     fy: Positive
     cx: float
     cy: float
     distortion: list[float] | None = None
-    """Coefficients in OpenCV's order; none given: 0."""
+    """Coefficients in OpenCV's order; None or empty: no distortion."""
     model: DistortionModel = "pinhole"
     width: int | None = None
-    """Width of the images, px; of the capture's images where it is not stated."""
+    """Width (px) of the images that the intrinsics apply to; None: that of the capture's images."""
     height: int | None = None
-    """Height of the images, px; of the capture's images where it is not stated."""
+    """Height (px) of the images that the intrinsics apply to; None: that of the capture's images."""
 
     @staticmethod
     def of(intrinsics: Intrinsics) -> "IntrinsicsEntry":
-        """Return the entry of intrinsics."""
+        """Return the entry that states these intrinsics, without the size of the images."""
         model = {} if intrinsics.model == "pinhole" else {"model": intrinsics.model}
         numbers = {key: getattr(intrinsics, key) for key in ("fx", "fy", "cx", "cy")}
         return IntrinsicsEntry(**model, **numbers, distortion=list(intrinsics.distortion))
 
     def record(self, size: tuple[int, int], where: str) -> Intrinsics:
-        """Return the intrinsics of images of `size`; raise InputError, begun with `where`, where they cannot be."""
+        """Return the intrinsics for images of `size` (width, height).
+
+        Raises InputError, whose message begins with `where`, if they do not fit the images or the distortion model.
+        """
         names = COEFFICIENTS[self.model]
         distortion = self.distortion or [0.0] * len(names)
         if len(distortion) != len(names):
@@ -119,7 +122,7 @@ class IntrinsicsEntry(Entry):
 
 
 class StdEntry(Entry, extra="forbid"):
-    """Standard deviations of intrinsics in a capture.json, px and units of distortion; 0 is exact, null not stated."""
+    """Standard deviations of the intrinsics in a capture.json (px; distortion: no unit). 0: exact; null: not stated."""
 
     fx: Std = None
     fy: Std = None
@@ -129,41 +132,42 @@ class StdEntry(Entry, extra="forbid"):
 
 
 class FrameEntry(Entry):
-    """Frame of a capture.json: an image with the data recorded at it."""
+    """Frame of a capture.json: an image, its gripper pose, and other data recorded with it."""
 
     image: str
-    """Path in the folder of the capture."""
+    """Path of the image, relative to the folder of the capture."""
     base_from_gripper: RigidMatrix
     joints: Annotated[list[float], Field(min_length=1), AfterValidator(_plausible)] | None = None
-    """Joint angles (rad), from the base on."""
+    """Joint angles (rad), from the base to the gripper."""
     depth: str | None = None
-    """Path of a depth camera's image."""
+    """Path of the depth image, relative to the folder of the capture."""
     time_s: float | None = None
-    """Time on the camera's clock."""
+    """Time of the image on the camera's clock (s)."""
 
 
 class CameraEntry(Entry, extra="forbid"):
-    """Camera in "cameras" of a capture.json."""
+    """Camera in the object "cameras" of a capture.json, whose keys are the names of the cameras."""
 
     mount: Mount
     watches: Literal["scene", "gripper"] | None = None
     """Subject of the images; unset: the gripper for a fixed camera without images, else the scene."""
     arm: Name | None = None
-    """Other arm that carries the camera."""
+    """Name of another arm that carries the camera."""
     frames: list[FrameEntry] | None = None
-    """Images of a camera on another arm, each with that arm's gripper pose in its own base."""
+    """Images of a camera on another arm, each with that arm's gripper pose in its own base frame."""
     images: list[str | None] | None = None
+    """Paths of the images of a further camera; null for a frame of the capture without one."""
     intrinsics: IntrinsicsEntry | None = None
     intrinsics_std: StdEntry | None = None
 
     @property
     def is_own(self) -> bool:
-        """Whether the entry is that of the camera of the capture's frames."""
+        """Whether the entry describes the camera that took the images in the frames of the capture."""
         return self.images is None and self.frames is None
 
     @model_validator(mode="after")
     def _agrees(self) -> "CameraEntry":
-        """Raise ValueError where mount, arm, frames and images contradict each other."""
+        """Raise ValueError if mount, arm, frames and images contradict each other."""
         is_fixed, own, shows_gripper = self.mount == "base", self.is_own, self.watches == "gripper"
         if own and self.watches is not None and is_fixed is not shows_gripper:
             raise ValueError(
@@ -184,7 +188,7 @@ class CameraEntry(Entry, extra="forbid"):
 
 
 def _one_own(cameras: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
-    """Return the cameras; raise ValueError where several of them are without images."""
+    """Return the cameras; raise ValueError if more than one has no images of its own."""
     if len(own := [name for name, camera in cameras.items() if camera.is_own]) > 1:
         raise ValueError(f"{', '.join(own)} have no images; only one can be the camera of the frames")
     return cameras
@@ -194,10 +198,10 @@ CameraEntries = Annotated[dict[Name, CameraEntry], AfterValidator(_one_own)]
 
 
 class CaptureFile(Entry, extra="allow"):
-    """Content of a capture.json; other keys are kept."""
+    """Content of a capture.json; unknown keys are kept."""
 
     frames: list[Any]
-    """Entries that FrameEntry validates one by one, so that a few of them may be faulty."""
+    """Frames as JSON objects; each is validated as a FrameEntry later, because a few of them may be invalid."""
     intrinsics: IntrinsicsEntry | None = None
     intrinsics_std: StdEntry | None = None
     pose_convention: Any = None
@@ -206,5 +210,5 @@ class CaptureFile(Entry, extra="allow"):
     cameras: CameraEntries | None = None
 
     def as_text(self) -> str:
-        """Return the text of the file."""
+        """Return the text of the capture.json."""
         return json.dumps(self.model_dump(mode="json", exclude_unset=True), indent=1) + "\n"

@@ -1,4 +1,4 @@
-"""Reconstruction from images alone up to one similarity, and the cloud that is made of it in the base frame."""
+"""Records of a reconstruction (camera poses, tracks, boards, pointmaps) and of its point cloud in the base frame."""
 
 from dataclasses import dataclass, replace
 
@@ -11,106 +11,107 @@ from jcr.records.capture import Intrinsics
 
 @dataclass(frozen=True)
 class Body:
-    """A board, or a single tag, among the points of tracks: rigid, and unrelated to other bodies."""
+    """Board or single tag whose corners are points of the tracks; each is a rigid body of its own."""
 
     number: int
     """Number of the tag; 0 for a board."""
     point: Int[ndarray, " _"]
-    """Rows of `Tracks.points_in_recon`, its corners."""
+    """Indices of the corners in `Tracks.points_in_recon`."""
     x_in_body: Float[ndarray, "_ 3"]
-    """Corners as printed, z = 0; in metres, or in sides where the side is unknown."""
+    """Corners as printed, with z = 0, in metres; in units of the side if the side is unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Boards:
-    """The boards or tags of one `--board`."""
+    """Board or tags of one `--board` option, as found in the images."""
 
     spec: str
-    """The boards as `--board` names them."""
+    """Value of the option `--board`."""
     side: float
-    """Side of a square or a tag, in the unit of `Body.x_in_body`: metres, or 1 where it is unknown."""
+    """Side of a square or a tag (m); 1 if it is unknown."""
     size_std: float | None
     """Relative standard deviation of the stated size, common to all bodies; None: the size is unknown."""
     bodies: tuple[Body, ...]
-    """Empty where no two images show one."""
+    """Bodies that two or more images show; empty if there are none."""
     elsewhere: tuple[int, ...] = ()
-    """Rows of the reconstruction whose images show a body at another place than most do: their corners are left out."""
+    """Indices, among the registered images, of those that show a body at another position than most images do; their
+    corners are not in the tracks."""
     proposed: str | None = None
-    """Value for `--board` that the images seem to show where no body was found; None where they show none."""
+    """Value of `--board` that fits the images if no body was found; None if no other board is visible."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Observations of common 3D points, for bundle adjustment, whatever back end made them."""
+    """Points of a reconstruction and their k observations in the images, for bundle adjustment."""
 
     image: Int[ndarray, " k"]
-    """Row of the reconstruction (not of the capture) that each observation belongs to."""
+    """Index of each observation's image among the registered images (not among those of the capture)."""
     x_px: Float[ndarray, "k 2"]
-    """Pixels of the capture's original image, distorted as the camera made it."""
+    """Pixel of each observation in the original, distorted image."""
     point: Int[ndarray, " k"]
-    """Row of `points_in_recon`."""
+    """Index of each observation's point in `points_in_recon`."""
     points_in_recon: Float[ndarray, "p 3"]
     from_pointmaps: bool = False
-    """Matched between pointmaps, with errors that neighbours share, instead of found in the images."""
+    """Whether the observations are matches between pointmaps, with correlated errors, and not features of the images."""
     from_board: bool = False
-    """All on a board or tags: the scene rises above them."""
+    """Whether all points lie on a board or tags, so that the points do not show the height of the scene."""
     std_px: Float[ndarray, " k"] | None = None
-    """Standard deviation of one coordinate of each observation by its match, up to a factor; None: all are alike."""
+    """Relative standard deviation of each observation's coordinates, up to a common factor; None: equal for all."""
     boards: Boards | None = None
-    """Boards or tags whose corners are among the points; None: no shape of any point is known."""
+    """Boards or tags whose corners are among the points; None without the option `--board`."""
 
     @property
     def on_board(self) -> Bool[ndarray, " p"]:
-        """Mask of the points that are corners of `boards`."""
+        """Mask of the points that are corners of a board or tag."""
         out = np.zeros(len(self.points_in_recon), bool)
         for body in () if self.boards is None else self.boards.bodies:
             out[body.point] = True
         return out
 
     def only(self, rows: Bool[ndarray, " k"] | Int[ndarray, " n"]) -> "Tracks":
-        """Return these observations; points keep their rows."""
+        """Return the tracks with the observations of a mask or of indices; all points are kept."""
         std = None if self.std_px is None else self.std_px[rows]
         return replace(self, image=self.image[rows], x_px=self.x_px[rows], point=self.point[rows], std_px=std)
 
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """The cameras as the images alone determine them, with their covariance; no robot pose is used."""
+    """Camera poses that the images determine without robot poses, with their joint covariance."""
 
     recon_from_camera: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "6*m 6*m"]
-    """Covariance of steps of the cameras (geometry.retract, recon axes), camera by camera. The recon frame is
-    that of one of the cameras, which is therefore exact."""
+    """Covariance of steps of the camera poses (geometry.retract, recon axes), 6 rows per camera. One camera defines the
+    recon frame; its rows are 0."""
 
 
 NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
-"""Evidence of a depth: none; images that show the same, or a network's prediction; a plane that the colours and the
-matched depths around it support; both."""
+"""Values of Pointmaps.reason, the origin of a pixel's depth. NO_DEPTH: none. MATCHED: matches between images, or a
+network. PRIOR: a plane supported by the colours and the matched depths around it. BOTH: MATCHED and PRIOR agree."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pointmaps:
-    """A surface point for every pixel of the registered images, a row an image."""
+    """Surface point of each pixel (h,w) of the m registered images, in the recon frame."""
 
     intrinsics: Intrinsics
-    """The undistorted pinhole grid of the pixels (size W x H)."""
+    """Intrinsics of the pixel grid, a pinhole camera without distortion with images of w x h pixels."""
     points_in_recon: Float[ndarray, "m h w 3"]
     confidence: Float[ndarray, "m h w"]
-    """At least 0; 0 means no estimate (the point may be anything, finite)."""
+    """Confidence of each point, at least 0; at 0 there is no estimate, and the point is any finite value."""
     colors: UInt8[ndarray, "m h w 3"]
-    """RGB at the pixels."""
+    """RGB colour of each pixel."""
     reason: UInt8[ndarray, "m h w"] | None = None
-    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: a network predicted all of them."""
+    """Origin of each depth: NO_DEPTH, MATCHED, PRIOR or BOTH; None: a network predicted all depths."""
     depth_std: Float[ndarray, "m h w"] | None = None
-    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: unknown."""
+    """Standard deviation of each depth z (recon units), 0 without a depth; None: unknown."""
 
     @property
     def is_predicted(self) -> bool:
-        """Whether a network predicted them, as part of the reconstruction."""
+        """Whether the network of the back end predicted the pointmaps; otherwise the stage densify estimated them."""
         return self.reason is None
 
     def of_rows(self, rows: Int[ndarray, " k"]) -> "Pointmaps":
-        """Return the pointmaps of some images, in the order of `rows`."""
+        """Return the pointmaps of the images of these indices, in their order."""
         return replace(
             self,
             points_in_recon=self.points_in_recon[rows],
@@ -123,64 +124,66 @@ class Pointmaps:
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction:
-    """Camera poses, tracks and pointmaps in one frame, up to a similarity unless `is_metric`."""
+    """Reconstruction of a capture: camera poses, tracks and pointmaps in one frame of arbitrary origin and unit."""
 
     image_index: Int[ndarray, " m"]
-    """Rows of the capture that were registered, ascending."""
+    """Rows of the capture of the m registered images, ascending."""
     recon_from_camera: Float[ndarray, "m 4 4"]
     intrinsics: Intrinsics
-    """The camera of the capture's original images: given, or estimated by the back end."""
+    """Intrinsics of the capture's original images: given, or estimated by the back end."""
     tracks: Tracks
     backend: str
+    """Name of the back end."""
     pointmaps: Pointmaps | None = None
-    """Predicted by the back end's network, or estimated by the stage densify; None before it."""
+    """Pointmaps, predicted by the back end's network or estimated by the stage densify; None before that stage."""
     is_metric: bool = False
-    """Whether the unit is meant to be the metre."""
+    """Whether the unit is nominally the metre."""
     metric_std: float | None = None
-    """Relative standard deviation of its unit from a metre; None: not given."""
+    """Relative standard deviation of a metric unit; None: unknown, or the unit is arbitrary."""
     notes: tuple[str, ...] = ()
-    """Remarks: images not registered, matches left out."""
+    """Remarks of the back end, for example on images that were not registered."""
     warnings: tuple[str, ...] = ()
-    """Warnings: intrinsics that cannot be used, a gripper pose that the images contradict."""
+    """Warnings of the back end, for example on a gripper pose that the images contradict."""
     evidence: CameraEvidence | None = None
-    """Evidence in the same frame, where robot poses were used for `recon_from_camera` or cameras err beside them."""
+    """Camera poses from the images alone in the same frame, with covariance, to be used for the calibration; None if
+    `recon_from_camera` is to be used."""
 
     predicted_focal: tuple[float, float] | None = None
-    """Focal length of a network (px of the original image) and its relative standard deviation, where no match in the
-    images confirms it; None: the images determine the focal length, or nothing was predicted."""
+    """Focal length that a network predicted (px of the original image), and its relative standard deviation; None: the
+    images determine the focal length, or nothing was predicted."""
 
     @property
     def dense(self) -> Pointmaps:
-        """The pointmaps, for what comes after densify."""
+        """Pointmaps of a reconstruction that has passed the stage densify; raises AssertionError before it."""
         assert self.pointmaps is not None, "the stage densify comes first"
         return self.pointmaps
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointCloud:
-    """Confident points in the base frame, with the rays that saw them."""
+    """Point cloud in the base frame: confident points of the pointmaps, with the centre of the camera that saw each."""
 
     points_in_base: Float[ndarray, "n 3"]
     color: UInt8[ndarray, "n 3"]
     confidence: Float[ndarray, " n"]
     margin: Float[ndarray, " n"]
-    """One-sigma position uncertainty (m) that the calibration leaves at the point."""
+    """Standard deviation of each point's position due to the calibration (m)."""
     label: Int[ndarray, " n"]
-    """Segment; 0 = none."""
+    """Index of each point's segment in `label_names`; 0: no segment."""
     image: Int[ndarray, " n"]
-    """Row of `camera_centers_in_base`."""
+    """Index of each point's camera in `camera_centers_in_base`."""
     camera_centers_in_base: Float[ndarray, "m 3"]
     label_names: tuple[str, ...] = ("none",)
     reason: UInt8[ndarray, " n"] | None = None
-    """MATCHED, PRIOR or BOTH; None: no point is a prior."""
+    """Origin of each depth: MATCHED, PRIOR or BOTH; None: no depth is a PRIOR."""
     depth_std: Float[ndarray, " n"] | None = None
-    """One sigma (m) of the depth in its image; None: not known."""
+    """Standard deviation of each point's depth in its image (m); None: unknown."""
     clears: Bool[ndarray, " n"] | None = None
-    """Whether the way from the camera to the point counts as seen free; None: every one but to a PRIOR."""
+    """Mask of points whose ray from the camera counts as free space; None: all points but those of reason PRIOR."""
 
     @property
     def cleared(self) -> Bool[ndarray, " n"]:
-        """`clears`, with what None stands for."""
+        """Mask of points whose ray from the camera counts as free space."""
         if self.clears is not None:
             return self.clears
         return np.ones(len(self.image), bool) if self.reason is None else self.reason != PRIOR
