@@ -382,4 +382,4 @@ def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unkno
     if unknown != "report":
         return np.asarray(states.any(-1))
     rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too
-    return rank[rank[states].max(-1, initial=0)]
+    return np.asarray(rank[rank[states].max(-1, initial=0)])
