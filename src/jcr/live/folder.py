@@ -23,6 +23,7 @@ from jcr.records import Capture
 from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
 
 IMAGES = "images"
+"""Subfolder of the colour images."""
 Channels = Literal["rgb", "bgr"]
 """Order of the colour channels of an image."""
 

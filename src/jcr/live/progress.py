@@ -114,7 +114,10 @@ class Progress:
 
 
 def faults(state: Progress) -> list[Finding]:
-    """Return the findings that reject or warn, those on the added image first; without the need for more images."""
+    """Return the findings that reject or warn, those on the added image first.
+
+    Findings that only state that more images are needed are left out.
+    """
     more_images = FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES
     acting = (one for one in without_consequences(state.findings) if one.severity != "informs")
     found = [one for one in acting if one.kind not in more_images]

@@ -275,7 +275,11 @@ def _by_recalibration(
 
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
-    """Return the drift of a camera between two poses that differ by `offset` (m, rad), with its covariance."""
+    """Return the drift of a camera from its old to its new pose, with a χ² test.
+
+    `offset` is the difference of the poses (three translations in m, three rotations in rad), `covariance` its
+    covariance.
+    """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, options.alpha)
     found = {"offset": offset, "covariance": covariance, "p_value": p_value, "detectable": noticed}

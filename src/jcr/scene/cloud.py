@@ -24,8 +24,11 @@ _COLUMNS = {
 }
 """Properties of a point in the PLY file and their types; `reason` and `depth_std` are written only if they are known."""
 _AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
+"""Type in a PointCloud of each type in the file."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+"""PLY's name of each type in the file."""
 _FIRST = "comment jcr cloud in the base frame, metres"
+"""Line of the header that identifies a cloud of jcr."""
 
 
 def point_cloud(

@@ -193,7 +193,7 @@ class Field(nn.Module):
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Return by property its outputs (n, outputs) at points (n,3) m."""
+        """Return the outputs (n, outputs) of the network at points (n,3) m, by name of the property."""
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
@@ -217,7 +217,7 @@ class Fields(nn.Module):
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return by property its outputs (n, outputs) at points (n,3) m, for the properties in `names`."""
+        """Return the outputs (n, outputs) of the fields at points (n,3) m, for each property in `names`."""
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):
@@ -226,6 +226,7 @@ class Fields(nn.Module):
 
 
 CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
+"""Number of rows in a piece of `in_chunks`, by type of device."""
 
 
 def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:

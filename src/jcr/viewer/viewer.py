@@ -36,8 +36,11 @@ if TYPE_CHECKING:
     import yourdfpy
 
 CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
+"""RGB of cameras: of used images, of the selected image, and of rejected images."""
 FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
+"""RGB of the free and of the colliding sphere, and of occupied space in a slice."""
 GREY = (110, 110, 110)
+"""RGB of unknown space."""
 CLOUD, MAP = "points as measured", "map"
 """Names of the two kinds of points that can be drawn."""
 MAP_POINTS = 150_000
