@@ -19,7 +19,7 @@ from numpy import ndarray
 from jcr.records import COEFFICIENTS, Intrinsics
 
 HALF_PIXEL = 0.5
-"""Difference (px) of pixel coordinates in COLMAP and nerfstudio, counted from the image corner, to those here."""
+"""Pixel coordinates of COLMAP and nerfstudio, which count from the image corner, minus those of this project (px)."""
 USUAL_FOCAL = 0.8
 """Assumed focal length of an unknown camera over the long side of its image (64° wide); wrist cameras: 0.5 to 1.2."""
 WITHIN_FOLD = 0.9

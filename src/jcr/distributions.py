@@ -13,7 +13,7 @@ Number = float | int | np.number | ndarray
 
 
 class chi2:  # noqa: N801
-    """Chi-squared distribution; arguments are x, or a probability, then the degrees of freedom."""
+    """Chi-squared distribution: cdf and sf of x, ppf and isf of a probability; second argument: degrees of freedom."""
 
     cdf = staticmethod(lambda x, freedom: chdtr(freedom, x))
     sf = staticmethod(lambda x, freedom: chdtrc(freedom, x))

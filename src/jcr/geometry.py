@@ -65,7 +65,7 @@ def skew(v: Vectors) -> Rotations:
 
 
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
-    """Return [I, -skew(v), v], the derivatives of points v by a translation, a rotation about 0, and a log scale."""
+    """Return [I, -skew(v), v], derivatives of points v by translation, rotation about the origin, and log scale."""
     identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
     return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
 

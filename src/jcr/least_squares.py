@@ -37,7 +37,7 @@ class Minimum(Generic[Unknowns]):
 
     unknowns: Unknowns
     cost: Any
-    """Half the sum of the losses."""
+    """Half the sum of the losses at the minimum; an array for many problems."""
     normal: Float[ndarray, "*b p p"]
     """Matrix JᵀWJ at the minimum, W being the weights of the loss: the inverse covariance if residuals are whitened."""
     settled: bool

@@ -80,7 +80,7 @@ class ImageUse(Part):
     """Number of points shared with the images of the capture's own camera."""
     reprojection_px: float | None
     reason: str | None
-    """Reason why the image was not used."""
+    """Reason why the image was not used; null for a used image."""
 
 
 class CameraPlacement(Part):
@@ -98,7 +98,7 @@ class CameraPlacement(Part):
     intrinsics: IntrinsicsAndStd | None = None
     images: list[ImageUse] = Field(alias="pictures")
     findings: list[FindingJson] = []
-    """Strongest first."""
+    """Findings about the camera, the most severe first."""
     verdict: Verdict
     """Verdict of the worst finding."""
     converged: bool

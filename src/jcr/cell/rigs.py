@@ -64,13 +64,13 @@ def localise(
 
 
 def _count(found: Registration | int) -> int:
-    """Return the number of shared points of a registration, or of a failed one (the number itself)."""
+    """Return the number of points that agree with a registration; a failed registration is that number itself."""
     return len(found.x_px) if isinstance(found, Registration) else found
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraViews:
-    """Images of one further camera: registrations of the used ones, their rigs, and reasons for the unused ones."""
+    """Images of one further camera: registrations and rigs of the k used images, reasons for the unused ones."""
 
     camera: CellCamera
     points: Sequence[int]
@@ -144,7 +144,7 @@ def known_images(case: Case) -> KnownImages:
 
 
 class Rigs:
-    """All rigs of a cell: poses of the capture's own camera at each used image, then rigs of the added cameras.
+    """All rigs (bodies that carry cameras) of a cell: one for each used image of the own camera, then those of others.
 
     `case` is the calibration of the own camera, `known` are its used images with poses in metres.
     """

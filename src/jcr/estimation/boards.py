@@ -24,9 +24,9 @@ from jcr.records import Boards
 CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
 """Standard deviation of a single corner along each axis of its body."""
 STRETCH_STD = 1e-3
-"""Standard deviation of the relative stretch of x over y by a printer."""
+"""Prior standard deviation of the relative stretch of a printed board's x axis over its y axis."""
 BEND_STD_M = {2: 3e-4, 3: 1e-4}
-"""Standard deviation of the bend (m rms over the corners) by one polynomial, by its degree."""
+"""Prior standard deviation of a board's bend (m rms) by each polynomial of degree 2, and of degree 3."""
 SIZE_STD = 10.0
 """Prior standard deviation of the log size l; large, because the unit of the world is unknown."""
 FEWEST_TO_BEND = 9
@@ -37,7 +37,7 @@ FEWEST_CORNERS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class BoardShapes:
-    """Shape prior of c board corners, with s shape parameters: log size, then deformations of each body."""
+    """Shape prior of the c corners of all bodies (boards, tags); s shape parameters: log size, then deformations."""
 
     point: Int[ndarray, " c"]
     """Point of each corner, ascending."""
@@ -177,7 +177,7 @@ def _seen_bodies(
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
-    """Return w deformations of a body with c corners, displacements by one unit each, and their standard deviations."""
+    """Return w deformations of a body, as displacements of its c corners, and their prior standard deviations."""
     if len(x) < FEWEST_TO_BEND:
         return np.zeros((len(x), 3, 0)), ()
     across = x[:, :2] - x[:, :2].mean(0)

@@ -113,7 +113,7 @@ class Normal:
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
-    """Negative gradient."""
+    """Right side: negative gradient."""
     _blocks: list[tuple[ndarray, ndarray, ndarray, ndarray]]
     """For each group of points: rows of its points; its columns; inverse Cholesky factors L⁻¹ of the points' 3x3 blocks;
     L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""

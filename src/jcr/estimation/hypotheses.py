@@ -54,7 +54,7 @@ ORDERS = 200
 BY_CHANCE = 0.02
 """Largest share of random orders with at least the gain of the actual order."""
 LEAST_PART = 3
-"""Smallest number of images before and after a change; fewer are single wrong poses."""
+"""Smallest number of images before and after a change, such as a slip; fewer are single wrong poses."""
 MANY_PLACES = 60
 """Largest number of images at which a change is tested; longer captures are sampled evenly."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -95,7 +95,7 @@ class Test:
 
     row: Row
     estimate: Float[ndarray, " d"]
-    """Estimated parameters of the effect."""
+    """Estimate of the d parameters of the effect."""
     covariance: Float[ndarray, "d d"]
     log_p: float
     """Log p-value: chance of such an estimate without the effect, times the number of places tested."""
@@ -291,7 +291,7 @@ class Alternatives:
     freedom: int
     """Degrees of freedom of the reported poses' residuals, used for F tests; images have far more."""
     dispersion: float
-    """Dispersion: actual variance of a gradient over the variance that the weights imply."""
+    """Ratio of the gradient's actual variance to the variance that the observations' weights imply."""
     names: tuple[str, ...]
     """Names of the camera's parameters."""
     units: Float[ndarray, " q"]
@@ -299,7 +299,7 @@ class Alternatives:
     distance: Float[ndarray, " m"]
     """Median depth of the points of each image (m)."""
     down_in_camera: Float[ndarray, "m 3"]
-    """Base's −z axis in the camera frame of each image."""
+    """Direction of gravity (−z of the base) in the camera frame of each image."""
 
     @property
     def columns(self) -> int:
@@ -438,7 +438,7 @@ def differences(count: int) -> Float[ndarray, "n d"]:
 def test_combinations(
     equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]
 ) -> ScoreTest:
-    """Return the test that frees the combinations `free`; those of `beside` are free under both hypotheses."""
+    """Return the score test that frees p linear combinations `free`; q others, `beside`, are free in both hypotheses."""
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     (without, gain_without, _), (step, gain, covariance) = (_step(equations, one) for one in (fewer, more))

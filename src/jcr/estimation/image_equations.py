@@ -35,13 +35,13 @@ SIZES_SETTLED = 0.01
 ENOUGH = 1e-5
 """Change of the cost, in squared standard deviations, that ends an adjustment."""
 STEPS = 60
-"""Largest number of steps of an adjustment."""
+"""Largest number of Gauss-Newton steps of one adjustment."""
 FAINT = 1e-6
 """Information added to every column (1/m², 1/rad²): a standard deviation of 1 km for images without observations."""
 
 
 class RigInformation(NamedTuple):
-    """Information about the first m rigs: sᵀ H s + 2 gᵀ s is twice the cost of steps s from reference poses."""
+    """Quadratic cost of the first m rigs: ½ sᵀ H s + gᵀ s for steps s (6m numbers) from reference poses."""
 
     world_from_rig: Float[ndarray, "m 4 4"]
     """Reference poses."""
@@ -57,7 +57,7 @@ class RigInformation(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageEvidence:
-    """Normal distribution of all d image columns about a state, from images and priors without the reported poses."""
+    """Normal distribution of the d `Problem.columns` about a state, from images and priors, without reported poses."""
 
     problem: Problem
     state: State
@@ -154,7 +154,7 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the normal distribution of the image columns about a state, from images and priors."""
+    """Return the normal distribution of `Problem.columns` about a state, from images and priors alone."""
     return linearised(problem, state, view_of(problem, state))[0]
 
 
@@ -255,7 +255,7 @@ def _normal_equations(
     known: Sequence[RigInformation],
     damping: float,
 ) -> Normal:
-    """Return the damped normal equations of all image columns, with the points eliminated."""
+    """Return the damped normal equations of all `Problem.columns`, with the points eliminated."""
     first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
     weighted = derivatives(problem, state, view, weight)
     hessian, right = with_fixed_points(weighted, seen)

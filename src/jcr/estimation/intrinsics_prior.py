@@ -48,7 +48,7 @@ DECENTRING = 1e-3
 FIXED: Mapping[str, float] = {}
 """Prior of exact intrinsics: no parameter is free."""
 LEAST = 1e-12
-"""Standard deviation below which a parameter is fixed."""
+"""Prior standard deviation below which an intrinsic parameter is fixed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -166,7 +166,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
 def expressed(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "q e"]:
-    """Return the change of the q camera parameters along `directions` that best fits each polynomial at the pixels."""
+    """Return the change of q camera parameters along `directions` that best fits each of e distortion polynomials."""
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
     return (

@@ -44,7 +44,7 @@ MOST = 30
 FITS = (1e-4, 1e-3)
 """Largest misfit (m, rad) of a pose that counts as reached."""
 REFUSED = (0.01, np.radians(1.0))
-"""Misfit of a pose, as a share of the reach and in rad, from which the robot is refused."""
+"""Largest misfit of poses to the named robot, as a share of its reach and in rad; above, InputError is raised."""
 TO_REST = 3e-4
 """Weight (m/rad) of the distance from the rest posture; it changes determined angles by only 1e-6 rad."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
@@ -62,7 +62,7 @@ class Posture:
     joints: Float[ndarray, "n dof"]
     """Joint angles (rad)."""
     flange_from_tool: Transform
-    """Identity, or the estimated tool."""
+    """Estimated pose of the tool on the flange; the identity if no tool was estimated."""
     misfit: Float[ndarray, "n 2"]
     """Distance (m) and angle (rad) of the reached pose from each given one."""
 
@@ -230,7 +230,7 @@ def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Ar
 
 
 NOISE = (1e-3, 1e-3 / ARM)
-"""Errors (m, rad) of equal weight in the fit of base and tool."""
+"""Position and rotation errors (m, rad) that have equal weight in the fit of base and tool."""
 AGREE = (0.015, np.radians(1.5))
 """Largest rms difference between forward kinematics and poses, as a share of the reach and in rad."""
 ALIKE, SURE = 0.01, 5.0

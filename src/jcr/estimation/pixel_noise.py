@@ -19,15 +19,15 @@ MIN_SIGMA_PX = 0.02
 RATIOS = (0.25, 100.0)
 """Bounds of a group's variance over that of the first camera's features."""
 FAR_OFF = 6.0
-"""Residual of an outlier in units of the median residual, about seven standard deviations."""
+"""Multiple of the median residual above which an observation is an outlier, about seven standard deviations."""
 COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Candidate values of `PixelNoise.common`."""
 SCALE_STEPS = 10
-"""Number of reweighted estimates of the variance for each candidate."""
+"""Number of reweighted estimates of the variance for each candidate in COMMON."""
 NEAREST = 0.05
 """Smallest depth of an observation over the median depth; a camera does not focus on nearer points."""
 LEAST_LEFT = 0.1
-"""Smallest usable share of an observation's variance that remains in its residual after its point was estimated."""
+"""Smallest share of an observation's variance in its residual (one minus leverage of its point) that is used."""
 
 
 @dataclass(frozen=True)

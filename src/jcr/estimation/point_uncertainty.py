@@ -90,7 +90,7 @@ def bounds_at(
     x_px: Float[ndarray, "2"],
     distance_m: float,
 ) -> Seen:
-    """Return the bounds that 95 % of the errors of a pixel's point do not exceed: total, across, along ray, in angle."""
+    """Return the 95 % bounds of the error of a pixel's point: in total, across and along the ray, and in direction."""
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
@@ -216,7 +216,7 @@ def scene_points(solution: Solution) -> ScenePoints:
 def _triangulation(
     solution: Solution, some: Int[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of n points by the d image columns, and the points' covariance for fixed columns."""
+    """Return the derivative of n points by the d `Problem.columns`, and the points' covariance if these are exact."""
     images, problem = solution.images, solution.problem
     _, rows_point, rows_rig, _ = problem.rows
     rows = np.flatnonzero(np.isin(rows_point, some))
@@ -235,7 +235,7 @@ def _triangulation(
 
 
 def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
-    """Return the derivative of the d image columns by the p unknowns, and the columns' covariance for fixed unknowns.
+    """Return the derivative of `Problem.columns` by the p unknowns, and their covariance if the unknowns are exact.
 
     The covariance is nonzero for the arms' rigs only.
     """

@@ -55,7 +55,7 @@ class Region:
     by_unknown: Float[ndarray, "s u"]
     """J: derivative of the residuals by the u unknowns X and Z, 12 for each arm."""
     fit: Float[ndarray, "u s"]
-    """A = (JᵀWJ)⁻¹JᵀW; zero for unused poses."""
+    """A = (JᵀWJ)⁻¹JᵀW: change of X and Z per error of the poses, W being EFFECTIVE_WEIGHT²; zero for unused poses."""
     unknowns: int = 13
     """Number p of all unknowns of the problem, which begin with X, log λ and Z."""
 
@@ -151,7 +151,7 @@ def pose_residuals(
 def residuals_by_camera(
     x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
 ) -> Float[ndarray, "n 6 6"]:
-    """Return the derivative of the residuals of `pose_residuals` by a step of each camera pose."""
+    """Return the derivative of the residuals of `pose_residuals` by a step of each image's camera pose."""
     base_from_recon = z[:3, :3]
     lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
     j = np.zeros((len(lever), 6, 6))
@@ -194,7 +194,7 @@ def paper_residuals(
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
-    """Return the means over consecutive used images of δ_t (m) and δ_R (Frobenius) of A·X − X·B(λ) (paper, eq. 16)."""
+    """Return the paper's δ_t (m) and δ_R, mean norms of A·X − X·B(λ) over consecutive used images (eq. 16)."""
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
     translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()

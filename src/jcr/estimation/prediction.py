@@ -38,7 +38,7 @@ from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 FEWEST = 3
 """Smallest number of poses for a prediction."""
 COLUMNS = 9
-"""Columns of the grid of pixels in each image whose rays give the points of the simulated scene."""
+"""Number of columns of the pixel grid whose rays give the points of the simulated scene."""
 MOST_POINTS = 400
 """Largest number of points of the simulated scene; with 1000 predictions change by 0.1 %."""
 RELIEF = 0.1
@@ -48,7 +48,7 @@ TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
 LEAST_MODEL_ERROR = 1e-9
 """Lower bound of the size of the remaining distortion, in image widths."""
 UNCONNECTED = 1e-2
-"""Information (1/m², 1/rad²) added to all image columns, against rounding for images without common points."""
+"""Information (1/m², 1/rad²) added to all `Problem.columns`, against rounding for images without common points."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Largest angle (rad) between lines of sight, and ratio of distances, at which a feature is matched again."""
 
@@ -85,7 +85,7 @@ class Assumptions:
     noise: RobotNoise
     """Errors of the gripper poses."""
     camera: PredictedCamera | None = None
-    """None: the camera poses are given and exact."""
+    """Camera whose images are simulated; None: the camera poses are given and exact."""
     scale_std: float | None = None
     """Relative standard deviation of a known scale; None: the scale is unknown."""
     faults: Float[ndarray, "7 7"] | None = None
@@ -251,7 +251,7 @@ CANDIDATES = 600
 SCENE_DISTANCE = (0.1, 2.0)
 """Smallest and largest distance of a scene (m)."""
 UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""Errors of X and scale with equal weight: 1 mm, 0.1°, 0.2 %."""
+"""Errors of translation (m), rotation (rad) and log scale that have equal weight: 1 mm, 0.1°, 0.2 %."""
 
 
 def choose_poses(

@@ -99,12 +99,12 @@ class LinearPrior(NamedTuple):
 
 
 def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
-    """Return the prior on the scale of a problem with one arm; `std` is relative."""
+    """Return the prior that the scale is `metres_per_unit` with the relative standard deviation `std`."""
     return LinearPrior(np.eye(UNKNOWNS)[6], float(np.log(metres_per_unit)), std)
 
 
 def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> LinearPrior:
-    """Return the prior on the camera's position along an axis of the gripper frame, metres ± std; one arm."""
+    """Return the prior that the camera is at `metres` ± `std` (m) along a unit `axis` of the gripper frame."""
     return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
 
 
@@ -160,7 +160,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """Measurements and priors: reported poses, and observations in images or Gaussian distributions of rigs."""
+    """Estimation problem: reported poses of arms, observations in images or given camera poses, and priors."""
 
     arms: tuple[ReportedPoses, ...]
     n_rigs: int
@@ -181,7 +181,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> Columns:
-        """Layout of the columns of the image equations."""
+        """Layout of the columns (unknowns) of the image equations."""
         boards = 0 if self.boards is None else len(self.boards.shape_std)
         mounts = [6 * camera.mount_free for camera in self.cameras]
         counts = [self.directions.shape[1], *self.model_error_counts, boards, *mounts]
@@ -298,7 +298,7 @@ class Problem:
 
     @property
     def n_images(self) -> int:
-        """Number of images."""
+        """Number of images; 0 without observations."""
         return 0 if self.observations is None else len(self.observations.rig)
 
     @property
@@ -314,12 +314,12 @@ class Problem:
 
     @cached_property
     def free(self) -> Int[ndarray, " e"]:
-        """Columns of cameras, model errors, boards, mounts, and of the rigs that no arm moves."""
+        """Columns that the unknowns include: cameras, model errors, boards, mounts, and rigs that no arm moves."""
         return np.setdiff1d(np.arange(self.columns.count), self.by_arm)
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns: those of the arms, then the columns `free`."""
+        """Number p of unknowns: those of the arms, then the columns `free`."""
         return self.arm_unknowns + len(self.free)
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
@@ -330,7 +330,7 @@ class Problem:
         return np.concatenate([*(camera.std for camera in self.cameras), self.freed_std, *each, boards])
 
     def displacement(self, state: State) -> Float[ndarray, " r"]:
-        """Return the parameters of cameras and images less the middle of their priors, in the rows of `directions`."""
+        """Return parameters of cameras and images minus their prior means, in the order of the rows of `directions`."""
         return self.directions @ state.camera_steps[self.columns.cameras]
 
     def intrinsics(self, state: State) -> tuple[Intrinsics, ...]:
@@ -418,10 +418,10 @@ def freed(
     n_images: int,
     camera: int = 0,
 ) -> Problem:
-    """Return the problem in which also linear combinations of the parameters of one camera and its images are free.
+    """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
-    `combinations` (e,p) has one column each; its rows are those of `hypotheses.Alternatives`. `images` are the camera's
-    images among all `n_images`.
+    `combinations` (e,p) has one column per direction; the e parameters are those of `hypotheses.Alternatives`. `images`
+    are the camera's images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -486,7 +486,7 @@ def stepped(
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
 ) -> State:
-    """Return the state after a step of the arms' unknowns and a step of the image columns; points do not move.
+    """Return the state after a step of the arms' unknowns and of the d `Problem.columns`; points do not move.
 
     `arms` holds X, log scale and Z of the first arm, then X and Z of further arms; None: no step.
     """
@@ -518,7 +518,7 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
 def step_to(
     problem: Problem, state: State, other: State
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
-    """Return the steps of the arms' unknowns and of the image columns that lead from `state` to `other`."""
+    """Return the steps of the arms' unknowns and of `Problem.columns` that lead from `state` to `other`."""
     own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
     arms = np.zeros(problem.arm_unknowns)
     arms[SCALE] = np.log(other.scale / state.scale)
@@ -534,7 +534,7 @@ def step_to(
 
 
 def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
-    """Return the derivative of all image columns by a similarity of the world: log scale, translation, rotation.
+    """Return the derivative of `Problem.columns` by a similarity of the world: log scale, translation, rotation.
 
     Images do not determine these seven directions.
     """

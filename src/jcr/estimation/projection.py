@@ -34,9 +34,9 @@ class ProjectedObservations:
     in_camera: Float[ndarray, "k 3"]
     """Point in the frame of its camera."""
     from_centre_px: Float[ndarray, "k 2"]
-    """π − c: pixel by the intrinsics alone, less the principal point."""
+    """Pixel predicted by the intrinsics alone, minus the principal point."""
     own_map: Float[ndarray, "k 2"] | None
-    """e^l and a (px/px) of each observation's image; None if no parameters of images are free."""
+    """Focal factor e^l and shear a (px/px) of each observation's image; None if no parameters of images are free."""
     residual_px: Float[ndarray, "k 2"]
     """Predicted minus observed pixel."""
 

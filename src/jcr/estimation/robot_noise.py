@@ -78,17 +78,17 @@ LEVELS = tuple(1.5 * np.arange(-4, 5))
 FARTHEST, LESS_FAR = 21.0, 10.0
 """Largest squared distance of the grid from the mode; with 7, 95 % regions of three images hold 81 %."""
 MANY, TOO_MANY = 15, 80
-"""Number of poses from which LESS_FAR is used; number above which the mode, from that many poses, replaces the grid."""
+"""Number of poses from which the grid is smaller (LESS_FAR), and above which the mode of the sizes replaces it."""
 AT_ONCE = 4e6
 """Largest number of elements of the arrays that are computed together."""
 SETTLED = 1e-4
 """Step of the log sizes that ends the search of their mode."""
 LogSizes = Float[ndarray, "*k c"]
-"""c logarithms: of σ_t, σ_r, σ_s, and of the growths of camera pose errors that add up along the sequence."""
+"""c logarithms: random errors σ_t (m) and σ_r (rad), systematic error σ_s (rad), growths of camera pose errors."""
 Each = Float[ndarray, "*k"] | np.floating
 Covariance = Float[ndarray, "s s"]
 Information = Float[ndarray, "c c"]
-"""Expected information of the log sizes at their mode."""
+"""Expected Fisher information of the c log sizes at their mode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class Equations:
     known: Covariance | None = None
     """Covariance of the residuals from errors of the camera poses; None: exact camera poses."""
     given: tuple[float, float] | None = None
-    """Random errors (m, rad) that the user gave: lower bounds of σ_t and σ_r."""
+    """Lower bounds of the random errors σ_t (m) and σ_r (rad) that the user gave; None: none."""
     walks: tuple[Covariance, ...] = ()
     """Covariances of camera pose errors that add up along the sequence, each for a growth of 1 per image."""
     confirmed: Covariance | None = None
@@ -115,7 +115,7 @@ class Equations:
 
     @property
     def least(self) -> Float[ndarray, "2"]:
-        """Given σ_t and σ_r (m, rad), or NOISE_FLOOR; the estimated variances are added to their squares."""
+        """Lower bounds of the random errors (m, rad), given or NOISE_FLOOR; estimated variances add to their squares."""
         return np.array(self.given or NOISE_FLOOR)
 
     @cached_property
@@ -134,7 +134,7 @@ class Equations:
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
-        """Mask of the residuals: 1 for position, 0 for rotation."""
+        """Mask of the s residuals: 1 for position, 0 for rotation."""
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
@@ -167,7 +167,7 @@ class Equations:
         return np.log(np.r_[beside, max(noise.systematic, LEAST_BESIDE * float(self.least[1]))])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
-        """Return the variance of the random part of each residual: σ_t² or σ_r²."""
+        """Return the variance of the random part of each residual: σ_t² for position (m²), σ_r² for rotation (rad²)."""
         variances = self.variances(log_sizes)
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
@@ -267,7 +267,7 @@ def left_out(
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
     """Return the residual of each of m poses from a fit without that pose, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
 
-    `noise` (m, rad) scales the matrices before they are inverted.
+    P is `solution.projection`, i a pose. `noise` (m, rad) scales the matrices before they are inverted.
     """
     sigma, m = np.repeat(noise, 3), len(solution.root) // 6
     own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]

@@ -24,7 +24,7 @@ Images = Bool[ndarray, " n"]
 """Mask of the used images."""
 
 SHARE_RIGHT = 0.65
-"""Share of the images that the trimmed fit uses; the others may be wrong."""
+"""Share of the images that the least-trimmed-squares fit uses; the others may be wrong."""
 MAX_TRIPLES, MOST_TRIPLES = 1500, 30_000
 """Largest number of triples that are solved in closed form, and of triples to choose from (all, up to 57 images)."""
 CONCENTRATED = 20
@@ -140,7 +140,7 @@ def _distance(fit: Solution) -> Float[ndarray, " n"]:
 
 
 def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
-    """Return for each pose the log of: density of its leave-one-out error if wrong, times (2π)^3, times prior odds.
+    """Return log((2π)^3 · w · d) for each pose: d density of its leave-one-out error if wrong, w odds of a wrong pose.
 
     The errors of wrong poses have a uniform direction and a log-uniform size.
     """

@@ -78,13 +78,13 @@ STEP_SETTLED = 0.01
 ROUNDING = 1e-9
 """Relative increase of a cost that is accepted as rounding."""
 ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
-"""Step of the arms' unknowns, in squared standard deviations, that ends their iteration: final, intermediate fits."""
+"""Squared step of the arms' unknowns (in σ²) at which their iteration ends: for a result, for a comparison of fits."""
 ROUNDS_BEFORE = 3
 """Number of earlier rounds that the acceleration uses."""
 PARALLEL = 1e-2
 """Relative cutoff of singular values in the acceleration, against rounds with nearly equal steps."""
 FARTHEST = 5.0
-"""Largest extrapolation beyond the end of a round, in lengths of the round's step."""
+"""Largest extrapolation by the acceleration beyond the end of a round, in lengths of the round's step."""
 TINY_STEP = 1e-6
 """Step of numerical derivatives by the arms' unknowns (m, rad, log scale)."""
 
@@ -110,7 +110,7 @@ class Solution:
     evidence: ImageEvidence | None = None
     """Evidence of the images; None without observations."""
     settled: bool = True
-    """Whether the rounds converged before their largest number."""
+    """Whether the rounds converged within ROUNDS."""
     iterations: int = 0
     """Number of rounds; 0 without observations."""
     last_step: float = 0.0
@@ -165,7 +165,7 @@ class Solution:
         return found, covariance
 
     def camera_unknowns(self, columns: slice) -> slice:
-        """Return the slice of the unknowns for a slice of the image columns before the mounts."""
+        """Return the slice of the p unknowns for a slice of the columns of cameras, model errors or boards."""
         first = self.problem.arm_unknowns
         return slice(first + columns.start, first + columns.stop)
 
@@ -353,7 +353,7 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 def _joint_step(
     images: ImageEvidence, equations: Equations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton steps of the arms' unknowns and of all image columns, and the std of all unknowns."""
+    """Return the Gauss-Newton steps of the u arms' unknowns and of `Problem.columns`, and the std of all unknowns."""
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
     step = solution.step
@@ -461,7 +461,7 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return the coordinates of a state: steps from `start` of arms, image columns and points; log model-error sizes."""
+    """Return the steps from `start` to a state: arms, `Problem.columns`, points; then its log sizes of model errors."""
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 
