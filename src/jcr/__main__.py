@@ -1,4 +1,4 @@
-"""`python -m jcr` is `jcr`."""
+"""Entry point of `python -m jcr`, which is the command `jcr`."""
 
 from jcr.cli import main
 

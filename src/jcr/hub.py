@@ -16,7 +16,7 @@ HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a network on this machine."""
+    """Location, name and licence of a network's weights on this machine."""
 
     path: Path
     """File with the weights, or folder with their files."""

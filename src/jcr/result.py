@@ -63,7 +63,7 @@ class RunOptions:
 
 
 class RunState(BaseModel):
-    """Content of run.json."""
+    """Content of run.json: capture, options and attempts of a run, and what its files were made from."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     capture: Annotated[str, Field(max_length=4096, pattern=r"^[^\x00]+$")]
@@ -75,7 +75,8 @@ class RunState(BaseModel):
     """Fingerprints of inputs: key "reconstruct" for those of the reconstruction, key "run" (only for a finished run)
     for all inputs."""
     files: dict[str, str] = {}
-    """Fingerprint of each file of a finished run, by file name; empty for an unfinished run."""
+    """Fingerprints of calibration.json and added images, by file name, and an empty text for each other file of a
+    finished run; empty for an unfinished run."""
 
 
 class RunResult:
@@ -105,7 +106,7 @@ class RunResult:
 
     @cached_property
     def calibration(self) -> AnyCalibration:
-        """Content of calibration.json."""
+        """Calibration of the run, which is the content of calibration.json; also that of a failed one."""
         return read_calibration(self.out)
 
     @property

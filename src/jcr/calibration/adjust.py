@@ -82,10 +82,10 @@ def adjust_case(
 ) -> Solution:
     """Adjust the used images and gripper poses of a case, starting from its last adjustment or its fit to camera poses.
 
-    `prior` replaces the case's prior of the intrinsics. Each column of `combinations` (e,p) is one effect to estimate,
-    a combination of the e columns of hypotheses.Alternatives. `confirmed_errors` (s,b) are b error patterns of the
-    gripper poses, s = 6 per used image, one standard deviation each. The robot pose noise starts at the residuals of
-    the fit, because a smaller initial noise takes ten times the steps where poses contradict the images.
+    `prior` replaces the case's prior of the intrinsics. `combinations` (e,p) are p additional parameters to estimate,
+    each a combination of the e candidate parameters in hypotheses.Alternatives. `confirmed_errors` (s,b) are b error
+    patterns of the gripper poses, s = 6 per used image, one standard deviation each. The robot pose noise starts at the
+    residuals of the fit; with a smaller initial noise, poses that contradict the images take ten times the steps.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)

@@ -46,7 +46,7 @@ class Case:
     reconstruction: Reconstruction
     options: CalibrateOptions
     robot: RobotErrorPrior
-    """Systematic errors of the registered images' poses."""
+    """Prior of the systematic errors of the registered images' gripper poses."""
     priors: tuple[LinearPrior, ...]
     """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
     hand_eye: Calibration
@@ -62,7 +62,7 @@ class Case:
 
     @property
     def base_from_gripper(self) -> Float[ndarray, "m 4 4"]:
-        """Reported gripper poses of the registered images."""
+        """Reported gripper poses of the registered images, in the order of the reconstruction."""
         return self.capture.base_from_gripper[self.reconstruction.image_index]
 
     @property
@@ -104,7 +104,7 @@ class Case:
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Observations in the used images, at most MOST_OBSERVATIONS."""
+        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS."""
         if self.chosen_tracks is not None:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
@@ -112,9 +112,9 @@ class Case:
 
     @property
     def free_focus(self) -> Float[ndarray, "e p"] | None:
-        """Combinations (e,p) of the columns of hypotheses.Alternatives that give each used image its own focal length.
+        """Additional parameters that give each used image its own focal length; None if the option `focus` is "fixed".
 
-        None where the option `focus` is "fixed".
+        Matrix (e,p): each column is one parameter, a combination of the e candidates in hypotheses.Alternatives.
         """
         if self.options.focus == "fixed":
             return None
@@ -160,7 +160,7 @@ class Case:
 
     @property
     def is_open(self) -> bool:
-        """Whether the motions are observable and no cause rejects the calibration yet."""
+        """Whether the motions are observable and no finding that is a cause has rejected the calibration."""
         return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
 
     def after(

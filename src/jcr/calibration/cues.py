@@ -18,7 +18,7 @@ CONTRADICTED = (4.0, 0.02)
 """Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
 fraction of the scale; both limits are exceeded."""
 ONE_AXIS = np.radians(6)
-"""Largest mean deviation (rad) of the rotation axis of a planar motion."""
+"""Largest rms deviation of the rotation axis (rad) for which a motion is planar, and smallest rotation it needs."""
 
 
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:

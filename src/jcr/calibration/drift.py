@@ -30,7 +30,7 @@ POWER = 0.9
 NOISIER = 1.5
 """Ratio of the robot errors of old and new images to those of the old images from which `is_noisier` is set."""
 SETTLED, ITERATIONS = 1e-5, 10
-"""Step (m, rad) that ends the iterations, and their largest number."""
+"""Largest step (m, rad) at which the iterations end, and largest number of iterations."""
 
 NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]

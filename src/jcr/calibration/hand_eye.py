@@ -44,7 +44,7 @@ SURPRISE = 1.5
 
 
 Offset = tuple[Float[ndarray, "3"], float, float]
-"""Axis in the gripper frame, position of the camera along it (m), standard deviation (m)."""
+"""Known coordinate of the camera: a unit axis in the gripper frame, the camera's position along it (m), and std (m)."""
 
 
 @one_blas_thread
@@ -75,9 +75,9 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` (6n,6n) is
     the covariance of these errors at 1 rad where it is known already.
 
-    `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
-    the scale is estimated. `offset` is an axis of the gripper frame, the position of the camera along it (m), and its
-    standard deviation (m), for motions that do not determine it.
+    `scale` (metres per unit of the camera poses, 1 if these are metric) is known with the relative standard deviation
+    `scale_std`; None: the scale is estimated. `offset` is a known coordinate of the camera, for motions that do not
+    determine it: an axis in the gripper frame, the camera's position along it (m), and its standard deviation (m).
 
     `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM. Errors that
     add up along their order are then tested and included. `names` are those of the poses, for the result's `images`.

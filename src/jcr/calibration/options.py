@@ -47,7 +47,7 @@ class CalibrateOptions:
 
     @property
     def robot_noise_m_rad(self) -> tuple[float, float] | None:
-        """`robot_noise` in metres and radians."""
+        """Option `robot_noise` in metres and radians; None if it is not set."""
         return None if self.robot_noise is None else (self.robot_noise[0] / 1e3, radians(self.robot_noise[1]))
 
 

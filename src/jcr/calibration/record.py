@@ -103,6 +103,7 @@ def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
 
 
 def _version() -> str:
+    """Return the version of the installed distribution."""
     import jcr
 
     return jcr.__version__
@@ -233,11 +234,11 @@ class Outcome:
         return replace(self, notes=tuple(dict.fromkeys([*self.notes, *notes, *informs])))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of calibration.json."""
+        """Return the content of calibration.json as a dict."""
         return adapter(type(self)).dump_python(self, by_alias=True, mode="json")
 
     def __eq__(self, other: object) -> bool:
-        """Compare the JSON of both, for arrays have no truth value."""
+        """Compare two records by their JSON, because a comparison of arrays is no single truth value."""
         return isinstance(other, Outcome) and self.as_json() == other.as_json()
 
     __hash__ = None  # type: ignore[assignment]
@@ -245,7 +246,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration(Outcome):
-    """Result of a hand-eye calibration, and the content of calibration.json."""
+    """Result of a hand-eye calibration: transform, scale, uncertainty, robot errors, and accuracy; see also Outcome."""
 
     scale: Positive
     """Metres per unit of the reconstruction."""
@@ -321,7 +322,7 @@ class Calibration(Outcome):
 
     @property
     def inliers(self) -> Bool[ndarray, " m"]:
-        """Whether each registered image is used, in the order of the reconstruction."""
+        """Mask of the used images among the registered ones, in the order of the reconstruction."""
         registered = (one for one in self.images if one.translation_residual_mm is not None)
         return np.array([image.used for image in registered], bool)
 

@@ -62,6 +62,7 @@ def better_poses(
     systematic, poses = robot.with_poses(now, possible), np.concatenate([now, possible])
 
     def uncertainty_of(rows: Int[ndarray, " c"]) -> float:
+        """Return the predicted total uncertainty with the candidates of these indices added."""
         together = np.r_[existing, len(now) + rows]
         errors = of_poses(systematic, together)
         covariance = predict_covariance(assumptions, poses[together], errors, averaged=False)
@@ -76,6 +77,7 @@ def predictions(
     """Return a function of c that predicts the uncertainty with the first c of the `added` poses."""
 
     def predicted(count: int) -> Uncertainty:
+        """Return the predicted uncertainty with the first `count` added poses."""
         together = np.concatenate([base_from_gripper, added[:count]])
         return predict(assumptions, together, robot.with_poses(base_from_gripper, added[:count]))
 
@@ -195,6 +197,7 @@ def advised(
     predicted = predictions(assumptions, used, robot, added)
 
     def is_met(count: int) -> bool:
+        """Test whether `count` added poses are predicted to reach the required accuracy."""
         share = np.divide(reached(predicted(count), required.at), reached(predicted(0), required.at))
         mm, deg = (share * (required.reached_mm, required.reached_deg)).tolist()
         return replace(required, reached_mm=mm, reached_deg=deg).met

@@ -40,7 +40,7 @@ PARTS = {
 
 
 def verdict_in_words(findings: Iterable[Finding]) -> str:
-    """Return the verdict in capitals, with the number of warnings."""
+    """Return the verdict of the findings in capitals, with the number of warnings."""
     findings = without_consequences(tuple(findings))
     verdict = verdict_of(findings)
     warnings = sum(one.severity == "warns" for one in findings)
@@ -117,6 +117,7 @@ def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[
     """
 
     def advice(finding: Finding) -> str:
+        """Return the remedy of a finding, or `proposed` if its remedy is more images."""
         is_images = finding.kind is FindingKind.NOT_EXACT_ENOUGH and finding.concerns == "images"
         return proposed if is_images and proposed else remedy(finding)
 
@@ -237,7 +238,7 @@ def _board(board: BoardFound) -> dict[str, str]:
 def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Float[ndarray, "7 7"]) -> str:
     """Return the least certain direction of the translation, e.g. "along the optical axis: ±4.0 mm".
 
-    `covariance` is in COVARIANCE_ORDER.
+    `covariance` is that of the calibration, in COVARIANCE_ORDER.
     """
     variance, vectors = np.linalg.eigh(covariance[:3, :3])
     direction, std_mm = vectors[:, 2], 1e3 * float(np.sqrt(variance[2]))

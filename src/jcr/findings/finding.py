@@ -15,8 +15,8 @@ from jcr.rounding import significant
 
 Severity = Literal["rejects", "warns", "informs"]
 Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
-"""Part of the capture that the remedy changes: another reconstruction of the same images, other motions, more or other
-images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles; or nothing."""
+"""Subject of a finding's remedy, in this order: another reconstruction of the same images, other motions, more or
+other images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles, nothing."""
 Verdict = Literal["accepted", "accepted with warnings", "rejected"]
 NUMBERS = ("joints", "value", "std", "p", "shift", "intrinsics_shift")
 """Keyword arguments of Finding.of that set fields of a finding; all others are its details."""
@@ -115,6 +115,7 @@ class Quantities(dict[str, Any]):
     """
 
     def __missing__(self, name: str) -> _Text:
+        """Return an empty text for a name without a value."""
         return _Text("")
 
     @staticmethod

@@ -27,7 +27,7 @@ class Requirement:
     """Number of images, at the proposed poses, to add until the required accuracy is reached; 0 if it is reached, None
     if no reasonable number suffices."""
     at: Where = "camera"
-    """Quantity that the millimetres and degrees refer to."""
+    """Quantity to which the required and reached bounds refer."""
 
     @property
     def met(self) -> bool:

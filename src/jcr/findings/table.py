@@ -18,7 +18,7 @@ TOO_FEW = (
     "robot base moved against the scene",
     "gripper poses early or late",
 )
-"""Kinds that are further consequences if too few of the images can be used."""
+"""Kinds that are consequences in addition to MISFIT if too few of the images can be used."""
 ONE_PART = (
     "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
     "the other part only where "
@@ -94,10 +94,10 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class KindRow:
-    """Properties of a kind of finding."""
+    """Row of the table: group, templates of the texts, consequences and documentation of a kind of finding."""
 
     group: str
-    """Key of GROUPS."""
+    """Group of the kind in the documentation, a key of GROUPS."""
     message: str
     """Template of the message in one sentence, filled with the values of finding.Quantities."""
     remedy: str = ""

@@ -34,7 +34,7 @@ Radians = Annotated[float, in_unit(180 / np.pi)]
 
 @dataclass(frozen=True, kw_only=True)
 class ImageVerdict:
-    """Use and residuals of one image of the capture."""
+    """Verdict on one image of the capture: whether the calibration uses it, why not, and its residuals."""
 
     image: str
     """Path relative to the folder of the capture; for given camera poses, the name of the sample."""
@@ -198,7 +198,9 @@ class LeaveOneOut:
     """Mean leave-one-out error: each image's gripper pose is predicted from the other images."""
 
     translation_mm: float
+    """Mean distance between predicted and reported gripper position."""
     rotation_deg: float
+    """Mean angle between predicted and reported gripper orientation."""
     reprojection_px: float | None
     """Median reprojection error with the predicted poses (px); None if the images were not adjusted."""
     how: str
@@ -342,7 +344,7 @@ class Uncertainty:
     covariance: Covariance7
     """Covariance in COVARIANCE_ORDER."""
     budget: Budget | None = None
-    """Parts of the covariance by cause; None where it was not divided."""
+    """Parts of the covariance by cause of error; None if they are unknown."""
     joint: JointCovariance | None = None
     """Covariance with the intrinsics; None where the intrinsics were not estimated."""
     model_error: ModelError | None = None
@@ -355,7 +357,7 @@ class Uncertainty:
     @computed_field
     @property
     def order(self) -> tuple[str, ...]:
-        """Names of the rows of the covariance."""
+        """Names of the rows of `covariance`: COVARIANCE_ORDER."""
         return COVARIANCE_ORDER
 
     @computed_field
@@ -384,12 +386,12 @@ class Uncertainty:
 
     @property
     def std(self) -> Float[ndarray, "7"]:
-        """Standard deviations in COVARIANCE_ORDER."""
+        """Standard deviations of translation (m), rotation vector (rad) and log scale, in COVARIANCE_ORDER."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def intrinsics_std(self) -> Float[ndarray, " q"] | None:
-        """Standard deviation of each parameter of the intrinsics; None where they were not estimated."""
+        """Standard deviations of fx, fy, cx, cy and the distortion; None where the intrinsics were not estimated."""
         return None if self.joint is None else np.sqrt(np.diag(self.joint.covariance)[7:])
 
     @property

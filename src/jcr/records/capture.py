@@ -62,7 +62,7 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class IntrinsicsAndStd(Intrinsics):
-    """Intrinsics with their standard deviations."""
+    """Intrinsics and the standard deviations of their parameters."""
 
     std: tuple[Spread, ...] | None = None
     """Standard deviations of fx, fy, cx, cy (px) and the distortion; None where the intrinsics were not estimated."""
@@ -170,7 +170,7 @@ class PosePairs:
     source: Path
     """File that the poses were read from."""
     images: tuple[str, ...]
-    """Names of the samples."""
+    """Names of the samples, one for each pair of poses."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     recon_from_camera: Float[ndarray, "n 4 4"]
     is_metric: bool

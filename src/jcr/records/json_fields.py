@@ -30,7 +30,7 @@ class Part(BaseModel):
     )
 
     def __eq__(self, other: object) -> bool:
-        """Compare the JSON of both, for arrays have no truth value."""
+        """Compare two records by their JSON, because a comparison of arrays is no single truth value."""
         return (
             isinstance(other, Part) and type(self) is type(other) and self.model_dump() == other.model_dump()
         )

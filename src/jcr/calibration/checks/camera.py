@@ -53,7 +53,7 @@ LEAST_PX = {
     FindingKind.CENTRE_SAGS: 3.0,
     FindingKind.THIN_PRISM: 1.0,
 }
-"""Smallest size (px) that is reported; smaller effects are remaining errors of the distortion model."""
+"""Smallest reported size of each effect (px); smaller ones are remaining errors of the distortion model."""
 OFF = 0.01, 0.01, 0.015, 0.015
 """Differences of fx, fy, cx, cy from given ones, relative to the focal length, up to which Wald's test is not applied:
 factory values and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
@@ -89,12 +89,13 @@ PAIRS = (
 NAMED = 4.0
 """Difference of a parameter, in standard deviations, from which the message states its value (4: p = 6e-5)."""
 Combinations = Float[ndarray, "e p"]
-"""p combinations of the e columns of hypotheses.Alternatives: each column of the matrix is one additional parameter."""
+"""Additional parameters of a camera: each column is one parameter, a combination of the e candidate parameters (columns)
+of hypotheses.Alternatives."""
 
 
 @dataclass(frozen=True)
 class CameraEffect:
-    """Hypothesis about one camera: additional parameters, as combinations of the columns of hypotheses.Alternatives."""
+    """Hypothesis of an effect on one camera: its kind, its additional parameters, and nuisance parameters."""
 
     kind: FindingKind
     free: Combinations
@@ -276,6 +277,7 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
         focal = best.free @ after.estimates(best)
 
         def explained(one: CameraEffect) -> float:
+            """Return the fraction of the squared focal-length differences that a simpler effect explains."""
             along = one.free[:, 0]
             return float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
 

@@ -32,7 +32,7 @@ FITS = 3.0
 BETTER = 3.0
 """Ratio of the misfit of the given poses to that of a candidate, above which the candidate is reported."""
 ROUGHLY = 2.0
-"""Factor of uncertainty of a misfit that the closed form estimates."""
+"""Factor by which the misfit of a closed form may differ from that of a fit."""
 MIN_SHARE = 0.8
 """Smallest fraction of the images that must agree with a candidate convention."""
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"

@@ -12,7 +12,7 @@ from jcr.estimation.problem import pose_problem
 from jcr.findings import Finding, FindingKind, joined
 
 MIN_EXAMINED = 4
-"""Fewest images from which joint offsets are estimated."""
+"""Fewest used images with which joint offsets are estimated."""
 SURE = 2.5
 """Size of a joint offset, in standard deviations, above which it is reported."""
 
