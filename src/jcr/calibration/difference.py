@@ -131,7 +131,7 @@ def read_hand_eye(path: Path) -> StatedTransform:
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
     """Return the step Δ from `ours` to `other` and its χ² = ΔᵀV⁻¹Δ, where V is the sum of both covariances.
 
-    Causes of error with covariances Pₖ make up V = ΣPₖ; the share of cause k is ΔᵀV⁻¹PₖV⁻¹Δ / χ².
+    V is the sum of the covariances Pₖ of all causes of error k; the share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ².
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
     parts, together = dict[str, Float[ndarray, "6 6"]](), np.zeros((6, 6))

@@ -1,4 +1,4 @@
-"""Required accuracy of a calibration, and the accuracy that it reaches."""
+"""Record of the required accuracy of a calibration and of the accuracy that the calibration reaches."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -92,7 +92,7 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
     """
     require_file(path)
     try:
-        # NumPy leaves a file open that it cannot read.
+        # The file is opened here, because NumPy does not close a file that it fails to read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             if file.zip is not None:
                 require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))

@@ -124,7 +124,7 @@ class Pointmaps:
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction:
-    """Reconstruction of a capture: camera poses, tracks and pointmaps in one frame of arbitrary origin and unit."""
+    """Reconstruction of a capture: camera poses, tracks and pointmaps in one frame (recon) of any origin and unit."""
 
     image_index: Int[ndarray, " m"]
     """Rows of the capture of the m registered images, ascending."""

@@ -94,7 +94,7 @@ def better_reading(
     by_name: Mapping[bool, Poses] | None = None,
     solved: Calibration | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the pose convention that fits much better than the given one, and the given one; None without such one.
+    """Return the pose convention that fits much better than the given one, and the given one; None if none does.
 
     `by_name` holds the gripper poses for images sorted by name, as numbers (key True) or as text (key False). `solved`
     is the calibration with the given poses if it used the camera poses alone.
