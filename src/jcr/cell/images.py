@@ -24,7 +24,7 @@ class CellImages:
     """Estimation problem of a cell, its initial state and observations; camera 0 is the capture's own."""
 
     problem: Problem
-    """Problem without its observations."""
+    """Estimation problem of the cell, without its observations."""
     state: State
     observations: Observations
 

@@ -31,7 +31,7 @@ from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, regis
 CLEARLY_MORE = 1.1
 """Ratio of RANSAC inliers with estimated over given focal length, above which the given one is wrong."""
 SAME_PLACE = (0.02, np.radians(2.0))
-"""Difference (m, rad) below which two gripper poses are equal."""
+"""Difference (m, rad) below which two gripper poses count as equal."""
 MAP_STD = (4e-3, np.radians(0.25))
 """Standard deviations (m, rad) of a localised pose by errors of map and intrinsics, not in its covariance."""
 APART = float(chi2.isf(1e-6, 6))
@@ -123,7 +123,7 @@ class CameraViews:
     def refused(
         self, why: FindingKind | Sequence[Finding], concerns: Concerns = "none", *images: str, **numbers: Any
     ) -> CameraPlacement:
-        """Return a rejected placement with these findings, or with one finding of a kind, made by Finding.of."""
+        """Return a rejected placement for findings `why`, or for one finding: kind and other arguments of Finding.of."""
         if isinstance(why, FindingKind):
             why = (Finding.of(why, "rejects", concerns, *images, **numbers),)
         return CameraPlacement.of(self.camera, why, self.points, self.reasons)
@@ -220,7 +220,7 @@ class Rigs:
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
-        """Add a rig for each used image of the camera of another arm, after a hand-eye fit to that arm's poses."""
+        """Add a rig for each used image of another arm's camera; reject the camera if its hand-eye fit fails."""
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)

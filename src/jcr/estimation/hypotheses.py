@@ -97,6 +97,7 @@ class Test:
     estimate: Float[ndarray, " d"]
     """Estimate of the d parameters of the effect."""
     covariance: Float[ndarray, "d d"]
+    """Covariance of the estimate."""
     log_p: float
     """Log p-value: chance of such an estimate without the effect, times the number of places tested."""
     shift: Float[ndarray, " p"]
@@ -320,7 +321,7 @@ class Alternatives:
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """Result of the test of p linear combinations of camera parameters."""
+    """Result of the score test of p linear combinations of camera parameters."""
 
     log_p: float
     """Log p-value: chance of this gain or a larger one without the effect."""

@@ -46,9 +46,9 @@ class RigInformation(NamedTuple):
     world_from_rig: Float[ndarray, "m 4 4"]
     """Reference poses."""
     information: Float[ndarray, "r r"]
-    """Matrix H, r = 6m."""
+    """Matrix H of the cost ½ sᵀ H s + gᵀ s; r = 6m."""
     gradient: Float[ndarray, " r"]
-    """Vector g."""
+    """Vector g of the cost ½ sᵀ H s + gᵀ s."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
         """Return the steps (6m,) from the reference poses to the rigs of a state."""

@@ -124,9 +124,9 @@ DEGREE, POLYNOMIALS = 5, 42
 TYPICAL = 1e-4
 """Middle of the weak prior on the size of the remaining distortion, in image widths."""
 UPDATES, SETTLED = 100, 1e-3
-"""Largest number of updates of the size, and the relative change of its square that ends them."""
+"""Largest number of updates of the remaining distortion's size, and the relative change of its square that ends them."""
 WORTH = 2.0
-"""Weight of the weak prior on the size, as a number of polynomials."""
+"""Weight of the weak prior on the remaining distortion's size, as a number of polynomials."""
 
 
 def displacements(

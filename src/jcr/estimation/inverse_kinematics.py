@@ -36,7 +36,7 @@ from jcr.geometry import (
 from jcr.least_squares import minimise
 
 STARTS = 12
-"""Number of initial joint angles for each pose."""
+"""Number of sets of initial joint angles for each pose."""
 STEPS = 30
 """Largest number of Gauss-Newton steps."""
 MOST = 30
@@ -213,7 +213,7 @@ def _with_tool(
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """Return the arm with base and tool as the poses show, and its joint angles, by inverse kinematics if None.
+    """Return the arm with base and tool fitted to the poses, and joint angles; `joints` None: by inverse kinematics.
 
     Raise InputError if poses, joints and arm do not agree.
     """

@@ -73,7 +73,7 @@ class Layout:
     group: Int[ndarray, " k"]
     """Group of each observation, a row of PixelNoise.sigma_px."""
     groups: int
-    """Number of groups."""
+    """Number of groups of observations."""
     point: Int[ndarray, " k"]
     """Point of each observation."""
     cell: Int[ndarray, " k"]

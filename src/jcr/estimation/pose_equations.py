@@ -210,7 +210,7 @@ class PoseEquations:
     region: Region
     """Fit of the effective hand-eye transform to the used poses."""
     used: Bool[ndarray, " n"]
-    """Mask of the used poses."""
+    """Mask of the used poses among the reported poses of all arms."""
 
     @cached_property
     def equations(self) -> Equations:

@@ -83,9 +83,11 @@ class ReportedPoses:
     rigs: Int[ndarray, " n"]
     """Rig of each pose."""
     base_from_gripper: Poses
+    """Reported pose at each of n images."""
     error_covariance: Float[ndarray, "s s"]
     """Covariance (s,s), s = 6n, of the systematic errors of the n poses for a size σ_s of 1 rad."""
     carries: Literal["camera", "scene"] = "camera"
+    """Object that moves with the gripper."""
     confirmed_errors: Float[ndarray, "s b"] | None = None
     """Errors of the poses (s = 6n rows) by each of b confirmed effects of one standard deviation; None: no effects."""
 
@@ -120,11 +122,11 @@ class Columns:
     """Layout of the columns of the image equations: cameras, model errors, boards, mounts, then six for each rig."""
 
     cameras: slice
-    """Steps along `Problem.directions`."""
+    """Columns of the steps along `Problem.directions`."""
     model_error: tuple[slice, ...]
-    """Remaining distortion of each camera; an empty slice if it is not estimated."""
+    """Columns of each camera's remaining distortion; an empty slice if it is not estimated."""
     boards: slice
-    """Shape of the boards."""
+    """Columns of the boards' shapes."""
     mounts: tuple[slice | None, ...]
     """Six columns of the pose of each camera on its rig; None for a fixed pose."""
     first_rig: int
@@ -163,17 +165,22 @@ class Problem:
     """Estimation problem: reported poses of arms, observations in images or given camera poses, and priors."""
 
     arms: tuple[ReportedPoses, ...]
+    """Reported poses of each arm."""
     n_rigs: int
+    """Number of rigs."""
     cameras: tuple[CameraPrior, ...] = ()
+    """Prior of each camera; empty without observations."""
     observations: Observations | None = None
     """Observations sorted by point and rig, at least two for each point; None: `known_rigs` has the camera poses."""
     boards: BoardShapes | None = None
+    """Shape prior of board corners among the points; None: no boards."""
     freed: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((0, 0)))
     """Additional free directions of cameras and images, one column each; rows are those of `directions`."""
     freed_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
     """Prior standard deviation along each column of `freed`."""
     known_rigs: RigGaussian | None = None
     priors: tuple[LinearPrior, ...] = ()
+    """Linear priors on X, scale and cameras."""
     robot_noise_floor: tuple[float, float] | None = None
     """Lower bound on the random errors of the reported poses (m, rad); None: no bound is given."""
     used: Bool[ndarray, " n"] | None = None

@@ -76,13 +76,13 @@ RATIO_STD = np.log(4.0)
 LEVELS = tuple(1.5 * np.arange(-4, 5))
 """Grid of log sizes along each axis, in standard deviations from the mode; relative error of an average: 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
-"""Largest squared distance of the grid from the mode; with 7, 95 % regions of three images hold 81 %."""
+"""Largest squared distance (σ²) of grid points from the mode; with 7, 95 % regions of three images hold 81 %."""
 MANY, TOO_MANY = 15, 80
 """Number of poses from which the grid is smaller (LESS_FAR), and above which the mode of the sizes replaces it."""
 AT_ONCE = 4e6
-"""Largest number of elements of the arrays that are computed together."""
+"""Largest number of array elements for the grid points of the sizes that are solved together."""
 SETTLED = 1e-4
-"""Step of the log sizes that ends the search of their mode."""
+"""Largest step of the log sizes at which the search of their mode ends."""
 LogSizes = Float[ndarray, "*k c"]
 """c logarithms: random errors σ_t (m) and σ_r (rad), systematic error σ_s (rad), growths of camera pose errors."""
 Each = Float[ndarray, "*k"] | np.floating
@@ -93,13 +93,14 @@ Information = Float[ndarray, "c c"]
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Linearised equations r + J θ of n gripper poses: s = 6n residuals, p unknowns θ with a normal prior."""
+    """Linearised equations r + J θ = noise of n gripper poses: s = 6n residuals, p unknowns θ with a normal prior."""
 
     residual: Float[ndarray, " s"]
     """r: step from the reported to the predicted pose, pose by pose: m, then rad; both in base axes."""
     jacobian: Float[ndarray, "s p"]
     """J: derivative of r by the unknowns."""
     prior_information: Float[ndarray, "p p"]
+    """Information matrix of the prior on θ."""
     prior_gradient: Float[ndarray, " p"]
     """Gradient of the prior's half squared distance at θ = 0."""
     systematic: Covariance
@@ -206,7 +207,7 @@ class LinearSolution:
     step: Float[ndarray, "*k p"]
     """Estimate of the unknowns θ."""
     root: Float[ndarray, "*k s s"]
-    """Lower Cholesky factor of V."""
+    """Lower Cholesky factor of V, the covariance of the s residuals."""
     information_root: Float[ndarray, "*k p p"]
     """Lower Cholesky factor of JᵀV⁻¹J + prior."""
     weighed: Float[ndarray, "*k s p"]

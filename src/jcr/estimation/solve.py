@@ -95,6 +95,7 @@ class Solution:
 
     problem: Problem
     state: State
+    """Estimate, averaged over the sizes of the robot's errors."""
     covariance: Float[ndarray, "p p"]
     """Covariance of the p unknowns: steps of the arms, then of the columns `Problem.free`."""
     budget: Budget | None
