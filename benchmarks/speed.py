@@ -143,15 +143,16 @@ def colmap_alone(place: str) -> None:
 def run_by_stage(place: str) -> None:
     """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
-    from jcr.pipeline import run as stages
     from jcr.pipeline import selection
-    from jcr.report import html
+    from jcr.pipeline.stages import STAGES as FUNCTIONS
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
-    functions = "reconstruct", "calibrate", "densify", "_map", "report_html"
-    modules = selection, selection, stages, stages, html
-    for module, function, name in zip(modules, functions, STAGES, strict=True):
-        setattr(module, function, _timed(getattr(module, function), spent, name))
+    # The stage that reconstructs also calibrates, to select the back end.
+    for function, name in (("reconstruct", "reconstruct"), ("calibrate_reconstruction", "calibrate")):
+        setattr(selection, function, _timed(getattr(selection, function), spent, name))
+    for name in STAGES[2:]:
+        files, function = FUNCTIONS[name]
+        FUNCTIONS[name] = files, _timed(function, spent, name)
     jcr.run(CAPTURE, Path(place) / "run")
     (Path(place) / "stages.json").write_text(json.dumps(spent))
 
