@@ -56,11 +56,12 @@ class Board:
 
 
 def boards(spec: str) -> list[Board]:
-    """Return the boards that a name may mean, the literal one first.
+    """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, the literal one first.
 
-    A ChArUco board has alternatives: printed by OpenCV before 4.6, its two counts swapped, and each of the RATIOS if the
-    name has MARKER. SIDE in the name replaces an unknown length; the unit is then the side. Raises InputError, with the
-    valid forms, for a name that means no board.
+    A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its
+    marker length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word
+    SIDE stands for an unknown side, which is then the unit of length. Raises InputError, with the valid forms, for a
+    name that means no board.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:

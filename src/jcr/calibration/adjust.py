@@ -143,7 +143,8 @@ def with_intrinsics_considered(
     This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
     Φ is the covariance of the intrinsics. S is the derivative of the fit by the intrinsics: each parameter changes by
     one standard deviation, and the camera poses change so that the pixels of `tracks` stay in place. All poses and
-    `systematic`, the covariance of the systematic robot errors (s = 6m) at 1 rad, are those of the used images.
+    `systematic` (6m,6m) are those of the m used images; `systematic` is the covariance of the systematic robot errors if
+    the error of a joint had a standard deviation of 1 rad.
     """
     moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
     for row, pose in enumerate(recon_from_camera):

@@ -22,7 +22,11 @@ ONE_AXIS = np.radians(6)
 
 
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the rotation axis (gripper frame) of a planar motion, the camera's height along it, and its std (m, m).
+    """Return the axis that all rotations of a planar motion share, and the camera's coordinate along it.
+
+    The axis is a unit vector in the gripper frame; the coordinate (m) counts from the gripper's origin and is
+    followed by its standard deviation (m). `height` is the measured height (m) of the camera above the gripper's
+    origin.
 
     Raises InputError if the gripper does not rotate about one common axis.
     """

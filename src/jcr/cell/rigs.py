@@ -220,7 +220,10 @@ class Rigs:
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
-        """Add a rig for each used image of another arm's camera; reject the camera if its hand-eye fit fails."""
+        """Return the views of another arm's camera with a rig (camera pose) for each used image.
+
+        Return a rejected placement if the hand-eye fit of that camera fails.
+        """
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)

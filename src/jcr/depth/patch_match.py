@@ -45,8 +45,9 @@ def _ray(v, u, k):
 def _look(v, u, asked, packed, motions, k, near, starts):
     """Write `near` and `starts` for 16 pixels of row v, from column u on.
 
-    `near` holds the columns of K R times one step of taps in u and in v, then K R·ray, and K t; `starts` are the indices
-    at which the neighbours' images begin in `packed`.
+    `near` holds the projection into each neighbour image (rotation R, translation t from this image, intrinsics K): K R
+    times the change of a ray by one patch sample in u and in v, K R times the ray, and K t. `starts` are the indices at
+    which the neighbour images begin in `packed`.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     size = packed.shape[1] * packed.shape[2]

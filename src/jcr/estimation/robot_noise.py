@@ -217,7 +217,10 @@ class LinearSolution:
 
     @property
     def gain(self) -> Float[ndarray, "*k p s"]:
-        """C JᵀV⁻¹, C the covariance of the unknowns: minus the derivative of the unknowns by the residuals."""
+        """C JᵀV⁻¹ for each of k sizes: minus the derivative of the p unknowns by the s residuals.
+
+        C is the covariance of the unknowns, J the Jacobian and V the covariance of the residuals.
+        """
         return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
 
     @property

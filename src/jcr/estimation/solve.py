@@ -202,10 +202,11 @@ def solve(
     averaged: bool = True,
     start_noise: tuple[float, float] = START_NOISE,
 ) -> Solution:
-    """Solve a problem from an initial state; a state with pixel noise is assumed to be near the solution.
+    """Solve a problem from an initial state.
 
-    `averaged`: average over the sizes of the robot's errors, else use their most likely values, which is faster and
-    understates the uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
+    If `start` has an estimate of the pixel noise already, it is taken as near the solution. `averaged`: average over
+    the sizes of the robot's errors, else use their most likely values, which is faster and understates the
+    uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)

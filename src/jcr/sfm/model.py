@@ -28,7 +28,11 @@ ENOUGH = 1e-6
 
 
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
-    """Return COLMAP's camera of the intrinsics; if not `known`, with a focal length and two radial coefficients."""
+    """Return COLMAP's camera with these intrinsics.
+
+    If they are not `known`, the model is RADIAL with the given focal length and without distortion; COLMAP then refines
+    the focal length and two coefficients.
+    """
     centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     both = [intrinsics.fx, intrinsics.fy, *centre]
     if not known:

@@ -45,8 +45,8 @@ def check_boards(case: Case) -> Case:
 def board_faults(case: Case) -> list[Finding]:
     """Return a finding if the adjusted boards are faulty (stretched in print, or moved); else an empty list.
 
-    A stretched board has sides of different scale. A board was moved before an image in which all its corners have a
-    common residual shift. The size of a faulty board is no known length.
+    A stretched board has sides of different scale. A board was moved before an image in which the residuals
+    of all its corners have one common mean. The size of a faulty board must not set the scale.
     """
     adjusted, boards = case.adjusted, case.reconstruction.tracks.boards
     if boards is None or adjusted is None or adjusted.problem.boards is None:
