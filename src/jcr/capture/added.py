@@ -19,10 +19,10 @@ FOLDER, OWNER = "added", "added_to"
 
 
 def read_added(run_folder: Path, capture: Capture) -> Capture:
-    """Read the images that were added to a run, oldest first; return a capture without images if none was added.
+    """Return the images added to a run by `jcr map --add`, oldest first, as a capture; without images if none was added.
 
-    `capture` is the capture of the run. Raises InputError if an image file is missing, or if the folder's images were
-    added to a run of another capture.
+    `capture` is the run's own capture. Raises InputError if an image file is missing, or if the images in `run_folder`
+    were added to a run of another capture.
     """
     folder = run_folder / FOLDER
     file = folder / capture_json.FILE
@@ -39,10 +39,10 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
 
 
 def with_added_images(added: Capture, path: Path, options: ReadOptions | None = None) -> Capture:
-    """Copy the images of the capture at `path` to the added images; return all added images.
+    """Return the capture `added` (images added to a run) extended by the images and poses of the capture at `path`.
 
-    The run has the new images only after `write_added`. Raises InputError for images of another size than the run's,
-    and for images that were added before.
+    The image files are copied into the folder of `added`; its capture.json changes only in `write_added`. Raises
+    InputError for images of another size than the run's, and for images that were added before.
     """
     with tempfile.TemporaryDirectory(prefix="jcr-added-") as scratch:
         new = read_capture(path, options, into=scratch, at_least=1)
@@ -62,5 +62,5 @@ def with_added_images(added: Capture, path: Path, options: ReadOptions | None = 
 
 
 def write_added(added: Capture, capture: Capture) -> None:
-    """Write the capture.json of the added images, so that they belong to the run of `capture` and its later maps."""
+    """Write the capture.json of the images `added` to the run of `capture`, so that later maps of the run use them."""
     capture_json.write(added.folder, added, **{OWNER: str(capture.folder.resolve())})

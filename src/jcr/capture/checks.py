@@ -88,7 +88,7 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError if three or more gripper poses are all equal within SAME_POSE."""
+    """Raise InputError if there are three or more gripper poses and all are within 0.5 mm and 0.05° of the first."""
     steps = np.abs(step_between(base_from_gripper[:1], base_from_gripper)).max(axis=0, initial=0.0)
     metres, radians = steps[:3].max(), steps[3:].max()
     if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:

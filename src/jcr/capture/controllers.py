@@ -41,16 +41,22 @@ class Convention:
 
     @property
     def has_angles(self) -> bool:
-        """Presence of numbers with a unit of angle; False for quaternions and matrices."""
+        """True if the pose has numbers in a unit of angle; False if its rotation is a quaternion or a matrix."""
         return self.rotation not in (*QUATERNIONS, "matrix")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Return the units of positions and angles, such as ("mm", "deg"): `asked`, or for auto the convention's."""
+        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg").
+
+        For `asked` "auto" they are the usual units of this convention.
+        """
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
     def scales(self, asked: UnitsName) -> tuple[float, float]:
-        """Return metres per unit of position and radians per unit of angle, for the units of `units(asked)`."""
+        """Return the factors from the pose's numbers to metres and to radians, for the units `asked`, such as "mm-deg".
+
+        For `asked` "auto" they are those of the convention's usual units.
+        """
         length, angle = self.units(asked)
         return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
@@ -89,7 +95,7 @@ OF_ARM = (
 
 
 def units_of(convention: str) -> str:
-    """Return the units of a convention as text: "m, rad", "mm, °", or "m" if it has no angles."""
+    """Return the usual units of the pose convention of this name as text: "m, rad", "mm, °", or "m" without angles."""
     form = CONVENTIONS[convention]
     return f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
 
@@ -97,7 +103,10 @@ def units_of(convention: str) -> str:
 def numbers_from_poses(
     base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
 ) -> Float[ndarray, "n k"]:
-    """Convert poses to rows of the k numbers of a convention, in its columns; inverse of `poses_from_numbers`."""
+    """Convert each pose to the k numbers of a pose convention, in the convention's order, such as x, y, z, rx, ry, rz.
+
+    The numbers are in `units` ("mm-deg"); "auto": the convention's usual ones. Inverse of `poses_from_numbers`.
+    """
     form = CONVENTIONS[convention]
     position_unit, angle_unit = form.scales(units)
     position = base_from_gripper[:, :3, 3] / position_unit
@@ -115,7 +124,10 @@ def numbers_from_poses(
 def poses_from_numbers(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> Float[ndarray, "n 4 4"]:
-    """Convert rows of the k numbers of a convention to base_from_gripper; raise InputError if a row is no pose."""
+    """Convert rows of the k numbers of a pose convention to base_from_gripper; raise InputError if a row is no pose.
+
+    The numbers are in `units` ("mm-deg"); "auto": the convention's usual ones. Messages begin with `where`.
+    """
     poses, faults = checked_rows(numbers, convention, units, where)
     if faults:
         raise InputError(faults[min(faults)])
@@ -167,15 +179,15 @@ def checked_rows(
 
 
 def tolerated(count: int) -> int:
-    """Return how many faulty frames of `count` may be left out; a larger number indicates a common cause."""
+    """Return the number of faulty frames among `count` that may be left out: a quarter, but one at least."""
     return max(1, count // 4)
 
 
 def far_faults(position: Float[ndarray, "n 3"], where: str, names: Sequence[str]) -> dict[int, str]:
-    """Return messages, by row, for positions (m) that are more than METRES_LIMIT from the base.
+    """Return a message for each row whose position (m) is more than 10 m from the base, by the index of the row.
 
-    Raises InputError if more than `tolerated` rows are, because wrong units are then the cause. `names` are the names
-    of the rows in the messages.
+    Raises InputError if more than a quarter of the rows are that far, because wrong units are then the cause. `names`
+    are the names of the rows in the messages.
     """
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
@@ -199,7 +211,10 @@ def _require_units(
     units: UnitsName,
     where: str,
 ) -> None:
-    """Raise InputError if positions (m) or the numbers of rotations (`rest`) are too large or small for the units."""
+    """Raise InputError if positions (m) or angles (`rest`, as written) are too large or too small for `units`.
+
+    `form` is the pose convention of the numbers. The message begins with `where` and names the option that helps.
+    """
     per_m, per_rad = form.scales(units)
     farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0)) / per_m
     largest = float(np.abs(rest).max(initial=0.0)) if form.has_angles else 0.0

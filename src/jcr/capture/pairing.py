@@ -64,10 +64,10 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
 def paired_by_name(
     names: Sequence[str], poses: Float[ndarray, "n 4 4"]
 ) -> dict[bool, Float[ndarray, "n 4 4"]]:
-    """Return the poses as they would be paired if the pose file had listed the images sorted by name.
+    """Return the pose of each name under the assumption that `poses`, in file order, belong to the sorted names.
 
-    Key True: names sorted by the numbers in them; key False: names sorted as text. The given `names` and `poses` are
-    paired row by row. A key is left out if its order changes no pair.
+    Key True: names sorted by the numbers in them (2 before 10); key False: sorted as text. A key is left out if `names`
+    are in this order already.
     """
     found = {}
     for by_number in (True, False):

@@ -49,9 +49,10 @@ class PoseTrack:
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Return for each stamp the row of the sample before it, the fraction of the way to the next sample, and the gap.
+    """Return for each of n time stamps (ns) the row of the sample before it, and two numbers on the next sample.
 
-    The gap is the time (ns) between the two samples around the stamp: 0 at a sample, NEVER outside of the samples.
+    The first number is the fraction (0 to 1) of the time from that sample to the next. The second is the time (ns)
+    between the two: 0 for a stamp at a sample, the largest int64 outside of the k ascending times `sample_ns`.
     """
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
@@ -63,9 +64,9 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """Return the speed (m/s) of the frame at time stamps (ns); rotation counts as in jcr.geometry.motion_length.
+    """Return the speed (m/s) of a moving frame at time stamps (ns), averaged over 0.1 s around each.
 
-    The motion is measured from SPEED_OVER_NS before to SPEED_OVER_NS after each stamp.
+    `poses_at` is a function from time stamps to poses. A rotation counts as its angle (rad) times 0.3 m.
     """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
@@ -95,7 +96,10 @@ class TfTree:
                 self._static.add(child)
 
     def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
-        """Return a function from time stamps to base_from_gripper; raise InputError if the frames are not connected."""
+        """Return a function from time stamps (ns) to base_from_gripper and the gaps (ns) between samples around each.
+
+        `base` and `gripper` are names of frames. Raises InputError, begun with `source`, if they are not connected.
+        """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
             if frame is None or frame not in frames:

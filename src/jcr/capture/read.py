@@ -111,14 +111,17 @@ def format_of(path: Path, options: ReadOptions | None = None) -> str:
 
 
 def _inverted(found: Any, options: ReadOptions) -> Any:
-    """Return the capture with inverted poses if `options.pose_inverted` is set, otherwise unchanged."""
+    """Return the capture `found` with its poses inverted if `options.pose_inverted` is set, otherwise unchanged."""
     if not options.pose_inverted:
         return found
     return replace(found, base_from_gripper=inverse(found.base_from_gripper))
 
 
 def _extracted(path: Path, options: ReadOptions, into: Path, form: Any, progress: Progress) -> Capture:
-    """Return the capture of a recording, extracted to `into`; extract again only if its files or options changed."""
+    """Return the capture that the format `form` (a module) extracts from the recording at `path` into the folder `into`.
+
+    A capture that is there already is returned if neither the recording's files nor the options changed since.
+    """
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]
     states = [

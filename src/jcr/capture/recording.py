@@ -40,9 +40,10 @@ Poses = Float[ndarray, "n 4 4"]
 
 
 def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
-    """Return the topic or key that the user chose, or the only `usual` one; raise InputError that lists all names.
+    """Return the topic or key `asked` by the user; if that is None, the only entry of `usual`, the likely names.
 
-    `what` and `option` name the choice and its command-line option in the message.
+    Raises InputError that lists all `names` if `asked` is not one of them, or if `usual` has not one entry. In the
+    message, `what` describes the choice and `option` is its command-line option.
     """
     if asked in names:
         return str(asked)
@@ -140,11 +141,11 @@ def best_frames(
     sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
     count: int,
 ) -> tuple[Rows, tuple[str, ...]]:
-    """Return the rows of the best `count` frames in order of time, and remarks on the choice for the user.
+    """Return the rows of `count` sharp frames from n in order of time, and remarks on the choice for the user.
 
-    `speed` is in m/s (rotation as in motion_length). `usable` marks the frames with a valid pose. `sharpness_of`
-    returns the sharpness of k ascending rows; it is called once. A stop gives at most one frame; if there are too few
-    stops, the slowest frames between them are added. Raises InputError if fewer than three frames are left.
+    `speed` is that of the gripper (m/s; 1 rad counts as 0.3 m). `usable` marks the frames with a valid pose.
+    `sharpness_of` returns the sharpness of k ascending rows. Each stop of the arm gives at most one frame; the slowest
+    frames between stops are added if necessary. Raises InputError if fewer than three frames are left.
     """
     moments = [
         run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]

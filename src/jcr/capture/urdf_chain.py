@@ -67,7 +67,7 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
 
 
 def read_chain(file: Path, dof: int) -> Arm:
-    """Read the arm of `dof` rotating joints from a URDF file, as `chain_of` does."""
+    """Read the arm of `dof` rotating joints in a row from a URDF file; its gripper frame is the link after the last."""
     return chain_of(load_urdf(file), dof, str(file))
 
 
@@ -141,7 +141,7 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Convert recorded positions (a column per joint) to joint angles (rad); None if `chain_of` finds no arm."""
+        """Convert recorded positions (a column per joint) to joint angles (rad); None if not all joints rotate."""
         try:
             chain_of(self.urdf, len(self.joints), "the URDF")
         except InputError:
@@ -149,7 +149,10 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper of recorded positions (a column per joint); raise InputError on degrees as rad."""
+        """Compute base_from_gripper from recorded positions, one column per joint.
+
+        Raises InputError if the positions are so large that they are degrees, although the unit is radians.
+        """
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(
@@ -164,17 +167,20 @@ class RecordedArm:
     def poses_at(
         self, samples: JointSamples, stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return base_from_gripper at time stamps (ns), and the largest gap (ns) between joint samples around each."""
+        """Return base_from_gripper at time stamps (ns), and the largest gap (ns) between joint samples around each.
+
+        `samples` are the time stamps (ns) and recorded positions of each joint.
+        """
         recorded, gap = self.interpolated(samples, stamp_ns)
         return self.poses(recorded), gap
 
     def interpolated(
         self, samples: JointSamples, stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
-        """Return recorded positions at time stamps (ns), and the largest gap (ns) between joint samples around each.
+        """Return the joint positions at n time stamps (ns), and the largest gap (ns) between joint samples around each.
 
-        Positions have one row per stamp and one column per joint, linear between the samples of the joint, which may be
-        published separately. A joint turns the shorter way, also across ±π.
+        `samples` are the time stamps (ns) and recorded positions of each of the j joints. Positions are interpolated
+        linearly, in the recorded units; a joint turns the shorter way, also across ±π.
         """
         rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
         for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):

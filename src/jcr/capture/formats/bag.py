@@ -36,7 +36,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Read the best frames of a bag into the folder `into`; the bag is streamed, never held in memory as a whole.
+    """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture.
 
     Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones),
     and if the poses of all images are stale.
@@ -111,7 +111,10 @@ class _Bag:
             raise InputError(f"{path}: topic {topic} has no images; choose another with --camera-topic")
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
-        """Yield connection, time of recording (ns) and content of messages; raise InputError if one is damaged."""
+        """Yield the connection, time of recording (ns) and content of each message of the connections.
+
+        `span` may limit the times of recording: `start` and `stop` (ns). Raises InputError if a message is damaged.
+        """
         try:
             for connection, at, raw in self.reader.messages(connections, **span):
                 yield connection, at, self.reader.deserialize(raw, connection.msgtype)
@@ -123,7 +126,10 @@ class _Bag:
     def pictures(
         self, rows: Int[ndarray, " k"], stamps: Int[ndarray, " n"], log_ns: Int[ndarray, " n"]
     ) -> Iterator[Picture]:
-        """Yield the images of the given rows; `stamps` and `log_ns` have each row's time stamp and recording time."""
+        """Yield the row, image and file ending of each of k rows among the bag's n images.
+
+        `stamps` and `log_ns` are the time stamps and the times of recording (ns) of all n images.
+        """
         for row in rows.tolist():
             at = int(log_ns[row])
             for _, _, message in self.messages(self.images, start=at, stop=at + 1):
@@ -132,9 +138,9 @@ class _Bag:
                     break
 
     def depth_near(self, stamp: int, logged: int) -> UInt16[ndarray, "h w"] | None:
-        """Return the depth (mm) of the exposure nearest to a time stamp (ns); None if none is of the same moment.
+        """Return the depth image (mm) whose time stamp is nearest to `stamp` (ns), that of a colour image.
 
-        The depth images are searched around the recording time `logged` (ns) of the image.
+        None: no depth image is within SAME_MOMENT_NS. `logged` (ns) is the time at which the colour image was recorded.
         """
         span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
         near = [
@@ -145,7 +151,10 @@ class _Bag:
         return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
-        """Return the intrinsics of CameraInfo for images of `size` (matrix P for rectified images); None if unknown."""
+        """Return the intrinsics in the bag's CameraInfo for images of `size` (width, height); None if it has none.
+
+        For rectified images they are those of the matrix P, without distortion.
+        """
         if (info := self.camera_info) is None:
             return None
         where = f"{self.path}: camera_info of {self.topic}"

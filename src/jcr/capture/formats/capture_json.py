@@ -100,9 +100,10 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
 def stated_fields(
     content: CaptureFile, frames: Sequence[FrameEntry], size: tuple[int, int], file: Path
 ) -> dict[str, Any]:
-    """Return the fields of Capture that a capture.json states for the given frames, without further cameras.
+    """Return the optional fields of Capture from a capture.json, as keyword arguments: intrinsics, joints, robot, ….
 
-    `size` is the width and height of the images (px); `frames` are those that can be used.
+    `size` is the width and height of the images (px); `frames` are the entries of the images in the capture. The
+    cameras of the entry "cameras" are not included (see `with_cameras`).
     """
     angles = [frame.joints for frame in frames if frame.joints is not None]
     joints = np.array(angles) if angles and len(angles) == len(frames) else None
@@ -125,10 +126,10 @@ def stated_fields(
 
 
 def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool] | None = None) -> Capture:
-    """Return the capture with the further cameras of the entry "cameras"; raise InputError if the entry is invalid.
+    """Return the capture with the other cameras from `cameras`, the entry "cameras" of a capture.json.
 
-    `used` tells for each frame of the file whether the capture contains it; by default it contains all. Messages begin
-    with `where`.
+    `used` is True for each frame of the file that the capture contains; None: it contains all. Raises InputError,
+    begun with `where`, if the entry is invalid.
     """
     entries: dict[str, CameraEntry] = validated_content(_CAMERAS, cameras, f"{where}: cameras")
     own = next((name for name, entry in entries.items() if entry.is_own), None)
@@ -146,7 +147,10 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
 
 def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
-    """Return a further camera from its entry in capture.json; its images must all have one size."""
+    """Return the camera `name` from its entry in "cameras" of capture.json; raise InputError if its image sizes differ.
+
+    `used` is True for each frame of the file that `capture` contains. Messages begin with `where`.
+    """
     poses, frame = None, None
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:
@@ -181,7 +185,10 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
 def _stated_intrinsics(
     stated: CaptureFile | CameraEntry, size: tuple[int, int], where: str
 ) -> dict[str, Any]:
-    """Return the fields `intrinsics` and `intrinsics_std` of the Capture or CellCamera with images of `size`."""
+    """Return the intrinsics of an entry in a capture.json as the fields `intrinsics` and `intrinsics_std` of Capture.
+
+    `size` is the width and height of the images (px). Raises InputError, begun with `where`, for invalid intrinsics.
+    """
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
     if std is None:
@@ -227,7 +234,10 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
-    """Write the capture.json of a capture whose images are in `folder` already; readers ignore the `remarks`."""
+    """Write the capture.json of a capture whose images are in `folder` already.
+
+    `remarks` are further entries of the file, which readers of captures ignore.
+    """
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}
@@ -272,7 +282,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
-    """Return the path of a file in the folder; raise InputError if the folder has no such file."""
+    """Return the path `folder/name`; raise InputError, begun with `where`, if the folder has no such file."""
     if not (file := contained(folder, name, where)).is_file():
         raise InputError(f"{where}: {name} is not there; add it, or remove the key")
     return file

@@ -79,9 +79,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Read the best frames of the chosen episodes into the folder `into`.
+    """Extract the sharpest frames at rest from the episodes that the options name; return them as a capture.
 
-    Raises InputError that lists the existing cameras, states or episodes if the options name others.
+    Images are written to the folder `into`. Raises InputError that lists the existing cameras, states or episodes if the
+    options name others.
     """
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
@@ -115,7 +116,11 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
 
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """Read episode `index` with the robot state `key`; raise InputError if the episode is missing or damaged."""
+    """Read the episode number `index` of the data set at `path`, whose meta/info.json is `info`.
+
+    `camera` and `key` are the names of the image column and of the column of robot states. Raises InputError if the
+    episode is missing or damaged.
+    """
     has_video = info.features[camera].dtype == "video"
     fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}
     video_fields, start_s = fields, 0.0
@@ -176,9 +181,10 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 def _images(
     episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
 ) -> Iterator[Picture]:
-    """Yield the images of the `wanted` rows (ascending) from the videos or tables of the episodes.
+    """Yield row, image and file ending for each of the `wanted` rows (ascending), from the episodes' videos or tables.
 
-    `rows` has the rows of each episode; rows are counted over all episodes. `fps` is the frame rate of the videos.
+    A row is the index of a frame, counted over all episodes; `rows` lists the rows of each episode. `key` is the image
+    column, `fps` the frame rate of the videos (1/s).
     """
     for episode, part in zip(episodes, rows, strict=True):
         mine = wanted[np.isin(wanted, part)]
@@ -231,10 +237,10 @@ def _video_frames(
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Return gripper poses computed from the k numbers per frame in `state`, and the angles (rad) of the j joints.
+    """Return the gripper poses (m) and joint angles (rad) of n frames from `state`, k numbers per frame.
 
-    The numbers are poses or joint angles. The angles are None without a URDF in which rotating joints alone move the
-    gripper.
+    With `options.urdf` the numbers are positions of the joints, else poses. The joint angles are None without a URDF,
+    or if a sliding joint moves the gripper. `key` and `feature` are the name and description of the data set's column.
     """
     where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:

@@ -35,15 +35,19 @@ def read_yaml_or_json(file: Path) -> Any:
 
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
-    """Return the keys of the gripper and the marker pose in a list of samples; None if the content is no such list."""
+    """Return the two keys under which each sample of a list has its gripper pose and its marker pose.
+
+    `content` is that of a YAML or JSON file, as of easy_handeye2: ("robot", "tracking"). None: it is no such list.
+    """
     first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
 
 def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[str] | None, list[list[Any]]]:
-    """Return the header (None without names) and the cells of every pose of a list, like the rows of a table.
+    """Return a list of poses, read from YAML or JSON, as a table: the column names, and a row of cells for each pose.
 
-    `key` names the pose in each entry if an entry holds several poses. A missing cell is empty.
+    The column names are None if the poses are lists of bare numbers. `key` selects the pose in entries with several
+    poses; None: an entry is a pose. A missing cell is "". Messages of InputError begin with `where`.
     """
     entries = _entries(content)
     if not entries:
@@ -60,7 +64,10 @@ def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[st
 
 
 def _entries(content: Any) -> list[Any]:
-    """Return the entries of a list, of the first list in an object, or of an object that maps images to poses."""
+    """Return the entries (one per image) of the content of a YAML or JSON file; empty if it has none.
+
+    The content is a list, an object that contains a list, or an object that maps image names to poses.
+    """
     if isinstance(content, list):
         return content
     if not isinstance(content, dict):
@@ -72,7 +79,10 @@ def _entries(content: Any) -> list[Any]:
 
 
 def _entry(entry: Any, where: str) -> Entry:
-    """Return the cells of one entry; raise InputError if it holds no pose, or two values for one cell."""
+    """Return one entry of a list of poses as a dictionary from column name to number; a row of bare numbers as a list.
+
+    Raises InputError, begun with `where`, if the entry has no pose, or two values for one column.
+    """
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
         return entry
     cells = dict[str, Any]()
@@ -88,7 +98,10 @@ def _entry(entry: Any, where: str) -> Entry:
 
 
 def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each cell of a pose, nested parts included; `key` is the key of `value` in the file."""
+    """Yield column name and number, such as ("qx", 0.1), of each number in a nested pose of a YAML or JSON file.
+
+    `value` is the pose or a part of it, such as its rotation, and `key` its key in the file.
+    """
     names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}
@@ -113,7 +126,10 @@ def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
-    """Yield the cells of a matrix, rotation or position; `names` are the cells of the rotation, None if it is none."""
+    """Yield column name and number of each number in a list: a matrix (m00 …), a rotation or a position (x, y, z).
+
+    `names` are the column names if the list is a rotation; None: its key in the file is not that of a rotation.
+    """
     rows = [row if isinstance(row, list) else [row] for row in value]
     flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}
     width = {9: 3, 12: 4, 16: 4}.get(len(flat), 0)

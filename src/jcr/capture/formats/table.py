@@ -51,7 +51,10 @@ class OpenConventionError(InputError):
 
 
 def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
-    """Return the options to try for columns rx, ry, rz: one list per convention, with one entry per pair of units."""
+    """Return the options with each convention and units that columns rx, ry, rz may have, to try them all.
+
+    One list per convention ("ur", "yaskawa"), with one entry per pair of units of length and angle.
+    """
     units = [options.pose_units]
     if options.pose_units == "auto":
         units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
@@ -173,7 +176,10 @@ def _convention_of(names: Collection[str], where: str) -> ConventionName:
 
 
 def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> UnitsName:
-    """Return the units of a table: those of the options, else those in its column names (`named`), else auto."""
+    """Return the units of a pose table such as "mm-deg": those of the options, else those in its header, else "auto".
+
+    `named` are the units that the header states, such as {"mm", "deg"}.
+    """
     if options.pose_units != "auto" or not named:
         return options.pose_units
     length, angle = CONVENTIONS[convention].units()
@@ -185,9 +191,10 @@ def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> 
 def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> tuple[dict[str, tuple[Any, ...]], set[str], ConventionName]:
-    """Return the cells by usual column name, the units in the column names, and the convention, auto if unknown.
+    """Return the columns of a table of poses, the units in its header, and the pose convention ("auto": unknown).
 
-    Without a header, an image name or time stamp is expected first, then the columns of the convention.
+    The columns are a dictionary from name ("x", "qx", "image", …) to cells. Without a header, an image name or time
+    stamp is expected first, then the columns of the convention. Messages of InputError begin with `where`.
     """
     columns, convention = [tuple(column) for column in zip(*rows, strict=True)], options.pose_convention
     if header is not None:
