@@ -33,7 +33,7 @@ MOST_PAIRS = 100
 
 @dataclass(frozen=True)
 class _Seen:
-    """Corners of one body: pixels by image (m) and corner (c), NaN where not detected, and positions (m)."""
+    """Corners of one board or tag in m images: pixels (NaN where not detected), and positions on it (m or sides)."""
 
     number: int
     """Number of the tag; 0 for a board."""
@@ -82,7 +82,7 @@ def with_boards(
 
 
 def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
-    """Yield the corners of each body that any image shows; `sightings` are those of each image."""
+    """Yield the corners of each board or tag that any image shows; `sightings` are the detections in each image."""
     for number in sorted({s.body for shown in sightings for s in shown}):
         own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
         x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
@@ -96,7 +96,7 @@ def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
 def _at_one_place(
     seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Return the largest set of images (rows) that agree on the body's position; empty where no two agree."""
+    """Return the rows of the largest set of images that see the board at one position; empty if no two agree."""
     images, best = seen.images, np.zeros(0, int)
     pairs = np.array(list(combinations(images.tolist(), 2)), int).reshape(-1, 2)
     if len(pairs) > MOST_PAIRS:
@@ -112,7 +112,7 @@ def _at_one_place(
 def _agreeing(
     seen: _Seen, by: Int[ndarray, " b"], cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Return the images (rows) whose detected corners agree with those triangulated from the images `by`."""
+    """Return the rows of images whose corners agree with the board's position triangulated from the images `by`."""
     points = _triangulated(seen.x_px[by], cameras[by], intrinsics)
     limit_px, agreeing = SAME_PLACE * intrinsics.width, list[int]()
     for k in seen.images:
@@ -146,7 +146,7 @@ def _with_corners(
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """Return the tracks with the corners of a body in `images` (rows) as further points, and the body."""
+    """Return the tracks with a board's corners in `images` (rows) added, and the board with its track points."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

@@ -36,7 +36,7 @@ RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
 
 @dataclass(frozen=True)
 class Sighting:
-    """Detected points of one body in one image."""
+    """Detected points of one body (a board or a single tag) in one image."""
 
     body: int
     """Number of the tag; 0 for a board."""
@@ -49,19 +49,19 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Board:
-    """One meaning of a board's name, with the detector of the board in a grey image."""
+    """Board that a user's --board name may mean, with the function that detects it in a grey image."""
 
     name: str
     detect: Callable[[UInt8[ndarray, "h w"]], list[Sighting]]
 
 
 def boards(spec: str) -> list[Board]:
-    """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, the literal one first.
+    """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, its exact reading first.
 
-    A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its
-    marker length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word
-    SIDE stands for an unknown side, which is then the unit of length. Raises InputError, with the valid forms, for a
-    name that means no board.
+    A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its marker
+    length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word SIDE
+    stands for an unknown side, which is then the unit of length. Raises InputError, with the valid forms, for a name
+    that means no board.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:
@@ -83,7 +83,7 @@ def boards(spec: str) -> list[Board]:
 
 
 def is_of_unknown_size(spec: str) -> bool:
-    """Test whether a board's name has SIDE instead of a length."""
+    """Test whether a board's name has the word SIDE in place of the length of its squares or tags."""
     return SIDE in spec.split(":")
 
 
@@ -152,7 +152,7 @@ def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Callable[[UInt8[ndarray,
 
 @cache
 def _charuco_shift_px() -> float:
-    """Return the half pixel that OpenCV before pull request 28380 adds to corners of ChArUco boards, else 0."""
+    """Return the shift, 0 or 0.5 px, of ChArUco corners in the installed OpenCV; pull request 28380 removed it."""
     square, margin = 40, 20
     board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
     drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)
@@ -185,7 +185,7 @@ def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarra
 
 
 def _starts_dark(grey: UInt8[ndarray, "h w"], x_px: Float[ndarray, "down across 2"]) -> bool:
-    """Test whether the square after the first corner is dark, which distinguishes the board's two ends."""
+    """Test whether the square below and right of the first corner is dark; a rotation by 180° changes that."""
     centre = (x_px[:-1, :-1] + x_px[1:, :-1] + x_px[:-1, 1:] + x_px[1:, 1:]) / 4
     u, v = np.moveaxis(np.rint(centre).astype(int), -1, 0)
     shade = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(float)
@@ -213,7 +213,7 @@ def _circles(count: tuple[int, int], spacing: float) -> Callable[[UInt8[ndarray,
 
 
 def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
-    """Return the points of a grid with spacing 1 and z = 0, row by row."""
+    """Return the points (column, row, 0) of a grid of `across` columns and `down` rows with spacing 1, row by row."""
     row, column = np.indices((down, across)).reshape(2, -1).astype(float)
     return np.column_stack([column, row, 0 * row])
 
@@ -248,10 +248,10 @@ def _single_tags(
 def most_seen(
     readings: Sequence[Board], images: Sequence[UInt8[ndarray, "h w 3"]]
 ) -> tuple[Board, list[list[Sighting]]]:
-    """Return the board of `readings` with most points in the images, and its sightings in each image.
+    """Return the board of the candidates `readings` with most points in the images, and its detections in each image.
 
-    The alternatives to the first board, and images without strongly coloured pixels, are tried only while the board is
-    found in fewer than half of the images.
+    The first board is tried first. The others, and images whose strongly coloured pixels are filled in, are tried only
+    while the best board is found in fewer than half of the images.
     """
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     best, seen, points = readings[0], [], -1

@@ -37,10 +37,11 @@ Pose = tuple[float, Float[ndarray, "4 4"]]
 
 
 def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
-    """Reconstruct cameras from a board or tags, in metres or sides; the recon frame is that of the most detected body.
+    """Reconstruct cameras from a board or tags, in metres, or in sides of a square or tag if its size is unknown.
 
-    `look_for` names the board in a form of `detection.KINDS`. Unknown intrinsics are calibrated from the board. Raises
-    InputError for a name that means no board, and RejectedError when fewer than three images show it.
+    The recon frame is that of the board or tag that most images show. `look_for` names the board in a form of
+    `detection.KINDS`. Unknown intrinsics are calibrated from the board. Raises InputError for a name that means no
+    board, and RejectedError when fewer than three images show it.
     """
     report = progress or silent
     readings = boards(look_for)
@@ -90,9 +91,9 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
 def _intrinsics(
     capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
 ) -> tuple[Intrinsics, list[str]]:
-    """Return the given intrinsics, or else focal length, centre and two radial coefficients calibrated from the board.
+    """Return the given intrinsics, or those calibrated from the board's detections `seen` in each image; and notes.
 
-    The second value are notes for the user.
+    Calibrated are the focal length, principal point and two radial coefficients. The notes are for the user.
     """
     if capture.intrinsics is not None:
         return capture.intrinsics, []
@@ -120,7 +121,10 @@ def _intrinsics(
 
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
-    """Return the body's pose; None where its points are collinear, have large errors, or fit two poses."""
+    """Return (rms reprojection error in px, camera_from_body) of a detected board or tag, or None.
+
+    The result is None if the points are collinear, have large errors, or fit two poses.
+    """
     x = sighting.x_in_body
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
         return None
@@ -136,10 +140,10 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
 def locate_cameras_and_bodies(
     poses: Sequence[dict[int, Pose]],
 ) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
-    """Return the poses of cameras by row and bodies by number in the frame of the most detected body.
+    """Return recon_from_camera by image row, and recon_from_body by number of the board or tag (body).
 
-    `poses` has for each image the pose of each body in it. Poses are chained: a camera is located by its body of
-    smallest error, and a body by the camera of smallest error.
+    The recon frame is that of the body that most images show. `poses` has for each image the pose of each body in it.
+    Poses are chained: a camera is located by its body of smallest error, and a body by the camera of smallest error.
     """
     counts = Counter(body for bodies in poses for body in bodies)
     cameras: dict[int, Float[ndarray, "4 4"]] = {}

@@ -33,7 +33,7 @@ def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
 
 
 def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
-    """Return the value of --board for the family whose tags are found most often; None without tags.
+    """Return the value of --board for the tag dictionary with most tags in the images; None without tags.
 
     The tags of a ChArUco board are proposed as single tags, because the user has to count its squares.
     """
@@ -73,7 +73,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 
 
 def proposed_for(capture: Capture, board: str | None) -> Finding | None:
-    """Return the finding that the images show a board; None with a given board or a camera that watches the gripper."""
+    """Return the finding that the images show a board; None if they do not, `board` is given or the camera is fixed."""
     if board is not None or capture.mount == "base":
         return None
     return proposed([read_image(capture.folder / name) for name in capture.images])

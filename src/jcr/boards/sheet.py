@@ -91,7 +91,10 @@ def _charuco(
 def _ruler(
     pixels: Image.Image, px_per_mm: float, start_mm: tuple[float, float], length_mm: float, along_x: bool
 ) -> None:
-    """Draw a ruler from `start_mm` with long ticks every 10 mm and short ticks every 1 mm, above or left of the line."""
+    """Draw a ruler with long ticks every 10 mm and short ticks every 1 mm, above the line (along x) or left of it.
+
+    The ruler begins at `start_mm` (x, y from the top-left corner of the page).
+    """
     draw, width = ImageDraw.Draw(pixels), round(0.15 * px_per_mm)
     x, y = start_mm
     ends = [((0.0, 0.0), (length_mm, 0.0))]

@@ -44,7 +44,7 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True)
 class Pair:
-    """Matched keypoints of two images that one two-view geometry explains, with its possible motions."""
+    """Matched keypoints of two images that fit one two-view geometry, and the camera motions that may explain them."""
 
     key: Key
     """Rows of the two images."""
@@ -56,7 +56,7 @@ class Pair:
 
 @dataclass(frozen=True, kw_only=True)
 class RotationOfX:
-    """Rotation R_X of gripper_from_camera, its covariance, and the pairs that agree on it."""
+    """Estimate of the rotation R_X of gripper_from_camera, with its covariance and the image pairs that agree on it."""
 
     rotation: Float[ndarray, "3 3"]
     covariance: Float[ndarray, "3 3"]
@@ -82,7 +82,7 @@ class Gate:
 
 
 def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[TwoViewMotion, float]]:
-    """Return the motions of a pair whose angle agrees with the gripper's `angle`, each with its tolerance (rad).
+    """Return the motions of an image pair that rotate by the gripper's `angle` (rad), each with its tolerance (rad).
 
     `systematic` is the share of the angle by which camera and gripper may differ systematically.
     """
@@ -102,10 +102,11 @@ def judge(
     systematic: float = SYSTEMATIC,
     known: RotationOfX | None = None,
 ) -> Gate:
-    """Classify the pairs by the gripper's motions, `motion` (i_from_j of gripper poses).
+    """Classify image pairs by whether their camera rotation agrees with the gripper's `motion[i, j]`, i_from_j.
 
-    Pairs pass first by angle alone. R_X is estimated from these, and every motion of every pair is then judged by its
-    whole rotation. `known` is R_X from a larger set of pairs, used where these pairs do not determine it.
+    Pairs pass first by rotation angle alone, which may differ by the share `systematic`. The hand-eye rotation R_X is
+    estimated from these. Every possible motion of every pair is then judged by its whole rotation. `known` is an R_X
+    from a larger set of pairs, used where these pairs do not determine it.
     """
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     undecided, passing, judged = [], [], []
@@ -141,7 +142,11 @@ def judge(
 
 
 def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX, systematic: float) -> float:
-    """Return the largest accepted angle (rad) between a pair's rotation and the rotation that R_X predicts."""
+    """Return the largest accepted angle (rad) between a pair's rotation and its prediction from the gripper and R_X.
+
+    `reading` is the pair's camera motion, `angle` the gripper's rotation (rad), and `systematic` the share of it by
+    which both may differ.
+    """
     own = float(np.trace(reading.covariance[:3, :3]))
     of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
     robot = 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
@@ -151,7 +156,10 @@ def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX,
 def _common_rotation(
     passing: Sequence[tuple[Key, TwoViewMotion, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
-    """Return R_X if at least LEAST_PAIRS pairs agree on it, else None."""
+    """Return the hand-eye rotation R_X if at least LEAST_PAIRS image pairs agree on it, else None.
+
+    `passing` lists image pairs, each with a camera motion and its tolerance (rad); `motion[i, j]` is gripper i_from_j.
+    """
     keys = [key for key, _, _ in passing]
     if len(set(keys)) < LEAST_PAIRS:
         return None
@@ -170,10 +178,11 @@ def rotation_of_x(
     camera: Float[ndarray, "p 3 3"],
     tolerance: Float[ndarray, " p"],
 ) -> RotationOfX | None:
-    """Return R_X from relative rotations i_from_j of gripper and camera; None if no three pairs about two axes agree.
+    """Return the hand-eye rotation R_X from relative rotations i_from_j of gripper and camera, p of each.
 
-    Each hypothesis comes from two pairs, as in RANSAC; the best one is refined on all pairs that agree with it.
-    `tolerance` (rad) is the largest disagreement of a correct pair.
+    Each hypothesis comes from two image pairs, as in RANSAC; the best one is refined on all pairs that agree with it.
+    `tolerance` (rad) is the largest disagreement of a correct pair. Returns None if no three pairs about two axes
+    agree.
     """
     axis_a, axis_b = sine_axis(gripper), sine_axis(camera)
     first, second = np.triu_indices(len(gripper), 1)
@@ -222,16 +231,16 @@ def rotation_of_x(
 def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
 ) -> Float[ndarray, "..."]:
-    """Return the angle (rad, one row per R_X of the batch) by which each pair of motions contradicts R_X."""
+    """Return the angle (rad) between gripper · X and X · camera, for each rotation X in `x` (rows) and each pair."""
     trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
-    """Return the angle (rad) to rotate each image by about its viewing axis, so that all images are upright alike.
+    """Return the angle (rad) by which to rotate each image about its viewing axis, so that all have one upright side.
 
-    It is the twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015). The
-    largest group of similar images is rotated least.
+    The angle is the twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski
+    2015). The largest group of images with one orientation is rotated least.
     """
     mean = base_from_camera[:, :, 2].sum(0)
     z = mean / max(float(np.linalg.norm(mean)), 1e-12)

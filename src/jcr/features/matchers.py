@@ -40,7 +40,7 @@ LEAST_CELLS = 3
 
 @runtime_checkable
 class Features(Protocol):
-    """Keypoints of a capture's images, of any kind, and a matcher of them."""
+    """Interface of one kind of features: keypoints and descriptors of a capture's images, and their matching."""
 
     x_px: list[Float[ndarray, "_ 2"]]
     """Keypoints of every image found so far, px; pixel centres are whole numbers."""
@@ -56,17 +56,17 @@ class Features(Protocol):
 
     @property
     def every_pair(self) -> int:
-        """Largest number of images of which all pairs are matched; above, pairs grow in proportion to images."""
+        """Largest number of images of which all pairs are matched; of more images, only near viewpoints are."""
         ...
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its images before matching."""
+        """Return for each pair the rows of matching keypoints; its images are first rotated by `rolls` (rad)."""
         ...
 
 
 @dataclass(frozen=True)
 class ImageGeometry:
-    """Keypoints, rays and intrinsics of the images at the working size."""
+    """Keypoints, rays (x/z, y/z) and intrinsics of a capture's images, at the size in which features are matched."""
 
     x_px: Sequence[Float[ndarray, "_ 2"]]
     """Keypoints of every image, px; pixel centres are whole numbers."""
@@ -77,7 +77,7 @@ class ImageGeometry:
 
     @staticmethod
     def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "ImageGeometry":
-        """Return the keypoints with their rays by the intrinsics."""
+        """Return keypoints `x_px` and intrinsics together with the keypoints' rays."""
         return ImageGeometry(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
 
@@ -87,10 +87,10 @@ class Matcher:
     def __init__(
         self, features: Features, scale: Float[ndarray, "2"], camera: pycolmap.Camera, known: bool, seed: int
     ) -> None:
-        """Begin without matches; `camera` belongs to images of the working size.
+        """Create a matcher without matches; `camera` is COLMAP's camera of the images at the size of matching.
 
-        `scale` is the working size over the size of the features' images, for x and y. `known` says that the camera's
-        intrinsics are given.
+        `scale` is this size over the size of the images that have the features, for x and y. `known` is true if the
+        intrinsics of `camera` are given; `seed` is that of RANSAC.
         """
         self.features, self._scale = features, scale
         self._camera, self.known, self.seed = camera, known, seed
@@ -126,9 +126,10 @@ class Matcher:
     def verified(
         self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]], moved: bool
     ) -> pycolmap.TwoViewGeometry | None:
-        """Return the geometry of the matches `rows` of a pair; None where too few matches agree. The result is cached.
+        """Return the two-view geometry of the matches `rows` of image pair `key`; None where too few matches agree.
 
-        If the gripper `moved`, matches that keep their pixel are discarded; matches in `still` cells are discarded, too.
+        If the gripper `moved`, matches that keep their pixel are discarded. Matches in the cells of `self.still` are
+        always discarded. The result is cached.
         """
         if moved:
             x_i, x_j = (x_px[image][own] for image, own in zip(key, rows.T, strict=True))
@@ -149,7 +150,10 @@ class Matcher:
         return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
-        """Return the pair of a geometry, with its possible motions by the intrinsics of `view`; cached."""
+        """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
+
+        The intrinsics are those of `view`.
+        """
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
@@ -159,7 +163,7 @@ class Matcher:
         return self._pairs[depends][0]
 
     def image_removed(self, row: int) -> None:
-        """Remove the pairs of an image that the features no longer have; rows of later images decrease by one."""
+        """Remove all matches of image `row`, which the features no longer have; later rows decrease by one."""
 
         def after(key: Key) -> Key:
             """Return the rows of a pair after the removal of the image."""
@@ -180,7 +184,10 @@ def matched(
     seed: int,
     known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
-    """Return the geometry that most matches agree on; None below MIN_INLIERS. `known`: the intrinsics are given."""
+    """Return the two-view geometry of the matches `rows` of image pair `key`; None for fewer than MIN_INLIERS inliers.
+
+    `known` is true if the intrinsics of `camera` are given, false if they are a guess.
+    """
     if len(rows) < MIN_INLIERS:
         return None
     options = pycolmap.TwoViewGeometryOptions()
@@ -200,7 +207,7 @@ def matched(
 def matrices(
     found: pycolmap.TwoViewGeometry, intrinsics: Intrinsics
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
-    """Return essential matrix and homography j from i for normalised coordinates, each None if COLMAP found none."""
+    """Return a geometry's essential matrix and homography, from rays of image i to image j; None if COLMAP has none."""
     k = intrinsics.matrix + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     essential, homography = found.E, found.H
     if essential is None and found.F is not None:
@@ -214,9 +221,10 @@ def still_cells(
     size: tuple[int, int],
     moving: Iterable[Key],
 ) -> Bool[ndarray, "r c"]:
-    """Return the cells of the image whose matches keep their pixel in many of the `moving` pairs.
+    """Return which cells of the image have matches that keep their pixel in many pairs although the gripper moves.
 
-    Such cells show the gripper's own fingers, a logo, or text drawn into the images. `size` is width and height, px.
+    Such cells show the gripper's own fingers, a logo, or text drawn into the images. `raw` are the matches of each
+    pair, `moving` the pairs between which the gripper moved, and `size` is width and height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)

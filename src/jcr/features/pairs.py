@@ -40,19 +40,19 @@ def all_pairs(n: int) -> list[Key]:
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """Return the pairs of every image with its `neighbours` nearest viewpoints by the gripper's motion."""
+    """Return the pairs of each image with its `neighbours` nearest viewpoints; `motion[i, j]` is gripper i_from_j."""
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
 def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
-    """Test for each pair of images whether they are of one viewpoint (SAME_VIEWPOINT)."""
+    """Test for each pair of images whether the gripper moved less than SAME_VIEWPOINT; `motion` is gripper i_from_j."""
     metres, radians = SAME_VIEWPOINT
     way = np.linalg.norm(motion[..., :3, 3], axis=-1)
     return (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
 
 
 def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return for each image the row of the first image of the same viewpoint."""
+    """Return for each image the row of the first image of the same viewpoint; `motion[i, j]` is gripper i_from_j."""
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -61,9 +61,10 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
 
 
 def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
-    """Return the pairs of every image with the viewpoints that share most of its scene; empty while X is unknown.
+    """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
-    The shared scene is measured by the points of the confirmed pairs.
+    The shared scene is measured by the points of the pairs in `found` that the gripper confirms. It is unknown without
+    a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is gripper i_from_j.
     """
     x = translation_of_x(found, motion)
     if x is None:
@@ -88,10 +89,11 @@ def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n
 
 
 def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
-    """Return gripper_from_camera from the confirmed pairs; None while its rotation is unknown.
+    """Return gripper_from_camera = (R_X, t_X) from the confirmed image pairs; None while R_X is unknown.
 
-    A pair's translation has a known direction d = R_X t_B. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X
-    and needs neither the scale nor a map.
+    The gripper's motion of a pair is (R_A, t_A), `motion[i, j]`. The camera's translation is known up to its length;
+    R_X rotates its direction to d. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X and needs neither the
+    scale nor a map.
     """
     if found.of_x is None or not found.confirmed:
         return None
@@ -114,7 +116,7 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[nd
 def _scene_points(
     view: ImageGeometry, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
 ) -> Float[ndarray, "p 3"]:
-    """Return the points that confirmed pairs see with parallax, in the frame of the first image's gripper, m."""
+    """Return the points (m) triangulated from confirmed pairs with parallax, in the gripper frame of image 0."""
     kept = [np.zeros((0, 3))]
     for pair in found.confirmed:
         rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
@@ -130,10 +132,10 @@ def _scene_points(
 
 
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:
-    """Return the pairs of every image with one image of each of the `count` other viewpoints of highest finite score.
+    """Return the pairs of each image with the `count` other viewpoints of highest finite `score`, one image of each.
 
-    Repeats of a viewpoint are paired with different images of the other one, so that all images are connected and their
-    noise averages.
+    `viewpoint` is the viewpoint of each image. Images of one viewpoint are paired with different images of another one,
+    so that all images are connected and their noise averages.
     """
     repeat = np.array([(viewpoint[:row] == of).sum() for row, of in enumerate(viewpoint)])
     pairs = set()

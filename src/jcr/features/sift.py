@@ -102,7 +102,7 @@ class SiftFeatures:
         del self.x_px[row], self.descriptors[row]
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return the rows of matching keypoints of each pair; `rolls` (rad) are not used."""
+        """Return for each pair the rows of its matching keypoints; SIFT does not use the rotations `rolls`."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

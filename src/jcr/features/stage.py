@@ -92,7 +92,7 @@ class _Search:
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
-        """Match pairs, their two images rotated by the given angles (rad); keep the better geometry of a pair."""
+        """Match pairs, their two images first rotated by the given angles (rad); keep a pair's better geometry."""
         todo = {}
         for key, both in rotations.items():
             if not self.matcher.features.minds_roll:
@@ -112,7 +112,10 @@ class _Search:
                 self.pairs[key] = pair, geometry
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
-        """Match pairs rotated by multiples of 90° until R_X is known, and return the classified pairs."""
+        """Match pairs with the second image rotated by 0, 90, 180 and 270° until the hand-eye rotation is known.
+
+        Returns the pairs, classified by the gripper; `found` is the classification before.
+        """
         for start in range(0, min(len(pairs), GUESSED_AT_MOST), GUESSED_AT_ONCE):
             for quarter in range(4):
                 guess = (0.0, quarter * math.pi / 2)
@@ -123,7 +126,10 @@ class _Search:
         return found
 
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
-        """Match pairs with their images rotated by the angles `upright` (rad), and return the classified pairs."""
+        """Match pairs with each image rotated by its angle `upright` (rad); return all pairs, classified.
+
+        `found` is the classification before, whose hand-eye rotation is used if the pairs do not determine one.
+        """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x)
 
@@ -157,7 +163,7 @@ class _Search:
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def gate(self) -> Gate:
-        """Return the classified pairs, by the given intrinsics or those for which most pairs agree with the gripper."""
+        """Return all pairs, classified; unknown intrinsics are first estimated from the gripper's angles."""
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
             self.view = ImageGeometry.of(self.view.x_px, intrinsics)
             self.pairs = {
@@ -208,8 +214,9 @@ def match_with_robot(
 ) -> Matched:
     """Match pairs of images and return those that the gripper poses do not contradict.
 
-    `intrinsics` are at the working size, and an initial estimate unless the matcher's are known. If R_X cannot be found
-    from the pairs, the pairs are not checked against the robot poses, which may be of another convention.
+    `intrinsics` are at the size in which images are matched; they are an initial estimate unless the matcher's are
+    known. If the hand-eye rotation cannot be found from the pairs, the pairs are not checked against the robot poses,
+    which may be of another convention.
     """
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
@@ -255,9 +262,9 @@ def match_with_robot(
 def _believed(
     search: _Search, found: Gate, names: Sequence[str]
 ) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
-    """Return the pairs to be mapped, with notes and warnings about the others.
+    """Return the two-view geometries that are to be mapped, and notes and warnings for the user about the other pairs.
 
-    These are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
+    To be mapped are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
     """
     notes, warnings = tuple[str, ...](), tuple[str, ...]()
     stale = _contradicted_by_all(found, search.motion)
@@ -280,7 +287,7 @@ def _believed(
 
 
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
-    """Return the images with a wrong pose: their pairs agree with each other and contradict the pose."""
+    """Return the rows of images with a wrong gripper pose: their pairs contradict it and agree on one correction."""
     assert found.of_x is not None
     x = found.of_x.rotation
     confirmed = {row for pair in found.confirmed for row in pair.key}

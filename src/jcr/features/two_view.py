@@ -52,9 +52,9 @@ def readings(
     j_from_i_essential: Float[ndarray, "3 3"] | None,
     j_from_i_homography: Float[ndarray, "3 3"] | None,
 ) -> list[TwoViewMotion]:
-    """Return the possible motions that explain matched directions (x/z, y/z), best first; empty where none fits.
+    """Return the motions that may explain matched rays (x/z, y/z) of cameras i and j, best first; empty without one.
 
-    The matrices, each None if not found, map normalised coordinates.
+    The matrices map rays of image i to image j, each None if not found. `focal_px` converts residuals to px.
     """
     found: list[TwoViewMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
@@ -72,10 +72,11 @@ def starting_motions(
     essential: Float[ndarray, "3 3"] | None,
     homography: Float[ndarray, "3 3"] | None,
 ) -> list[tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]]:
-    """Return rotations i_from_j and unit directions from camera i to j, decomposed from the matrices j from i.
+    """Return rotations i_from_j and unit directions from camera i to j that an essential matrix or a homography allows.
 
-    An essential matrix gives the one decomposition of four that has most points in front of both cameras. A homography
-    gives those whose plane lies in front of camera i at nearly every match.
+    Both matrices map rays (x/z, y/z) of image i to image j. An essential matrix gives the one decomposition of four
+    that has most points in front of both cameras. A homography gives those whose plane lies in front of camera i at
+    nearly every match.
     """
     found = []
     if essential is not None:
@@ -98,7 +99,10 @@ def sampson_px(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, " m"]:
-    """Return the signed Sampson distances (px) of matches from the epipolar geometry."""
+    """Return the signed Sampson distance (px) of each match from the epipolar geometry of a camera motion.
+
+    `rotation` is i_from_j, and `direction` points from camera i to camera j in the frame of i; rays are x/z, y/z.
+    """
     essential = skew(direction) @ rotation  # x_i · E x_j = 0
     h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
     line_i, line_j = h_j @ essential.T, h_i @ essential
@@ -112,7 +116,10 @@ def _by_step(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> Float[ndarray, "m 5"]:
-    """Return the derivatives of `sampson_px` by the five components of the step in `_retracted`."""
+    """Return the derivatives of `sampson_px` by a step of the motion, one column per component.
+
+    Columns 0 to 2 are a rotation vector in axes of camera i, columns 3 and 4 two components across the direction.
+    """
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
     essential = of_direction @ rotation
     by_step = np.concatenate(
@@ -131,7 +138,7 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return the length of the gradient of x_i · E x_j with respect to the four coordinates of a match."""
+    """Return the length of the gradient of x_i · E x_j by both rays, per match; line_i is E x_j, line_j is Eᵀ x_i."""
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
@@ -142,7 +149,11 @@ def _least_squares_motion(
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
 ) -> TwoViewMotion | None:
-    """Refine a motion by five parameters under a Cauchy loss, whose scale is estimated alternately."""
+    """Return a camera motion refined to least Sampson distances, with covariance; None for fewer than eight matches.
+
+    Rotation (i_from_j) and direction (i to j) have five parameters. The loss is Cauchy, whose scale is estimated
+    alternately.
+    """
     if len(ray_i) < 8:
         return None
     at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)

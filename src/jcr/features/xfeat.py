@@ -125,7 +125,10 @@ def match(
     descriptors: tuple[Float[Tensor, "m 64"], Float[Tensor, "n 64"]],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
-    """Return the row of each match in the keypoints of both images, and its score; `sizes` are (width, height), px."""
+    """Return the matches of two images as rows of their keypoints `x_px`, and each match's score.
+
+    `sizes` are (width, height) of the images, px.
+    """
     images = [
         {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
         for x, d, size in zip(x_px, descriptors, sizes, strict=True)
@@ -135,9 +138,10 @@ def match(
 
 
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
-    """Return pixels as coordinates for torch's grid_sample, by the convention of the network's training.
+    """Return pixels of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
 
-    The training has -1 and 1 at the centres of the outermost pixels; grid_sample has them at the outer edges.
+    As in the network's training, -1 and 1 are the centres of the outermost pixels; grid_sample itself has them at the
+    outer edges.
     """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]
@@ -179,7 +183,7 @@ class LearnedFeatures:
         """Descriptors of these keypoints, of unit length."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return the rows of matching keypoints of each pair; `rolls` (rad) rotate its images before matching."""
+        """Return for each pair the rows of matching keypoints; its images are first rotated by `rolls` (rad)."""
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
             for both in zip(pairs, rolls, strict=True)
