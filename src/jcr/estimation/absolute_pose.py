@@ -39,7 +39,7 @@ APART = np.radians(5.0)
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPose:
-    """Result of `absolute_pose`: camera pose in the frame of the points (a), covariance, intrinsics and inliers."""
+    """Result of `absolute_pose`: a_from_camera (a: frame of the points), its covariance, intrinsics and inliers."""
 
     a_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "p p"]
@@ -66,11 +66,12 @@ def absolute_pose(
     planar: bool = False,
     loss: Loss = "cauchy",
 ) -> CameraPose | None:
-    """Return the pose with the most points within `gate_px`; None if fewer than six (planar: four) agree.
+    """Return the camera pose in the frame of k points from their pixels; None if fewer than six (planar: four) agree.
 
-    `planar`: the points lie in a plane; both possible poses are refined and the better one is returned. The pixel noise
-    is estimated in addition to `point_covariance`. `focal` "free": the focal length is estimated. `loss` "linear" is for
-    detected corners, which have no wrong matches.
+    The pose has the most points with a reprojection error below `gate_px`. `planar`: the points lie in a plane; both
+    possible poses are refined and the better one is returned. `point_covariance` None: exact points; pixel noise is
+    estimated in any case. `focal` "free": the focal length is estimated. `loss` "linear" is for detected corners, which
+    have no wrong matches.
     """
     least, p = 4 if planar else 6, 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
@@ -139,9 +140,10 @@ def _refined(
     least: int,
     loss: Loss,
 ) -> CameraPose | None:
-    """Return the pose with the least robust reprojection error from `start`; noise and inliers are estimated in rounds.
+    """Return the pose with the least robust reprojection error, by iteration from `start`; None if it has few inliers.
 
-    `p` is the number of unknowns: 6, or 7 with the focal length; `least` is the smallest number of inliers.
+    Pixel noise and inliers are estimated anew in each round. `spread` is the covariance of each point, `p` the number
+    of unknowns (6, or 7 with the focal length), `least` the smallest number of inliers.
     """
     scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
     (pose, camera, inlier), found = start, None
@@ -186,7 +188,8 @@ def _refined(
 def _noise(residual: Float[ndarray, "k 2"], added: Float[ndarray, "k 2 2"], p: int) -> float:
     """Return the pixel noise (px) for which the whitened residuals have the median length of normal errors.
 
-    `added` is the covariance of each residual by its point's error.
+    `added` is the part of each residual's covariance that comes from its point's error. `p` is the number of unknowns
+    that were fitted to the residuals.
     """
     values, axes = np.linalg.eigh(added)
     squared = np.einsum("kij,ki->kj", axes, residual) ** 2
@@ -206,7 +209,10 @@ def _reprojection(
     camera: Intrinsics,
     p: int,
 ) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 p"]]:
-    """Return projected minus observed pixels, and their derivative by pose (6) and log focal length (if p is 7)."""
+    """Return projected minus observed pixels, and their derivative by a pose step and (if p is 7) the log focal length.
+
+    `pose` is a_from_camera, `points` are in frame a. Points behind the camera have the residual BEHIND_PX.
+    """
     arm = points - pose[:3, 3]
     x_in_camera = arm @ pose[:3, :3]
     x_in_camera[x_in_camera[:, 2] <= 0] = np.nan  # a point behind the camera has no pixel

@@ -46,8 +46,8 @@ def _arm(
 def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> Float[ndarray, "n 6"]:
     """Return the `origins` of `_arm` from Denavit-Hartenberg parameters a (m), d (m), α (degrees), one row per frame.
 
-    Row 0 is the base; row i follows the rotation of joint i. Line i of a standard table is row i. Line i of a modified
-    table (Craig) has its d in row i, its a and α in row i − 1.
+    Row 0 is the transform before joint 1, row i the transform between the rotations of joints i and i + 1. Line i of a
+    standard table is row i. Line i of a modified table (Craig) has its d in row i, and its a and α in row i − 1.
     """
     none = np.zeros(len(a))
     return np.stack([a, none, d, alpha_deg, none, none], axis=1)

@@ -37,7 +37,10 @@ FEWEST_CORNERS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class BoardShapes:
-    """Shape prior of the c corners of all bodies (boards, tags); s shape parameters: log size, then deformations."""
+    """Prior on the positions of c board and tag corners: printed positions and s shape parameters.
+
+    The shape parameters are the log size, which all bodies (boards, tags) share, then the deformations of each body.
+    """
 
     point: Int[ndarray, " c"]
     """Point of each corner, ascending."""
@@ -76,7 +79,10 @@ class BoardShapes:
         points_in_world: Float[ndarray, "p 3"],
         shape: Float[ndarray, " s"],
     ) -> Float[ndarray, "c 3"]:
-        """Return the residual of each corner along body axes, in standard deviations, for parameters `shape` (s,)."""
+        """Return corner minus expected corner (printed position + deformation) along body axes, in standard deviations.
+
+        `shape` are the s shape parameters; the corners are the rows `point` of `points_in_world`.
+        """
         pose = world_from_rig[self.rig]
         ahead = points_in_world[self.point] - pose[:, :3, 3]
         in_body = np.exp(-shape[0]) * (ahead[:, None] @ pose[:, :3, :3])[:, 0]
@@ -92,7 +98,8 @@ class BoardShapes:
     ) -> Derivatives:
         """Return residuals and derivatives of the corners as two observations each: (x, y), and (z, 0).
 
-        `columns` are the shape parameters among the `shared` columns of the image equations.
+        The image equations have `shared` columns that are common to all images; `columns` are the s shape parameters
+        among them.
         """
         c = len(self.point)
         residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
@@ -117,7 +124,10 @@ class BoardShapes:
     def point_information(
         self, world_from_rig: Float[ndarray, "m 4 4"], shape: Float[ndarray, " s"], points: int
     ) -> Float[ndarray, "p 3 3"]:
-        """Return the shape prior's information about each of p points for fixed body poses; 0 for other points."""
+        """Return the information matrix (inverse covariance) of each of p points by the prior, for exact body poses.
+
+        The matrix is 0 for a point that is not a corner; `points` is the number p.
+        """
         whitened = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
         whitened /= CORNER_STD_M[:, None]
         out = np.zeros((points, 3, 3))
@@ -125,16 +135,17 @@ class BoardShapes:
         return out
 
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Return the height of each corner above the plane of its body, in the unit of the world."""
+        """Return the height of each corner above the plane of its body, in the unit of `x_in_body`."""
         return self.by_shape[:, 2] @ shape
 
 
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int
 ) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
-    """Return the shape prior of boards with corners among the points, and initial world_from_body of each body.
+    """Return the shape prior of boards with corners among the points, and initial world_from_body of each of b bodies.
 
-    Only corners that are `seen`, and bodies with at least four of them, are used. The prior is None without bodies.
+    A body is a board or tag; its rig has a number from `first_rig` on. Only corners that are `seen`, and bodies with at
+    least four of them, are used. The prior is None without bodies.
     """
     bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
     if not bodies:
@@ -165,7 +176,10 @@ def shapes_of(
 def _seen_bodies(
     boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
 ) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Transform, float]]:
-    """Yield corner points, printed coordinates, world_from_body and size of each body whose pose is determined."""
+    """Yield each body with enough seen corners: point rows and printed positions of the corners, world_from_body, size.
+
+    The size is the length of one stated metre, in units of the world.
+    """
     for body in boards.bodies:
         rows = np.flatnonzero(seen[body.point])
         x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
@@ -177,7 +191,10 @@ def _seen_bodies(
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
-    """Return w deformations of a body, as displacements of its c corners, and their prior standard deviations."""
+    """Return w deformations of a body with corners printed at `x` (m), and the prior standard deviation of each.
+
+    Each is a displacement of the c corners: a relative stretch of x over y, then bends in z with an rms of 1.
+    """
     if len(x) < FEWEST_TO_BEND:
         return np.zeros((len(x), 3, 0)), ()
     across = x[:, :2] - x[:, :2].mean(0)

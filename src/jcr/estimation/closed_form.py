@@ -25,8 +25,9 @@ def closed_form(
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
     """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
-    Rotations are solved first, then translations and scale by linear least squares (the paper's scale recovery problem,
-    eq. 8 to 10). Degenerate motions give the translation of least norm, and a scale that may be 0 or negative.
+    Rotations are solved first, with `rounds` of alternating refinement; then translations and scale by linear least
+    squares (the paper's scale recovery problem, eq. 8 to 10). Degenerate motions give the translation of least norm,
+    and a scale that may be 0 or negative.
     """
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
     rotation, base_rotation = rotations(of_gripper, of_camera, rounds)
@@ -38,7 +39,10 @@ def initial_estimate(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
 ) -> tuple[Transform, float, Transform]:
-    """Return X, scale and base_from_recon of `closed_form`; a scale ≤ 0 is replaced by the ratio of the extents."""
+    """Return gripper_from_camera, scale and base_from_recon of `closed_form`, with a positive scale.
+
+    A scale ≤ 0 is replaced by the extent of the gripper positions over that of the camera positions.
+    """
     x, scale, z = closed_form(base_from_gripper, recon_from_camera)
     if scale <= 0:
         way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
@@ -64,11 +68,12 @@ def rotations(
     camera: Float[ndarray, "*#batch n 3 3"],
     rounds: int = ROUNDS,
 ) -> tuple[Rotations, Rotations]:
-    """Return R_X and R_Z, the rotations of X and base_from_recon (...,3,3), from R_G · R_X = R_Z · R_C.
+    """Return R_X and R_Z, the rotations of gripper_from_camera and base_from_recon, from R_G · R_X = R_Z · R_C.
 
-    The method is Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. For problems
-    with a motion near 180° the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is tried
-    too, and the better fit is returned.
+    R_G is `gripper` (rotations of base_from_gripper), R_C is `camera` (rotations of recon_from_camera). The method is
+    Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. If a motion is near 180°,
+    the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is tried too. The better fit is
+    returned.
     """
     *batch, n = gripper.shape[:-2]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
@@ -115,9 +120,10 @@ def _polished(
 def _translations(
     base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations
 ) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
-    """Return t_X, λ and t_Z (of base_from_recon) by linear least squares from R_G t_X + t_G = λ R_Z t_C + t_Z.
+    """Return t_X, λ and t_Z by linear least squares from R_G t_X + t_G = λ R_Z t_C + t_Z.
 
-    `base_rotation` is R_Z. The paper prints t_c^e for t_C in its d_i(λ).
+    X is gripper_from_camera, Z base_from_recon with rotation R_Z = `base_rotation`, λ the scale, G base_from_gripper
+    and C recon_from_camera. The paper prints t_c^e for t_C in its d_i(λ).
     """
     center, rotation = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
     in_base = center @ np.swapaxes(base_rotation, -1, -2)

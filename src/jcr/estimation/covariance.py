@@ -42,22 +42,23 @@ def posterior(
     region: Region,
     expected: bool = False,
 ) -> tuple[Float[ndarray, " p"], Square, Budget]:
-    """Return the step of the unknowns averaged over the error sizes, their covariance (p,p), and its budget.
+    """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
-    `mode` and `information` are those of the log sizes; the covariance includes `Region.spread`. `expected`: for
-    predictions, the residuals are 0 and their squares are replaced by expectations under the noise at the mode.
+    `mode` is the mode of the log sizes, `information` their information matrix there; the covariance includes
+    `region.spread`. `expected`: for predictions, the residuals are 0 and their squares are replaced by expectations
+    under the noise at the mode.
     """
     root = cholesky(equations.covariance(mode))
 
     def density(solution: LinearSolution) -> Each:
-        """Return the log posterior of the sizes."""
+        """Return the log posterior of the error sizes for which `solution` was computed."""
         if not expected:
             return solution.log_posterior
         whitened, fitted = _whitened_and_fitted(solution, root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
-        """Return the covariance that systematic errors add for other poses of the workspace."""
+        """Return the covariance of the unknowns by systematic robot errors, which differ at other poses."""
         part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
         return region.spread(_blocks_of_poses(part) if expected else _second_moment(solution, part))
 
@@ -74,14 +75,20 @@ def posterior(
 
 
 def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
-    """Return the predicted covariance (p,p) of the unknowns for exactly known error sizes; faster than `posterior`."""
+    """Return the predicted covariance (p,p) of the unknowns if the error sizes are exactly those of `noise`.
+
+    The covariance includes `region.spread`. The function is faster than `posterior`.
+    """
     mode = equations.log_sizes_of(noise)
     part = equations.variances(mode)[2] * equations.systematic
     return solve_equations(equations, mode).covariance + region.spread(_blocks_of_poses(part))
 
 
 def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return E[e eᵀ] of each of m poses' systematic errors e given the residuals; `part` is their prior covariance."""
+    """Return E[e eᵀ] of each of m poses' systematic errors e, given the residuals of all poses.
+
+    `part` is the covariance (s,s) of the errors before, s = 6m; both may have an axis of k error sizes in front.
+    """
     expected = (part @ solution.weighed_left[..., None])[..., 0]
     own = _blocks_of_poses(part)
     for sign, root in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
@@ -94,13 +101,13 @@ def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> 
 def _whitened_and_fitted(
     solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
-    """Return A and B with AᵀA − BᵀB = MᵀPM, for M = `matrix` and P = `solution.projection`."""
+    """Return A (s,r) and B (p,r) with AᵀA − BᵀB = MᵀPM, for M = `matrix` and P = `solution.projection`."""
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
     return lower(solution.root, matrix), fitted
 
 
 def _blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return the diagonal block (6,6) of each of m poses."""
+    """Return the diagonal block (6,6) of each of m poses from a covariance (s,s) of all poses, s = 6m."""
     m = covariance.shape[-1] // 6
     each = np.arange(m)
     return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
@@ -114,8 +121,8 @@ def _widening(
 ) -> float:
     """Return the factor ≥ 1 on a mixture's covariance with which its 99 % ellipsoid contains 99 % of the mixture.
 
-    The k normal components have the weights `weight`, means `off` and covariances `each`. Squared Mahalanobis distances
-    of each are approximated by a scaled χ² (Satterthwaite, Biometrics Bulletin 2, 1946).
+    The k normal components have the weights `weight`, means `off` (relative to the mixture's mean) and covariances
+    `each`. Squared Mahalanobis distances are approximated by a scaled χ² (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
     std = np.sqrt(np.diag(covariance))
     scaled, shift = covariance / np.outer(std, std), off / std
@@ -138,10 +145,11 @@ def _widening(
 
 
 def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
-    """Return the covariance of X and scale divided into four causes: robot random, robot systematic, intrinsics, images.
+    """Return the covariance of X and scale as a sum over causes: robot random, robot systematic, intrinsics, images.
 
-    The part of the intrinsics is the covariance that exact intrinsics would remove. The increase from averaging over
-    the sizes is distributed over all parts. The part of the images includes unobservable directions and rounding.
+    `elsewhere` is the covariance that systematic errors add for other poses of the workspace, at `log_sizes`. The part
+    of the intrinsics is the covariance that exact intrinsics would remove. The parts are scaled so that they add up to
+    `covariance`. The part of the images includes unobservable directions and rounding.
     """
     exact = replace(
         equations,
@@ -175,7 +183,8 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
 def positive_part(part: Square, whole: Square | None = None) -> Square:
     """Return a symmetric matrix with its negative eigenvalues, which come from rounding, set to 0.
 
-    Rows and columns are scaled by the standard deviations of `whole` first; None: by those of `part`.
+    Before the eigenvalues are computed, rows and columns are divided by the standard deviations of `whole`; None: of
+    `part`.
     """
     std = np.sqrt(np.maximum(np.diag(part if whole is None else whole), 0.0))
     values, vectors = np.linalg.eigh(part / np.outer(*[np.where(std > 0, std, np.inf)] * 2))

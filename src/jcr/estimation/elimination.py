@@ -20,7 +20,10 @@ _solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float
 
 
 def cholesky(matrix: Matrices) -> Matrices:
-    """Return the lower Cholesky factor L of V = L Lᵀ; V of degenerate motions may be singular up to rounding."""
+    """Return the lower Cholesky factor L of a positive semidefinite matrix: L Lᵀ = `matrix`.
+
+    A matrix that is singular up to rounding, as of degenerate motions, is allowed.
+    """
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None] / size[..., None, :]
     for rounding in JITTER:
@@ -50,18 +53,18 @@ def over(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
 
 
 def inverse_of(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
-    """Return V⁻¹ for V = L Lᵀ, L = `root`."""
+    """Return V⁻¹ for V = L Lᵀ, with the lower Cholesky factor L = `root`."""
     half = np.tril(_invert(root, lower=1)[0])
     return half + np.tril(half, -1).T
 
 
 def log_root_determinant(root: Matrices) -> Float[ndarray, "*k"] | np.floating:
-    """Return log √det V for V = L Lᵀ, L = `root`."""
+    """Return log √det V for V = L Lᵀ, with lower Cholesky factors L = `root`."""
     return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
 
 
 def _triangular(root: Matrices, right: Columns, transposed: bool) -> Float[ndarray, "*k n r"]:
-    """Return L⁻¹ · right, or L⁻ᵀ · right if `transposed`."""
+    """Return L⁻¹ · right, or L⁻ᵀ · right if `transposed`, for lower triangular L = `root`."""
     # A row-major L is a column-major Lᵀ, which LAPACK takes without a copy.
     if root.ndim == right.ndim == 2:
         return _solve_triangular(root.T, right, lower=0, trans=not transposed)[0]
@@ -91,7 +94,7 @@ class Derivatives:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Index of observations that are sorted by point and then by image, or rig."""
+    """Index of observations that are sorted by point and then by image (or by rig: cameras that move together)."""
 
     image: Int[ndarray, " k"]
     """Image, or rig, of each observation."""
@@ -102,14 +105,20 @@ class Sightings:
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Return the index of sorted observations; every point has at least one. `images` is the number of images."""
+        """Return the index of sorted observations from the point and the image (or rig) of each.
+
+        Every point has at least one observation. `images` is the number of images (or rigs).
+        """
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(image, np.flatnonzero(np.diff(point, prepend=-1)), rows)
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations `hessian · step = right` of all d unknowns except the points, which are eliminated."""
+    """Normal equations `hessian · step = right` of the d unknowns that are not point coordinates.
+
+    The points were eliminated; `stepped` computes their step from that of the other unknowns.
+    """
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
@@ -119,7 +128,7 @@ class Normal:
     L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """Return the points after their Gauss-Newton step, given the `step` of all other unknowns."""
+        """Return the p points after their Gauss-Newton step; `step` (d,) is the step of all other unknowns."""
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -130,7 +139,11 @@ class Normal:
 def with_fixed_points(
     rows: Derivatives, seen: Sightings
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
-    """Return Hessian JᵀJ and right side −Jᵀr of all unknowns but the points, as if the points were fixed."""
+    """Return Hessian JᵀJ (d,d) and right side −Jᵀr (d,) of all unknowns but the points, as if the points were fixed.
+
+    The d unknowns are the columns that all images share, then the columns of each rig. J and r are the derivatives and
+    residuals in `rows`.
+    """
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)
     hessian, right = np.zeros((size, size)), np.zeros(size)
@@ -152,7 +165,11 @@ def without_points(
     seen: Sightings,
     damping: float = 0.0,
 ) -> Normal:
-    """Return the normal equations without the points (Schur complement); `hessian` and `right` are overwritten."""
+    """Return the normal equations of the d unknowns other than the points, which are eliminated (Schur complement).
+
+    `hessian` and `right` are those of `with_fixed_points` and are overwritten. `damping` increases the diagonal of each
+    point's block by this share.
+    """
     s, o = rows.shared.shape[2], rows.own.shape[2]
     blocks, ends = [], np.append(seen.starts, len(seen.image))
     # Points are grouped in the order of their first image, so that each group touches few of many images.
@@ -186,12 +203,15 @@ def without_points(
 
 
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
-    """Return the 3x3 block JᵀJ of each of n points, whose first observations are `starts`."""
+    """Return the 3x3 block JᵀJ of each of n points; J is `by_point`, `starts` are the points' first observations."""
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 
 
 def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
-    """Return the blocks after damping; a small diagonal makes them invertible if the rays of a point are parallel."""
+    """Return the points' 3x3 blocks JᵀJ with their diagonals times 1 + damping, slightly increased; changed in place.
+
+    The small increase makes a block invertible if all rays of its point are parallel.
+    """
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v

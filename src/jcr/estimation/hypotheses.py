@@ -78,7 +78,7 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One possible effect on the gripper poses: its d parameters and the columns they add to the equations."""
+    """One possible effect on the n gripper poses: its d parameters, and the derivative of the residuals by them."""
 
     kind: FindingKind
     columns: Float[ndarray, "s d"]
@@ -106,14 +106,22 @@ class Test:
     """Robot pose noise estimated together with the effect."""
 
     def is_within(self, limits: tuple[float, float]) -> bool:
-        """Return whether a motion is within limits (m, rad), or the norm of other parameters within the first."""
+        """Return whether the estimate is within limits: (m, rad) for a motion with six parameters.
+
+        Other effects are compared by the norm of their parameters with the first limit.
+        """
         if self.row.columns.shape[1] != 6:
             return bool(np.linalg.norm(self.estimate) <= limits[0])
         return bool((np.linalg.norm(self.estimate.reshape(2, 3), axis=1) <= limits).all())
 
 
 def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s _"]]) -> list[float]:
-    """Return the score test's gain gᵀS⁻¹g for each matrix A in `every`: g = AᵀV⁻¹(r + Jθ), S = AᵀPA."""
+    """Return how much each candidate effect would reduce the weighted squared residuals (gain of the score test).
+
+    Each matrix A in `every` is the derivative of the residuals by an effect's parameters. The gain is gᵀS⁻¹g with g =
+    AᵀV⁻¹(r + Jθ) and S = AᵀPA; V, r + Jθ and P are the covariance, residuals and `projection` of the fit without the
+    effect.
+    """
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     return [float(left @ a @ np.linalg.lstsq(a.T @ projection @ a, a.T @ left, rcond=1e-9)[0]) for a in every]
@@ -122,7 +130,7 @@ def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarra
 def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> list[Test]:
     """Return Wald's tests of the most promising effects, at most one row of each kind, the smallest p-value first.
 
-    A p-value is multiplied by the number of rows of its kind, the places that were tested.
+    A p-value is multiplied by the number of rows of the same kind, since the best of these rows was selected.
     """
     # The penalty d · log(s) of Schwarz (1978).
     penalty = [np.log(len(equations.residual)) * row.columns.shape[1] for row in rows]
@@ -140,8 +148,9 @@ def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -
 def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | None = None) -> Test:
     """Return Wald's test of an effect, with the error sizes estimated together with the effect.
 
-    The p-value is averaged over the sizes and multiplied by `places`. `freedom` is the denominator's degrees of freedom
-    of each F test; None: those of all residuals, which is conservative.
+    The p-value is averaged over the sizes and multiplied by `places`, the number of alternatives from which `row` was
+    selected. `freedom` is the denominator's degrees of freedom of each F test; None: those of all residuals, which is
+    conservative.
     """
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     free = replace(
@@ -180,8 +189,9 @@ def explains_by_order(
 ) -> bool:
     """Return whether a motion explains the residuals better than it does in nearly all random orders of the images.
 
-    `by_motion` is the derivative of the residuals by a motion, `share` (n,) its size at each image; the images `own` are
-    permuted. This permutation test of the score gain allows for errors with heavy tails and single wrong poses.
+    `by_motion` is the derivative of the residuals by a motion, `share` (n,) the motion's factor at each image; the
+    factors of the images `own` are permuted. This permutation test of the score gain allows for errors with heavy tails
+    and single wrong poses.
     """
     rng, centred, shares = np.random.default_rng(0), share[own] - share[own].mean(), [share]
     for _ in range(ORDERS):
@@ -199,7 +209,8 @@ def order_rows(
 ) -> Iterator[Row]:
     """Yield the effects that depend on the image order: slip of the camera, base moved, drift, delayed poses.
 
-    `by_x` and `by_z` are the derivatives of the residuals by the hand-eye transform X and by base_from_recon.
+    `by_x` and `by_z` are the derivatives of the residuals by the hand-eye transform X and by Z (base_from_recon). Slip
+    and moved base have one row for each of several images at which they may happen.
     """
     n = len(base_from_gripper)
     count = min(n - 2 * LEAST_PART + 1, MANY_PLACES)
@@ -274,10 +285,10 @@ OfImage = Literal["focal", "shear", "x", "y"]
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
-    """Normal equations of e camera parameters that may be freed, with all adjusted unknowns eliminated.
+    """Normal equations of e parameters of one camera that may be freed; all adjusted unknowns are eliminated.
 
-    The e parameters are one camera's q intrinsics in `units`, then focal, shear, x and y of each of its m images
-    (problem.OF_IMAGE), then s1 to s4 of the thin prism.
+    The e parameters are the camera's q intrinsics in `units`; then focal lengths, shears, x and y offsets of its m
+    images (problem.OF_IMAGE); then s1 to s4 of the thin prism.
     """
 
     hessian: Float[ndarray, "e e"]
@@ -308,11 +319,11 @@ class Alternatives:
         return len(self.right)
 
     def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
-        """Return unit vectors (columns) for p of the camera's intrinsics, by their names."""
+        """Return p unit vectors (columns), each of which selects one of the camera's intrinsics by its name."""
         return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
 
     def of_images(self, parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Return columns that change one parameter of the m images by `shares`, one column for each of p patterns."""
+        """Return p directions (columns) that change one parameter of the m images by the columns of `shares`."""
         out = np.zeros((self.columns, shares.shape[1]))
         first = len(self.names) + get_args(OfImage).index(parameter) * self.images
         out[first : first + self.images] = shares
@@ -344,8 +355,8 @@ def alternatives(
 ) -> Alternatives:
     """Return the normal equations of all parameters of one camera that may be freed, or were freed, about a solution.
 
-    `place` returns the pose of the camera on its parent. `model_error_std` is the size of the remaining distortion of
-    all cameras, in image widths; None: as estimated.
+    `place` returns the pose of the camera on its parent (gripper or base). `model_error_std` is the size of the
+    remaining distortion of all cameras, in image widths; None: as estimated.
     """
     problem, images = solution.problem, solution.images
     state, observations = images.state, problem.observations
@@ -411,9 +422,10 @@ def alternatives(
 
 
 def _dispersion(images: ImageEvidence) -> float:
-    """Return the larger dispersion of weighted residuals: of single ones, or of their sums over image cells.
+    """Return the variance of the weighted residuals over the variance that their weights imply.
 
-    Image cells are clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
+    The larger of two estimates is returned: from single residuals, and from their sums over image cells, which are
+    clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
     """
     problem, weight = images.problem, images.weight
     pull = weight[:, None] * images.view.residual_px
@@ -423,7 +435,10 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return the columns (e,p) over the parameters of `Alternatives` that free a focal length for each of p images."""
+    """Return directions (columns) in the e parameters of `Alternatives` that free the focal length of each of p images.
+
+    The first column is the camera's focal length, the others are differences between its images.
+    """
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0
@@ -432,14 +447,17 @@ def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
 
 
 def differences(count: int) -> Float[ndarray, "n d"]:
-    """Return an orthonormal basis of the zero-sum vectors of length n, shape (n, n - 1)."""
+    """Return an orthonormal basis (columns) of the vectors of length n = `count` whose sum is 0; d = n − 1."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
 
 
 def test_combinations(
     equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]
 ) -> ScoreTest:
-    """Return the score test that frees p linear combinations `free`; q others, `beside`, are free in both hypotheses."""
+    """Return the score test of p directions `free` (columns over the e parameters of `equations`).
+
+    The q directions `beside` are free in both hypotheses.
+    """
     q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
     fewer, more = spanned(beside), spanned(both)
     (without, gain_without, _), (step, gain, covariance) = (_step(equations, one) for one in (fewer, more))
@@ -455,7 +473,10 @@ def test_combinations(
 def _step(
     equations: Alternatives, free: Float[ndarray, "e r"]
 ) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
-    """Return the estimate of r free combinations, the gain (decrease of twice the cost), and the covariance."""
+    """Return estimate and covariance of r coefficients, with the gain (decrease of twice the cost) between them.
+
+    The coefficients belong to the columns of `free`, directions in the e parameters of `equations`.
+    """
     covariance = np.linalg.inv(free.T @ equations.hessian @ free)
     right = free.T @ equations.right
     step = covariance @ right
@@ -480,8 +501,9 @@ def drift_covariance(
 ) -> Float[ndarray, "s s"] | None:
     """Return the covariance (6n,6n) of camera pose errors that accumulate along the sequence; None if they do not.
 
-    Errors accumulate as in visual odometry; log evidence decides. `fit` is the estimate of (X, scale, base_from_recon)
-    without them. Only `used` poses decide.
+    Errors accumulate as in visual odometry; a gain of log evidence above CLEAR decides, from the `used` poses. `fit` is
+    the estimate of (X, scale, base_from_recon) without such errors. `error_covariance` and `noise_floor` are those of
+    the gripper poses in `pose_problem`.
     """
     rows = np.flatnonzero(used)
     if len(rows) < FEWEST:
@@ -518,9 +540,10 @@ def drift_covariance(
 
 
 def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, "s s"]]:
-    """Return three covariances (6n,6n) of camera pose errors that accumulate along the sequence as random walks.
+    """Return three covariances (6n,6n) of the errors of n camera poses that accumulate as random walks.
 
-    They grow per image by 1 m of position, by 1 rad, and by 1 of log scale; `scale` is in metres per unit.
+    Per image the standard deviation grows by 1 m of position, by 1 rad, and by 1 of log scale, respectively; `scale` is
+    in metres per unit of the reconstruction.
     """
     n, position = len(recon_from_camera), recon_from_camera[:, :3, 3]
     moves = np.zeros((n, n - 1, 6, 7))
