@@ -84,8 +84,8 @@ def adjust_case(
 
     `prior` replaces the case's prior of the intrinsics. `combinations` (e,p) are p additional parameters to estimate,
     each a combination of the e candidate parameters in hypotheses.Alternatives. `confirmed_errors` (s,b) are b error
-    patterns of the gripper poses, s = 6 per used image, one standard deviation each. The robot pose noise starts at the
-    residuals of the fit; with a smaller initial noise, poses that contradict the images take ten times the steps.
+    patterns of the gripper poses, s = 6 per used image, one standard deviation each. The initial robot pose noise is
+    taken from the residuals of the fit: a smaller one needs ten times the steps if poses and images contradict.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
@@ -104,10 +104,10 @@ def adjust_case(
 
 
 def _considered(case: Case) -> Case:
-    """Add the uncertainty of the intrinsics, which a fit to camera poses cannot estimate, to the case's covariance.
+    """Return the case with the uncertainty of the intrinsics in its covariance, which a fit to camera poses lacks.
 
-    The camera poses of a network do not depend on the focal length. An error of the principal point rotates the
-    hand-eye transform; this correlation is kept in the joint covariance.
+    Camera poses of a network do not depend on the focal length. An error of the principal point rotates their hand-eye
+    transform; the joint covariance contains this correlation.
     """
     hand_eye, camera, x = case.hand_eye, case.camera, case.hand_eye.gripper_from_camera
     if case.reconstruction.predicted_focal is not None:
@@ -173,7 +173,7 @@ def with_intrinsics_considered(
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
-    """Return the calibration that an adjustment of a case gives, without the findings that `judged` makes."""
+    """Return the calibration that the adjustment `found` of a case gives, without the findings that `judged` adds."""
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
@@ -207,7 +207,10 @@ def refined_by(case: Case, found: Solution) -> Calibration:
 
 
 def _leave_one_out(found: Solution) -> LeaveOneOut | None:
-    """Return the mean leave-one-out error: each gripper pose is predicted by an adjustment without its image."""
+    """Return the mean leave-one-out error of an adjustment: each gripper pose is predicted without its own image.
+
+    Return None for fewer than four images.
+    """
     left_out, likely = found.leave_one_out[0], found.most_likely
     # The reprojection error refers to cameras that are displaced by the leave-one-out residuals of their gripper poses.
     x, z, own, rigs = likely.x[0], likely.z[0], found.problem.arms[0].rigs, likely.world_from_rig.copy()

@@ -46,7 +46,7 @@ class Case:
     reconstruction: Reconstruction
     options: CalibrateOptions
     robot: RobotErrorPrior
-    """Prior of the systematic errors of the registered images' gripper poses."""
+    """Prior covariance of the systematic errors of the registered images' gripper poses."""
     priors: tuple[LinearPrior, ...]
     """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
     hand_eye: Calibration
@@ -88,7 +88,10 @@ class Case:
 
     @property
     def systematic(self) -> Float[ndarray, "s s"]:
-        """Covariance of the systematic errors of the used gripper poses for a size of 1 rad; 6 rows per pose."""
+        """Covariance of the used gripper poses' systematic errors if their size is 1 rad; 6 rows (m, rad) per pose.
+
+        The size is the standard deviation of a joint's error or, for an unknown arm, of the gripper's rotation.
+        """
         return of_poses(self.robot.systematic, self.used)
 
     @property
@@ -160,7 +163,7 @@ class Case:
 
     @property
     def is_open(self) -> bool:
-        """Whether the motions are observable and no finding that is a cause has rejected the calibration."""
+        """Whether the motions are observable and no known cause, such as static images, rejects the calibration."""
         return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
 
     def after(
@@ -176,7 +179,7 @@ class Case:
 
 
 def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
-    """Add findings to a calibration, and the outer products of their shifts to its covariance.
+    """Add findings to a calibration; the shift s of the calibration that a finding states adds s·sᵀ to the covariance.
 
     A finding with a shift is given the severity "rejects" if the calibration is rejected already, or if its shift makes
     the calibration too uncertain.
@@ -196,7 +199,7 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """Return the observations in the used images, with image numbers that count the used images only."""
+    """Return the observations in the images of the mask `used`; their image numbers count the used images only."""
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])
@@ -205,7 +208,8 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
 def some_points(tracks: Tracks, most: int, most_points: int | None = None) -> Tracks:
     """Return the observations of all board corners, and of randomly chosen points up to `most` observations.
 
-    `most_points` limits the number of the chosen points; points in WELL_SEEN or more images are then preferred.
+    `most_points` limits the number of these points; points in WELL_SEEN or more images are then preferred. None: no
+    limit.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))

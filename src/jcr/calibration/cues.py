@@ -63,7 +63,7 @@ def check_known_length(capture: Capture, known_length: LengthInImage | None) -> 
 def length_cue(
     capture: Capture, reconstruction: Reconstruction, known_length: LengthInImage
 ) -> tuple[float, float]:
-    """Return the scale (metres per recon unit) from a known length between two pixels, and its relative std.
+    """Return the scale (metres per recon unit) from a known length between two pixels, and its relative 1σ error.
 
     Raises InputError if the image is not registered or a pixel has no depth.
     """
@@ -78,10 +78,10 @@ def length_cue(
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
 ) -> Float[ndarray, "3"]:
-    """Return the surface point (recon frame) at a pixel of an image, from the pointmaps.
+    """Return the surface point (recon frame) at the pixel `x_px` of an image, from the pointmaps.
 
-    Raises InputError if the image is not registered or the pixel has no depth; the message names the command-line
-    option `asked_by`.
+    Raises InputError if the image is not registered or the pixel has no depth; the message begins with `asked_by`, the
+    command-line option or file that states the pixel.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:

@@ -38,7 +38,7 @@ NOTHING = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Step from one gripper_from_camera to another, along the axes of the gripper, and its test."""
+    """Step from one gripper_from_camera to another along the gripper's axes, and the χ² test of the step."""
 
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
@@ -66,7 +66,7 @@ class StatedTransform:
 
 
 class _Reference(BaseModel):
-    """Fields that are read from a JSON file which is no calibration.json, such as reference.json."""
+    """Content of a reference.json: gripper_from_camera and its standard deviations along the gripper's axes."""
 
     model_config = ConfigDict(allow_inf_nan=False)
     gripper_from_camera: Matrix | None = None
@@ -85,7 +85,10 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
 
 
 def _stated(one: Comparable, name: str) -> StatedTransform:
-    """Return gripper_from_camera and covariance of an argument of `compare`; raise InputError without a transform."""
+    """Return gripper_from_camera and covariance of an argument of `compare`.
+
+    Raises InputError without a transform; `name` denotes the argument in the message.
+    """
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)

@@ -98,9 +98,9 @@ def drift(
 
 
 def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Test:
-    """Test a motion from image `first` on: of gripper_from_camera X (SLIP), or of base_from_recon Z (BASE_MOVED).
+    """Return the test of a motion before image `first`: gripper_from_camera (SLIP) or base_from_recon (BASE_MOVED).
 
-    The equations are linearized again at each estimate of the motion until the estimate converges.
+    The test contains the estimate of the motion. The equations are linearized at each estimate until it converges.
     """
     (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
     columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)
@@ -125,7 +125,8 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
     """Return translation (m) and rotation (rad) that a χ² test at level `alpha` detects with probability 0.9.
 
-    `covariance` is that of the estimated motion; both sizes are those in its least certain direction.
+    `covariance` is that of an estimated motion (translation in m, rotation in rad). The motions to detect have its
+    least certain direction.
     """
     length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]

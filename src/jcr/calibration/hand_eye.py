@@ -129,10 +129,10 @@ def _fit_distinct(
     covariance: Float[ndarray, "r r"] | None,
     systematic: Float[ndarray, "r r"],
 ) -> tuple[Solution, Int[ndarray, " n"]]:
-    """Return the robust fit to the images without duplicates, and for each image its number in that fit.
+    """Return the robust fit to the images without duplicates, and for each image its index in that fit.
 
-    The images are sorted by their poses, so that the result does not depend on their order. Duplicates, images with the
-    same pair of poses, count once: an error that occurs twice would look like agreement.
+    The fit sorts the images by their poses, so that the result does not depend on their order. Images with the same
+    pair of poses count once, because an error that occurs twice would look like agreement.
     """
     n = len(gripper)
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
@@ -147,9 +147,9 @@ def _fit_distinct(
 def _with_residuals(
     gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"], names: Sequence[str]
 ) -> Calibration:
-    """Return the calibration that a fit gives, with residuals of all images, before `judged` adds its findings.
+    """Return the calibration that `fit` gives, with residuals of all images, before `judged` adds its findings.
 
-    `distinct` holds the number of each image in the fit (_fit_distinct).
+    `distinct` holds the index of each image in the fit, which has no duplicates (_fit_distinct).
     """
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
@@ -208,7 +208,7 @@ JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
 
 
 def judged(hand_eye: Calibration) -> Calibration:
-    """Return the calibration with its findings of the kinds JUDGED derived anew from its numbers."""
+    """Return the calibration with newly derived findings (kinds JUDGED) on image count, robot noise and uncertainty."""
     rejecting = list(_rejecting(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
     weak = "rejects" if any(one.kind is FindingKind.UNCERTAIN for one in rejecting) else "warns"
@@ -227,7 +227,7 @@ def poses_agree(noise: RobotNoise) -> bool:
 
 
 def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield the findings that reject: few images agree, gripper poses contradict images, result too uncertain."""
+    """Yield findings that reject a calibration: few images agree, poses contradict images, or it is too uncertain."""
     used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
     if used < max(3, MIN_SHARE_USED * n) and n > 2:
         counts = {"value": float(used), "images": float(n)}
@@ -249,7 +249,7 @@ def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
 
 
 def _warning(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield the findings that warn: residuals above the given noise, large leave-one-out error, few images."""
+    """Yield findings that warn: residuals larger than the given noise, a large leave-one-out error, or few images."""
     noise, images = hand_eye.robot_noise, [one for one in hand_eye.images if one.used]
     residual = np.array([(one.translation_residual_mm, one.rotation_residual_deg) for one in images], float)
     # The rms residual per axis, corrected for the 13 fitted unknowns.
@@ -272,9 +272,9 @@ def _warning(hand_eye: Calibration) -> Iterator[Finding]:
 def leave_one_out(
     residual: Float[ndarray, "u 6"], how: str, reprojection_px: float | None = None
 ) -> LeaveOneOut | None:
-    """Return the mean size of the leave-one-out residuals (m, rad) of the used images; None for fewer than four.
+    """Return the mean leave-one-out error from the residuals of u used images; None for fewer than four.
 
-    `how` states in words how each gripper pose was predicted.
+    `residual` (u,6) is translation (m), then rotation vector (rad). `how` names the method of prediction.
     """
     if len(residual) < 4:
         return None
@@ -283,9 +283,10 @@ def leave_one_out(
 
 
 def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None) -> Float[ndarray, "r r"]:
-    """Return the covariance (6n,6n) of the systematic errors of gripper poses for a size of 1 rad.
+    """Return the covariance (6n,6n) of the systematic errors of n gripper poses for errors of 1 rad.
 
-    Raises InputError if the poses do not fit the arm and its joint angles.
+    These are errors of the joint angles or, if `robot` is None, of the gripper's rotation. Raises InputError if the
+    poses do not fit the arm and its joint angles.
     """
     if robot is None:
         if joints is not None:
@@ -301,7 +302,7 @@ def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | Non
 
 
 def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
-    """Return the argument `name` as an array of floats; raise InputError if it does not consist of numbers."""
+    """Return `values` as an array of floats; raise InputError, naming `name` and `shape`, unless they are numbers."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -309,7 +310,7 @@ def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
 
 
 def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
-    """Return the argument `name` as a stack of rigid transforms; raise InputError if it is none."""
+    """Return `transforms` as an array (n,4,4); raise InputError, naming `name`, unless all are rigid."""
     stack = _numbers(transforms, name, "(n,4,4)")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")

@@ -81,7 +81,7 @@ FindingJson = Annotated[Finding, PlainSerializer(as_json)]
 
 
 def derived(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return the fields of a JSON file that state findings: the findings, their verdict, and the warnings in words."""
+    """Return the JSON fields `findings`, `verdict`, `converged` and `warnings` that these findings determine."""
     verdict = verdict_of(findings)
     return {
         "findings": list(findings),
@@ -114,7 +114,7 @@ AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """Part of a result that a failed calibration has too: findings, verdict, and the use of each image.
+    """Base class of Calibration and FailedCalibration: findings, verdict, and the use of each image.
 
     With mount "gripper" the camera is on the gripper, and the reconstructed scene rests in the base frame. With mount
     "base" the camera is fixed, and the gripper carries the reconstructed object. `parent_from_camera` is
@@ -214,7 +214,7 @@ class Outcome:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings in words, apart from the reason of a rejection and its consequences, and the unmet requirement."""
+        """Warnings in words, without a missed accuracy, the reason of a rejection, and warnings that follow from it."""
         first = self.short if self.converged else self.findings[0]
         said = without_consequences(self.findings)
         return [sentence(one) for one in said if one.severity != "informs" and one is not first]
@@ -229,7 +229,7 @@ class Outcome:
         return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     def with_notes(self: AnyOutcome, *notes: str) -> AnyOutcome:
-        """Return the calibration with more notes, and with the findings that require no action as notes."""
+        """Return the calibration with `notes` added, and its findings of severity "informs" added as notes."""
         informs = (sentence(one) for one in self.findings if one.severity == "informs")
         return replace(self, notes=tuple(dict.fromkeys([*self.notes, *notes, *informs])))
 
@@ -275,7 +275,10 @@ class Calibration(Outcome):
 
     @model_validator(mode="after")
     def _is_of_one_mount(self) -> "Calibration":
-        """Raise ValueError unless the transforms present are exactly the two of the camera's mount."""
+        """Raise ValueError unless exactly the two transforms of the camera's mount are set.
+
+        These are on_gripper and resting for mount "gripper", on_base and carried for mount "base".
+        """
         own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
         own, other = (own, other) if self.mount == "gripper" else (other, own)
         if any(one is None for one in own) or any(one is not None for one in other):
@@ -285,7 +288,7 @@ class Calibration(Outcome):
     @computed_field
     @property
     def robot_errors(self) -> dict[str, Any]:
-        """Systematic errors of the gripper poses, one sigma: size, part left after the fit per axis, joint offsets."""
+        """Systematic robot errors as JSON: size in degrees, part per axis that the fit leaves, joint offsets."""
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
@@ -332,14 +335,14 @@ class Calibration(Outcome):
         return tuple(one.image for one in self.images if one.used)
 
     def with_used(self, used: Bool[ndarray, " m"]) -> "Calibration":
-        """Return the calibration with the mask of used images replaced; its images are the registered ones."""
+        """Return the calibration with `used` as mask of the m images; all images must be registered ones."""
         images = tuple(replace(one, used=bool(own)) for one, own in zip(self.images, used, strict=True))
         return replace(self, images=images)
 
     def on_fixed_camera(self) -> "Calibration":
-        """Return the calibration as that of a fixed camera, with base_from_camera and gripper_from_object.
+        """Return the calibration of a fixed camera, with base_from_camera and gripper_from_object.
 
-        This calibration was made with gripper_from_base in place of base_from_gripper.
+        `self` must be made with gripper_from_base in place of base_from_gripper.
         """
         transforms = {
             "on_gripper": None,
@@ -350,15 +353,15 @@ class Calibration(Outcome):
         return replace(self, mount="base", with_given_intrinsics=None, **transforms)
 
     def with_uncertainty(self, uncertainty: Uncertainty) -> "Calibration":
-        """Return the calibration with `uncertainty`, from which the intrinsics take their standard deviations."""
+        """Return the calibration with another uncertainty, also as standard deviations of its intrinsics."""
         intrinsics, std = self.intrinsics, uncertainty.intrinsics_std
         intrinsics = None if intrinsics is None else intrinsics.with_std(std)
         return replace(self, uncertainty=uncertainty, intrinsics=intrinsics)
 
     def with_finding(self, finding: Finding) -> "Calibration":
-        """Return the calibration with the shift s of a finding as additional covariance s·sᵀ; the finding is not added.
+        """Return the calibration with s·sᵀ added to its covariance, s being the shift that `finding` states.
 
-        The shift is that of the transform and, if the intrinsics were estimated, of the intrinsics.
+        The shift changes transform and scale and, if they were estimated, the intrinsics. The finding is not added.
         """
         if finding.shift is None:
             return self
@@ -440,7 +443,7 @@ class FailedCalibration(Outcome):
         return None
 
     def __getattr__(self, name: str) -> Any:
-        """Return None, or an empty tuple, for a field of a Calibration; raise RejectedError for its other attributes."""
+        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods."""
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
             return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):

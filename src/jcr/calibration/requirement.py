@@ -47,9 +47,10 @@ def better_poses(
 ) -> Float[ndarray, "c 4 4"]:
     """Return `count` gripper poses to add that reduce the predicted uncertainty most, best first.
 
-    `base_from_gripper` and `robot` are the poses of the capture and their errors. The candidates are random poses
-    (`candidate_poses`) within `reach`, drawn with `seed`. `is_likely` returns a mask of the poses whose images are
-    likely to register; the candidates are restricted to them unless there are none.
+    `base_from_gripper` and `robot` are the poses of the capture and the prior of their errors. The candidates are
+    random poses (`candidate_poses`) in the box `reach` (min, max; m, base frame), drawn with `seed`.
+    `is_likely` returns a mask of the poses whose images are likely to register; other candidates are used only if the
+    mask is empty.
     """
     now, x = base_from_gripper, assumptions.gripper_from_camera
     if count == 0:
@@ -74,7 +75,7 @@ def better_poses(
 def predictions(
     assumptions: Assumptions, base_from_gripper: Poses, robot: RobotErrorPrior, added: Float[ndarray, "c 4 4"]
 ) -> Callable[[int], Uncertainty]:
-    """Return a function of c that predicts the uncertainty with the first c of the `added` poses."""
+    """Return a function that predicts the calibration's uncertainty with the first k of the `added` poses, given k."""
 
     def predicted(count: int) -> Uncertainty:
         """Return the predicted uncertainty with the first `count` added poses."""
@@ -91,11 +92,11 @@ def next_poses(
     predicted: Callable[[int], Uncertainty],
     reported: Uncertainty | None = None,
 ) -> tuple[NextPose, ...]:
-    """Return records of the added poses, each with the uncertainty expected after it and those before it are added.
+    """Return records of the added poses, each with the uncertainty expected once this and all earlier ones are added.
 
-    `names` are the images of the poses in `base_from_gripper`. If the `reported` uncertainty of the calibration is
-    given, the expected one is the reported one times the predicted ratio, because images and robot may differ from the
-    assumptions of the prediction.
+    `names` are the images of the poses in `base_from_gripper`; `predicted` is the function that `predictions` returns.
+    Given the `reported` uncertainty of the calibration, the expected one is that times the predicted ratio, because
+    images and robot may differ from the assumptions of the prediction.
     """
     found = []
     for count, pose in enumerate(added, start=1):
@@ -144,9 +145,10 @@ def assumptions_of_poses(
 
 
 def reached(uncertainty: Uncertainty, at: Where) -> tuple[float, float]:
-    """Return the bounds (mm, degrees) of 95 % of the errors of a seen point, the camera, or mapped points.
+    """Return the bounds (mm, degrees) on 95 % of the errors that `at` selects.
 
-    Without an uncertainty of the scene, `at` "scene" gives the bounds of a seen point.
+    "seen": a point seen by the camera; "camera": the camera's pose; "scene": mapped points, or a seen point if the
+    uncertainty has no scene.
     """
     covariance, scene, seen = uncertainty.covariance, uncertainty.scene, uncertainty.seen
     if at == "camera":

@@ -24,7 +24,7 @@ class RobotErrorPrior:
     """Prior covariance of the systematic errors of gripper poses, and the arm and joint angles it is computed from."""
 
     systematic: Float[ndarray, "r r"]
-    """Covariance of the pose errors for a size of 1 rad, r = 6 times the number of poses."""
+    """Covariance (m, rad) of the pose errors for joint errors of 1 rad, r = 6 times the number of poses."""
     arm: Arm | None = None
     """Kinematics of the arm and its tool; None: unknown, errors vary smoothly over the poses."""
     joints: Joints | None = None
@@ -38,10 +38,10 @@ class RobotErrorPrior:
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
     def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
-        """Return the covariance, for a size of 1 rad, of the errors of these poses followed by `added` poses.
+        """Return the covariance of the systematic errors (size 1 rad) of this prior's poses, then of `added` poses.
 
         `base_from_gripper` are the poses of this prior. Inverse kinematics of an added pose starts at the joint angles
-        of the nearest of them.
+        of the nearest of these poses.
         """
         if len(added) == 0:
             return self.systematic

@@ -208,6 +208,6 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
 
 
 def is_one(hand_eye: Calibration) -> bool:
-    """Return whether the log of the scale is below the larger of 3 standard deviations and METRIC_STD in size."""
+    """Return whether |log scale| is below METRIC_STD or below three of its standard deviations."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

@@ -117,7 +117,7 @@ def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[
     """
 
     def advice(finding: Finding) -> str:
-        """Return the remedy of a finding, or `proposed` if its remedy is more images."""
+        """Return the remedy of a finding, or the text `proposed` if the remedy of a missed accuracy is more images."""
         is_images = finding.kind is FindingKind.NOT_EXACT_ENOUGH and finding.concerns == "images"
         return proposed if is_images and proposed else remedy(finding)
 
@@ -169,7 +169,7 @@ def log(content: AnyCalibration) -> str:
 
 
 def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
-    """Return named values in blocks, by title: times, uncertainty, lengths, depth camera, robot and board."""
+    """Return blocks of named values as text: {title: {name: value}}, with times, uncertainty, lengths, robot, board."""
     time = {stage: f"{seconds:.1f} s" for stage, seconds in content.timings_s.items()}
     time["together"] = f"{sum(content.timings_s.values()):.1f} s"
     for k, attempt in enumerate(content.attempts, start=1):
@@ -262,9 +262,9 @@ def seen_in_words(seen: SeenAndCorners) -> str:
 
 
 def given_in_words(given: WithGivenIntrinsics) -> str:
-    """Return a sentence with the distance between a point's positions by given and by estimated intrinsics.
+    """Return a sentence with the distance between one point's positions by the given and the estimated intrinsics.
 
-    Each set of intrinsics is used with the transform that belongs to it.
+    Each set of intrinsics is used with its own transform.
     """
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "

@@ -55,7 +55,7 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Make a finding about the named images; `known` sets the fields in NUMBERS and, by name, the details."""
+        """Make a finding about `images`; `known` sets the fields named in NUMBERS, and other names as details."""
         sizes = {name: known.pop(name) for name in NUMBERS if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
@@ -109,9 +109,9 @@ class _Images(tuple[str, ...]):
 
 
 class Quantities(dict[str, Any]):
-    """Values for the templates of a finding: its details and numbers, the numbers also in mm, degrees and percent.
+    """Values by name for the templates of a finding's message and remedy: its details and numbers.
 
-    A name without a value gives an empty text.
+    Numbers are also given in mm, degrees and percent. A name without a value gives an empty text.
     """
 
     def __missing__(self, name: str) -> _Text:
@@ -167,7 +167,7 @@ def remedy(finding: Finding) -> str:
 
 
 def unobservable(finding: Finding) -> str:
-    """Return the direction that a finding of kind UNOBSERVABLE calls unobservable, or nearly so, in words."""
+    """Return in words the direction of a finding of kind UNOBSERVABLE, which is unobservable or nearly so."""
     return "{nearly:nearly unobservable: |}{direction}".format_map(Quantities.of(finding))
 
 
@@ -193,39 +193,39 @@ def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
 
 
 def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
-    """Return the findings for the error that every back end failed: its reason, and its further sentences."""
+    """Return findings for a failed reconstruction: one that rejects with the error's reason, and warnings."""
     words = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding.of(FindingKind.NO_RECONSTRUCTION, "rejects", "reconstruction", **words)
     return (failed, *(Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in error.also))
 
 
 def is_cause(finding: Finding) -> bool:
-    """Test whether a finding is a cause: other kinds of findings may be its consequences."""
+    """Test whether a finding may explain findings of other kinds, which are then its consequences."""
     return bool(finding.kind.row.explains)
 
 
 def is_lasting(finding: Finding) -> bool:
-    """Test whether a finding is a cause that another reconstruction of the same images cannot remove."""
+    """Test whether a finding explains others, and another reconstruction of the same images cannot remove it."""
     return is_cause(finding) and finding.kind.row.group != "reconstruction"
 
 
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings by severity; within a severity: findings about images, then other causes, then consequences."""
+    """Return findings by severity; within a severity those on images, then those that explain others, then the rest."""
 
     def place(finding: Finding) -> tuple[int, bool, bool]:
-        """Return the sort key of a finding."""
+        """Return the sort key of a finding: severity, not about images, explains no other."""
         return RANK[finding.severity], finding.kind.row.group != "images", not is_cause(finding)
 
     return tuple(sorted(findings, key=place))
 
 
 def is_explained(findings: Sequence[Finding]) -> bool:
-    """Test whether the first of sorted findings is a cause that rejects; more images or motions do not help then."""
+    """Test whether the first of sorted findings rejects and explains others; more images do not help then."""
     return bool(findings) and findings[0].severity == "rejects" and is_cause(findings[0])
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return sorted findings without the consequences of the first one, if that one is a cause and rejects."""
+    """Return sorted findings; if the first one rejects, the findings that it explains are left out."""
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings

@@ -36,6 +36,6 @@ class Requirement:
 
     @property
     def details(self) -> dict[str, float | str]:
-        """Fields as the `details` of a finding that the requirement is not met."""
+        """Required and reached accuracy as the `details` of a finding that the requirement is not met."""
         named = {name: value for name, value in vars(self).items() if value is not None}
         return {name: one if isinstance(one, str) else float(one) for name, one in named.items()}

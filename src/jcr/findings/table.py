@@ -94,7 +94,7 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class KindRow:
-    """Row of the table: group, templates of the texts, consequences and documentation of a kind of finding."""
+    """Row of the table of findings for one kind: group, templates of message and remedy, kinds that it explains."""
 
     group: str
     """Group of the kind in the documentation, a key of GROUPS."""

@@ -78,7 +78,7 @@ class Observability:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Principal directions of the excitation of the hand-eye unknowns by the motions (estimation/observability.py)."""
+    """Directions of translation, rotation and scale, sorted by how strongly the motions excite (determine) each."""
 
     value: Float[ndarray, "7"]
     """Excitation of each direction, weakest first."""
@@ -127,7 +127,7 @@ class RobotNoise:
 
     @property
     def together(self) -> tuple[float, float]:
-        """Random and remaining systematic error of a gripper pose together, one sigma per axis (m, rad)."""
+        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined."""
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
@@ -155,14 +155,14 @@ class Share:
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
-    """Return the covariance of one cause together with its standard deviations."""
+    """Return the share of one cause: its covariance in COVARIANCE_ORDER, and standard deviations in mm and degrees."""
     metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1)).tolist()
     degrees = float(np.degrees(radians))
     return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
 
 
 def _covariance_of(share: Share | None) -> Float[ndarray, "7 7"]:
-    """Return the covariance of a part of the uncertainty; 0 for a part that is missing."""
+    """Return the covariance (COVARIANCE_ORDER) of a share of the uncertainty; a zero matrix for None."""
     return np.zeros((7, 7)) if share is None else share.covariance
 
 
@@ -208,7 +208,7 @@ class LeaveOneOut:
 
     @property
     def length_m(self) -> float:
-        """Translation and rotation error as one length (m): hypot of translation and geometry.ARM times rotation."""
+        """Translation and rotation error as one length (m): hypot of translation and rotation times ARM."""
         from jcr.geometry import ARM  # SciPy, which help need not wait for
 
         return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))
@@ -246,7 +246,7 @@ class DepthCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """Point uncertainty: bounds on 95 % of the errors of a point seen by the camera, for exact gripper poses."""
+    """Uncertainty of a point that the camera sees: bounds on 95 % of its errors, for exact gripper poses."""
 
     distance_mm: Spread
     """Distance of the point from the camera along its ray (mm)."""
@@ -264,7 +264,7 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class SeenAndCorners(Seen):
-    """Point uncertainty at the image centre, for a point at the median distance of the scene, and at the corners."""
+    """Uncertainty of points at the median distance of the scene: at the image centre and at the worst corner."""
 
     corners: Seen
     """Point uncertainty at the worst corner of the image."""
@@ -285,7 +285,7 @@ class SceneUncertainty:
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-        """Return the covariances (m²) of scene points in the base frame, without the errors of their triangulation."""
+        """Return the covariances (m²) of points of the scene (m, base frame), without their triangulation errors."""
         from jcr.geometry import by_similarity  # SciPy, which help need not wait for
 
         by = by_similarity(x_in_base - self.middle_in_base)
@@ -294,7 +294,7 @@ class SceneUncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class WithGivenIntrinsics:
-    """Transform to use with the given intrinsics instead of the estimated ones: its most likely value for these."""
+    """Transform to use with the given intrinsics: its most likely value if these replace the estimated intrinsics."""
 
     gripper_from_camera: Matrix
     covariance: Covariance7
@@ -310,7 +310,7 @@ class WithGivenIntrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """Distortion that the camera model cannot express: e polynomials over the image (estimation/intrinsics_prior.py)."""
+    """Camera-model error: distortion that the model cannot express, as a sum of e polynomials of the pixel."""
 
     likeliest: Numbers
     """Estimated coefficients (e), in image widths."""
@@ -396,7 +396,7 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance in COVARIANCE_ORDER, followed by the intrinsics if these were estimated."""
+        """Covariance of transform and scale in COVARIANCE_ORDER (j = 7), followed by the intrinsics if estimated."""
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property
@@ -407,9 +407,9 @@ class Uncertainty:
     def with_error(
         self, added: Float[ndarray, "k k"], cause: Literal["intrinsics", "faults"] = "faults"
     ) -> "Uncertainty":
-        """Return the uncertainty with an independent error added, and attributed to `cause` in the budget.
+        """Return the uncertainty after an independent error is added and attributed to `cause` in the budget.
 
-        `added` is the covariance of the error, in COVARIANCE_ORDER or with all rows of `joint`.
+        `added` is the covariance (k,k) of the error: k = 7 in COVARIANCE_ORDER, or as many rows as `joint` has.
         """
         joint, budget, of_transform = self.joint, self.budget, added[:7, :7]
         if joint is not None:
@@ -423,7 +423,7 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class PaperResiduals:
-    """Mean residuals of AX = XB over the motions between consecutive used images, as in the paper of this method."""
+    """Mean residuals of AX = XB, where A and B are gripper and camera motions between consecutive used images."""
 
     translation: float
     """Mean translation residual δ_t (m)."""
@@ -437,7 +437,7 @@ LengthName = Literal["board", "known length", "depth camera", "network"]
 
 @dataclass(frozen=True, kw_only=True)
 class LengthCheck:
-    """Comparison of a known length with its value by the robot's positions."""
+    """Comparison of a known length, such as a board's size, with its value in the scale of the robot's positions."""
 
     name: LengthName
     robot_longer_percent: float

@@ -84,7 +84,7 @@ Mount = Literal["gripper", "base"]
 
 @dataclass(frozen=True, kw_only=True)
 class CellCamera:
-    """Camera of the robot's cell in addition to the capture's own one, with its images."""
+    """Camera of the robot's cell in addition to the one whose calibration is wanted, with its images."""
 
     name: str
     mount: Mount
@@ -151,7 +151,7 @@ class Capture:
         return len(self.images)
 
     def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
-        """Return the capture with the images of these rows, in their order, and without further cameras."""
+        """Return the capture with the images of these rows only, in the order of `rows`, without further cameras."""
         chosen = np.asarray(rows, dtype=int).tolist()
         return replace(
             self,
@@ -184,5 +184,5 @@ class PosePairs:
 
     @property
     def image_index(self) -> Int[ndarray, " n"]:
-        """Row of each camera pose among the samples: 0 … n-1, as in a Reconstruction that registered every image."""
+        """Indices 0 … n-1 of the camera poses, as of a Reconstruction in which every image is registered."""
         return np.arange(len(self))

@@ -38,14 +38,14 @@ def other_size(
     whose: str = "images",
     remedy: str = "take all with one camera at one resolution",
 ) -> InputError:
-    """Return the error that `what` has the resolution `size`, while `whose` have the resolution `expected`."""
+    """Return the error that `what` has another resolution than `whose`: `size` instead of `expected` (width, height)."""
     return InputError(
         f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
     )
 
 
 def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
-    """Return a rigid 4x4 matrix from nested lists; raise InputError with the deviation if it is not rigid."""
+    """Return a rigid 4x4 matrix from nested lists; raise InputError, which names `where`, if it is not rigid."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -64,7 +64,7 @@ RigidMatrix = Annotated[
 
 
 def _plausible(angles: list[float]) -> list[float]:
-    """Return joint angles (rad); raise ValueError if one is so large that they are probably in degrees."""
+    """Return the joint angles (rad) unchanged; raise ValueError if one is so large that it is probably in degrees."""
     if (largest := max(map(abs, angles))) > MOST_ROTATION:
         raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
     return angles
@@ -167,7 +167,7 @@ class CameraEntry(Entry, extra="forbid"):
 
     @model_validator(mode="after")
     def _agrees(self) -> "CameraEntry":
-        """Raise ValueError if mount, arm, frames and images contradict each other."""
+        """Return the entry; raise ValueError if its mount, arm, frames and images contradict each other."""
         is_fixed, own, shows_gripper = self.mount == "base", self.is_own, self.watches == "gripper"
         if own and self.watches is not None and is_fixed is not shows_gripper:
             raise ValueError(

@@ -75,19 +75,19 @@ def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Floa
 
 
 def in_json(kind: Any) -> GetPydanticSchema:
-    """Return the pydantic annotation of a field that is read and written as the type `kind`."""
+    """Return the pydantic annotation of a field that JSON has in the form of the type `kind`."""
     return GetPydanticSchema(lambda _source, handler: handler.generate_schema(kind))
 
 
 def rounded(value: float) -> float:
-    """Return a number rounded to 15 significant digits, which a conversion of the unit and back preserves."""
+    """Return a number rounded to 15 significant digits, so that a conversion to another unit and back preserves it."""
     return float(f"{value:.15g}")
 
 
 def in_unit(per_unit: float) -> GetPydanticSchema:
     """Return the pydantic annotation of a number in metres or radians that JSON states in another unit.
 
-    `per_unit` is the number of these units in a metre or radian.
+    `per_unit` is the value in the unit of JSON of 1 m or 1 rad, such as 1000 for mm.
     """
 
     def from_unit(value: float) -> float:
@@ -104,7 +104,7 @@ def in_unit(per_unit: float) -> GetPydanticSchema:
 def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:
     """Return the pydantic annotation of arrays that JSON has as nested lists; `made` converts the lists to an array.
 
-    `counts` is the shape of the arrays; None: any length.
+    `counts` is the shape of the arrays, with None for an axis of any length.
     """
     lists: Any = float
     for count in reversed(counts):

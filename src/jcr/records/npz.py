@@ -24,7 +24,7 @@ ARRAY = "array"
 
 
 class ReconstructionContent(BaseModel):
-    """Content of reconstruction.npz: its JSON, in which the arrays replace the objects that name them."""
+    """Content of reconstruction.npz: format and reconstruction, whose arrays are stored outside the JSON."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
     format: str
@@ -39,7 +39,10 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 
 
 def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a record, tuple or value as JSON, and add its arrays to `arrays` under names that begin with `name`."""
+    """Return a value as JSON that refers to arrays by name, and add these arrays to `arrays`.
+
+    Their names begin with `name`, followed by the path of fields and indices.
+    """
     if isinstance(value, np.ndarray):
         arrays[name] = value
         return {ARRAY: name}
@@ -54,9 +57,9 @@ def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _filled(value: Any, file: Mapping[str, np.ndarray]) -> Any:
-    """Return the JSON of `_named` with the arrays of the file in place of their names.
+    """Return the JSON `value` that `_named` made, with the arrays of `file` in place of references to them.
 
-    Raises KeyError for an array that the file lacks, and ValueError for one with values that are not finite.
+    Raises KeyError for an array that the file lacks, and ValueError for an array with values that are not finite.
     """
     if isinstance(value, list):
         return tuple(_filled(one, file) for one in value)
@@ -87,8 +90,8 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
 def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
     """Open an npz file of `write_npz`: yield its JSON text and its arrays by name.
 
-    Raises InputError if the file is missing or damaged, or if its `format` is not `expected`; also for errors in the
-    block that uses the arrays.
+    Raises InputError if the file is missing or damaged, if its `format` is not `expected`, or if the block under `with`
+    fails for a value of the file.
     """
     require_file(path)
     try:
@@ -124,7 +127,7 @@ def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> 
 
 
 def _check(found: Reconstruction) -> None:
-    """Raise ValueError for invalid values: indices out of range, lengths that are not positive, poses not rigid."""
+    """Raise ValueError for a reconstruction with indices out of range, lengths not positive, or poses not rigid."""
     tracks, boards, maps = found.tracks, found.tracks.boards, found.pointmaps
     m, p, cameras = len(found.image_index), len(tracks.points_in_recon), [*found.recon_from_camera]
     rows = [("image_index", found.image_index, np.inf), ("tracks.image", tracks.image, m)]

@@ -11,7 +11,7 @@ from jcr.records.capture import Intrinsics
 
 @dataclass(frozen=True)
 class Body:
-    """Board or single tag whose corners are points of the tracks; each is a rigid body of its own."""
+    """Rigid board, or single tag, whose corners are points of the tracks."""
 
     number: int
     """Number of the tag; 0 for a board."""
@@ -69,7 +69,7 @@ class Tracks:
         return out
 
     def only(self, rows: Bool[ndarray, " k"] | Int[ndarray, " n"]) -> "Tracks":
-        """Return the tracks with the observations of a mask or of indices; all points are kept."""
+        """Return the tracks with the observations that `rows` selects (mask or indices); all points are kept."""
         std = None if self.std_px is None else self.std_px[rows]
         return replace(self, image=self.image[rows], x_px=self.x_px[rows], point=self.point[rows], std_px=std)
 

@@ -20,7 +20,7 @@ MOVED = 4.0
 
 
 def check_boards(case: Case) -> Case:
-    """Report boards that were not found, moved or were stretched in print, and a board size estimated by the robot."""
+    """Add findings for boards that were not found, moved, or stretched in print, and for an estimated board size."""
     boards = case.reconstruction.tracks.boards
     if boards is None:
         return case
@@ -45,8 +45,8 @@ def check_boards(case: Case) -> Case:
 def board_faults(case: Case) -> list[Finding]:
     """Return a finding if the adjusted boards are faulty (stretched in print, or moved); else an empty list.
 
-    A stretched board has sides of different scale. A board was moved before an image in which the residuals
-    of all its corners have one common mean. The size of a faulty board must not set the scale.
+    A board is stretched if its two sides have different scales. It was moved if the residuals of its corners in one
+    image have a mean much larger than their scatter. The size of a faulty board must not set the scale.
     """
     adjusted, boards = case.adjusted, case.reconstruction.tracks.boards
     if boards is None or adjusted is None or adjusted.problem.boards is None:

@@ -95,7 +95,7 @@ of hypotheses.Alternatives."""
 
 @dataclass(frozen=True)
 class CameraEffect:
-    """Hypothesis of an effect on one camera: its kind, its additional parameters, and nuisance parameters."""
+    """Possible effect on one camera, such as a rolling shutter: its kind, its parameters and nuisance parameters."""
 
     kind: FindingKind
     free: Combinations
@@ -112,13 +112,13 @@ class CameraEffect:
 
     @property
     def both(self) -> Float[ndarray, "e r"]:
-        """Nuisance parameters, then the parameters of the effect."""
+        """Matrix (e,r) of all r parameters: columns of the nuisance parameters, then of the effect's parameters."""
         return np.concatenate([self.beside, self.free], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraAdjustment:
-    """Adjustment that also estimates the confirmed effects on one camera and on the gripper poses, for further tests."""
+    """Bundle adjustment that estimates all effects confirmed so far on one camera and the gripper poses."""
 
     adjusted: Solution
     adjust: Callable[[CameraPrior, Combinations | None, Float[ndarray, "s b"] | None], Solution]
@@ -144,13 +144,13 @@ class CameraAdjustment:
 
     @cached_property
     def equations(self) -> Alternatives:
-        """Equations of all possible additional parameters, with the estimated size of the camera-model error."""
+        """Equations of all candidate parameters of the camera, for the estimated size of the camera-model error."""
         return self.equations_with(None)
 
     def equations_with(self, model_error_std: float | None) -> Alternatives:
-        """Return the equations of all possible additional parameters for a size of the camera-model error.
+        """Return the equations of all candidate parameters of the camera, which score tests need.
 
-        None: the size that the adjustment estimated.
+        `model_error_std` is the size of the camera-model error; None: as the adjustment estimated it.
         """
         return alternatives(self.adjusted, self.camera, self.place, model_error_std)
 
@@ -180,9 +180,9 @@ class CameraAdjustment:
         return float(f_distribution.logsf(float(ratio), 4, self.equations.freedom))
 
     def with_free(self, found: Sequence[CameraEffect], poses: Sequence[Row]) -> "CameraAdjustment":
-        """Adjust again with the parameters of these effects; the sizes of all errors are estimated anew.
+        """Return the adjustment that estimates exactly the camera effects `found` and the pose effects `poses`.
 
-        Raises LinAlgError if the problem becomes singular.
+        The sizes of all errors are estimated anew. Raises LinAlgError if the problem becomes singular.
         """
         free = replace(self, found=tuple(found), poses=tuple(poses))
         own = rows_of_arm(self.adjusted.problem, self.arm or 0)
@@ -193,14 +193,17 @@ class CameraAdjustment:
     def test(
         self, free: Combinations, beside: Float[ndarray, "e q"], equations: Alternatives | None = None
     ) -> ScoreTest:
-        """Test the parameters `free`, with `beside` and those of the confirmed effects as nuisance parameters."""
+        """Return the score test of the parameters `free`, by default with `self.equations`.
+
+        The parameters `beside` and those of the confirmed effects are nuisance parameters.
+        """
         nothing = np.zeros((len(free), 1))
         known = spanned(np.concatenate([nothing, *(one.both for one in self.found)], axis=1))
         together = np.concatenate([known, beside], axis=1)
         return test_combinations(equations or self.equations, free, together)
 
     def log_p(self, one: CameraEffect, equations: Alternatives | None = None) -> float:
-        """Return the logarithm of an effect's p-value, multiplied by the number of tested change points."""
+        """Return the logarithm of an effect's p-value after multiplication by the number of tested change points."""
         return self.test(one.free, one.beside, equations).log_p + float(np.log(one.places))
 
     def estimates(self, one: CameraEffect) -> Float[ndarray, " p"]:
@@ -209,13 +212,13 @@ class CameraAdjustment:
 
 
 def rows_of_arm(problem: Problem, arm: int) -> slice:
-    """Return the rows of the gripper pose equations that belong to an arm: 6 per pose, arm after arm."""
+    """Return the rows of the arm with this index among the gripper pose equations: 6 per pose, arm after arm."""
     ends = np.cumsum([0, *(6 * len(one.rigs) for one in problem.arms)]).tolist()
     return slice(ends[arm], ends[arm + 1])
 
 
 def of_case(case: Case) -> CameraAdjustment:
-    """Return the adjustment of the capture's camera for the tests, with a subset of the points if there are many."""
+    """Return the case's adjustment in the form that the tests of effects need; many points are reduced to a subset."""
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
     if len(case.used) >= MIN_IMAGES and is_many:
@@ -243,9 +246,9 @@ def best_camera_effect(
 ) -> tuple[CameraEffect | None, float]:
     """Return the most significant camera effect and the logarithm of its p-value; (None, 0) without one.
 
-    Effects in `dismissed` are not tested. Several significant effects are ranked with the camera-model error at its
-    typical size, because the estimated size absorbs part of each effect. If no effect is significant, given intrinsics
-    are compared with the adjusted ones by Wald's test.
+    Effects in `dismissed` are not tested. Several significant effects are tested again with a typical size of the
+    camera-model error, because the estimated size includes part of each effect. If no effect is significant, given
+    intrinsics are compared with the adjusted ones by Wald's test.
     """
     excluded = {one.kind for one in (*state.found, *dismissed)}
     excluded |= FOCUS if excluded & FOCUS else set()
@@ -261,10 +264,10 @@ def best_camera_effect(
 
 
 def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjustment | None:
-    """Adjust with the parameters of one more effect; return None if the effect hardly moves the camera.
+    """Return the adjustment that also estimates the effect `best`; None if the effect hardly moves the camera.
 
-    A focal length per image (FOCUS_BY_IMAGE) is replaced by one that follows the distance or changes once, if that
-    explains nearly as much. Return None also if the adjustment becomes singular.
+    One focal length per image (FOCUS_BY_IMAGE) is replaced by a simpler effect that explains nearly as much: a focal
+    length that follows the distance or changes once. Return None also if the adjustment becomes singular.
     """
     first = state.test(best.both, best.both[:, :0]).shift
     is_given = best.kind is FindingKind.INTRINSICS and state.is_given
@@ -277,7 +280,7 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
         focal = best.free @ after.estimates(best)
 
         def explained(one: CameraEffect) -> float:
-            """Return the fraction of the squared focal-length differences that a simpler effect explains."""
+            """Return the fraction of the images' squared focal-length differences that a simpler effect explains."""
             along = one.free[:, 0]
             return float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
 
@@ -290,7 +293,7 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
 
 
 def is_material(found: Finding, after: CameraAdjustment) -> bool:
-    """Return whether an effect is large enough to be reported and moves the camera by more than MATERIAL.
+    """Return whether the effect `found`, which `after` estimates, is large and moves the camera by more than MATERIAL.
 
     Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
@@ -309,9 +312,10 @@ def is_material(found: Finding, after: CameraAdjustment) -> bool:
 
 
 def hypotheses(state: CameraAdjustment) -> list[CameraEffect]:
-    """Return the effects to test, with a common error of the focal length as nuisance parameter.
+    """Return the possible effects on the camera; the last one is wrong intrinsics.
 
-    The last effect is wrong intrinsics; with fewer than MIN_IMAGES images it is the only one.
+    A common error of the focal length is a nuisance parameter of all others. With fewer than MIN_IMAGES images, wrong
+    intrinsics is the only effect.
     """
     equations = state.equations
     m, far = equations.images, np.log(equations.distance)
@@ -401,7 +405,7 @@ def _size(after: CameraAdjustment, covariance: Float[ndarray, "p p"]) -> dict[st
 
 
 def _intrinsics(after: CameraAdjustment, std: Mapping[str, float]) -> dict[str, float | str]:
-    """Return the details of wrong intrinsics: estimated and given values, and the significant differences in words.
+    """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
     `std` holds the standard deviation of each tested parameter.
     """

@@ -62,10 +62,10 @@ def check_registered(case: Case) -> Case:
 
 
 def check_pieces(case: Case) -> Case:
-    """Report a reconstruction that consists of pieces, groups of images that fit their gripper poses only by group.
+    """Report a reconstruction in pieces: groups of images that are consistent within, but not with each other.
 
-    The hand-eye transform of the largest group gives a base_from_recon for each image. The images of one piece share
-    it, while wrong gripper poses give scattered values.
+    With the hand-eye transform of the largest group, each image gives a value of base_from_recon. The values agree
+    within a piece; wrong gripper poses give scattered values instead.
     """
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
@@ -142,7 +142,7 @@ def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return `view_findings` as causes of a rejection: repetitive images, or many blurred ones, reject."""
+    """Return the findings of the images of a rejected calibration: repetitive or many blurred images now reject."""
     return tuple(
         replace(one, severity="rejects")
         if one.kind is FindingKind.REPETITIVE

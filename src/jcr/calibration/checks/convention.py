@@ -50,7 +50,7 @@ _Candidate = tuple[str, str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention or order of the gripper poses, with the misfit of the calibration in it."""
+    """Convention or order of the gripper poses, and how badly a calibration with them fits."""
 
     name: str
     remedy: str
@@ -94,10 +94,10 @@ def better_reading(
     by_name: Mapping[bool, Poses] | None = None,
     solved: Calibration | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the pose convention that fits much better than the given one, and the given one; None if none does.
+    """Return the pose convention that fits much better than the given one, then the given one; None if none does.
 
-    `by_name` holds the gripper poses for images sorted by name, as numbers (key True) or as text (key False). `solved`
-    is the calibration with the given poses if it used the camera poses alone.
+    `by_name` holds the gripper poses that the images have if they are sorted by name, as numbers (key True) or as text
+    (key False). `solved` is a fit of the given poses to the camera poses alone; None: it is computed.
     """
     n = len(base_from_gripper)
     given, *others = _candidates(base_from_gripper)
@@ -131,7 +131,7 @@ def better_reading(
 def convention_finding(
     found: tuple[PoseConvention, PoseConvention], severity: Severity = "rejects"
 ) -> Finding:
-    """Return the finding that the poses fit in another convention; `found` holds that one and the given one."""
+    """Return the finding that the poses fit in another convention; `found` holds the better and the given one."""
     fits, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
@@ -144,7 +144,7 @@ def convention_finding(
 def _solved(
     candidate: _Candidate, recon_from_camera: Poses, solved: Calibration | None = None
 ) -> PoseConvention:
-    """Calibrate with a candidate convention, unless `solved` is that calibration, and return its misfit."""
+    """Return a candidate convention with the misfit of a calibration, which is `solved` or, if None, computed."""
     name, remedy, base_from_gripper, image = candidate
     fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
     metres, radians = fit.robot_noise.together
@@ -152,9 +152,9 @@ def _solved(
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
-    """Return the error (m) of a closed-form calibration of the images that agree best, 100 times faster than a fit.
+    """Return the error (m) of a candidate by a closed-form calibration from the images that agree best.
 
-    It is infinite if the scale is negative, as for mirrored poses.
+    It is infinite if the scale is negative, as for mirrored poses. A fit takes 100 times as long.
     """
     _, _, base_from_gripper, image = candidate
     camera = recon_from_camera[image]
@@ -169,7 +169,7 @@ def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
 
 
 def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
-    """Yield the given poses, then the poses with one assumed mistake corrected each, usual mistakes first."""
+    """Yield the given poses, then candidates that each correct one assumed mistake; usual mistakes come first."""
     n = len(base_from_gripper)
     every = np.arange(n)
     yield ("they are given", "", base_from_gripper, every)

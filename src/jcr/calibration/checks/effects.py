@@ -68,7 +68,8 @@ uncertainty."""
 def check_effects(case: Case) -> Case:
     """Report effects on the camera and on the gripper poses that the model of a rigid camera and arm lacks.
 
-    Cases with adjusted images adopt the effects; a fit to camera poses is tested for effects of the image order only.
+    With adjusted images, the calibration then includes the effects as parameters. A fit to camera poses is tested only
+    for effects that depend on the image order.
     """
     if not case.is_open:
         return case
@@ -91,7 +92,7 @@ def check_effects(case: Case) -> Case:
 
 
 def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, ...]]:
-    """Return the adjustment with all confirmed effects on one camera and its gripper poses, and a finding of each.
+    """Return the adjustment with all confirmed effects on one camera and its gripper poses, and a finding per effect.
 
     A camera effect is not reported if gripper poses and images contradict each other even with the effect estimated.
     """
@@ -122,9 +123,10 @@ def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, .
 
 
 def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
-    """Decide between two significant effects: return whether that on the poses, not that on the camera, is the cause.
+    """Return True if the pose effect `test` is the cause of the misfit, False if the camera effect `of_camera` is.
 
-    Each is tested again with the other one estimated; `log_chance` is the camera effect's log p-value.
+    Both are significant; each is tested again with the other one estimated. `log_chance` is the logarithm of the camera
+    effect's p-value.
     """
     with_camera = with_effect_free(state, of_camera)
     if with_camera is None:
@@ -165,9 +167,9 @@ def _tested_poses(state: CameraAdjustment) -> ArmEquations:
 def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
     """Return the test of the most significant effect on the poses of an arm; kinds in `passed` are not tested.
 
-    Return None if the effect is implausibly large, or if poses and images contradict each other even with the effect
-    estimated: the poses then have another fault. A motion must also be less significant in nearly all other orders of
-    the images.
+    Return None without a significant effect, if the effect is implausibly large, or if poses and images contradict each
+    other even with the effect estimated: the poses then have another fault. A motion counts only if it is more
+    significant in the true order of the images than in nearly all random orders.
     """
     equations, own, gripper = poses.equations, poses.rows, poses.base_from_gripper
     n, s = len(gripper), len(equations.residual)
@@ -237,7 +239,7 @@ def pose_finding(
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
-    """Return the fields of a finding that state the size of an arm's effect, its standard deviation, and its axis."""
+    """Return the fields of a finding for the size, standard deviation and axis of a strain, a lean or a sag."""
     estimate, covariance = test.estimate, test.covariance
     if test.row.kind is FindingKind.BASE_LEANS:
         return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
@@ -256,10 +258,10 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
 
 
 def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]) -> Case:
-    """Replace the calibration by one that includes the effects, unless that one is rejected.
+    """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
-    The effects were found with a subset of the points. Camera effects that do not move the calibration from all points
-    by more than MATERIAL are not reported. With a parameter per image, memory limits the number of points.
+    The effects were found with a subset of the points, and are now estimated from all points that memory permits.
+    Camera effects that then change the calibration by at most MATERIAL are dropped.
     """
     free = state.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
@@ -285,7 +287,7 @@ def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...])
 def with_effects(
     case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
-    """Adjust a case with the effects on camera and arm as parameters; return it with the findings' remaining shifts.
+    """Return an adjustment with the effects on camera and arm as parameters, and the findings with remaining shifts.
 
     The result is the effective hand-eye transform, which predicts best from reported gripper poses. Its difference from
     the transform for the true poses, and the possible error of the scale, are the remaining shifts. A thin prism
@@ -332,16 +334,16 @@ def as_adopted(found: Finding) -> Finding:
 def straight_shift(
     equations: Equations, log_sizes: LogSizes, columns: Float[ndarray, "s b"]
 ) -> Float[ndarray, " p"]:
-    """Return the step of the unknowns from their effective values to those that fit the true gripper poses.
+    """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    `columns` are the confirmed error patterns of the poses, one standard deviation each.
+    `columns` (s,b) are the confirmed error patterns of the poses, one standard deviation each.
     """
     straight = replace(equations, confirmed=columns @ columns.T)
     return solve_equations(straight, log_sizes).step - solve_equations(equations, log_sizes).step
 
 
 def _with_rejected_runs(case: Case) -> Case:
-    """Return the case with consecutive rejected images used again, which may follow a slip of the camera."""
+    """Return the case that again uses consecutive rejected images, because a slip of the camera may reject them."""
     in_order = with_rejected_runs(case.hand_eye.inliers)
     if (in_order == case.hand_eye.inliers).all():
         return case
@@ -355,7 +357,7 @@ def _with_rejected_runs(case: Case) -> Case:
 
 
 def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
-    """Return the mask of the used images, extended by rejected images next to another rejected one."""
+    """Return the mask of the used images, extended by rejected images whose neighbour is rejected too."""
     rejected = np.pad(~used, 1)
     return used | rejected[:-2] | rejected[2:]
 

@@ -69,9 +69,9 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
 def _shown_poses(
     capture: Capture, made: Reconstruction, hand_eye: Calibration
 ) -> dict[int, Float[ndarray, "4 4"]]:
-    """Return base_from_gripper that each unused image shows, by row of the capture, from its camera pose.
+    """Return the base_from_gripper that follows from each unused image's camera pose; keys are rows of the capture.
 
-    Images without a camera pose are registered in the reconstruction first; those that fail are missing.
+    Images without a camera pose are registered in the reconstruction first; images that fail are missing.
     """
     used = set(made.image_index[hand_eye.inliers].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))

@@ -61,7 +61,7 @@ NORMAL = 1.4826
 
 @dataclass(frozen=True)
 class Length:
-    """Known length compared with the robot's positions."""
+    """Ratio of a known length, such as a board's size, to the same length by the robot's positions."""
 
     name: LengthName | Literal["robot"]
     off: float
@@ -71,12 +71,12 @@ class Length:
 
 
 def check_lengths(case: Case) -> Case:
-    """Compare all known lengths with the robot: use those that agree as priors, or report two that contradict."""
+    """Compare known lengths with the robot's scale: use agreeing lengths as priors, or report two that contradict."""
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
 
     def sigmas(pair: tuple[Length, Length]) -> float:
-        """Return the difference of two lengths in standard deviations."""
+        """Return the difference of two lengths, divided by its standard deviation."""
         return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
 
     pair = max(combinations([robot, *lengths], 2), key=sigmas, default=None) if converged else None
@@ -148,7 +148,7 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
 
 
 def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
-    """Return the finding that two lengths contradict each other; if one is the robot's, it is `one`."""
+    """Return the finding that two lengths contradict each other; a length by the robot must be the argument `one`."""
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
         size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
@@ -161,9 +161,9 @@ def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
-    """Return the change of the calibration (COVARIANCE_ORDER) if all robot positions are too long by a factor exp(off).
+    """Return the correction (COVARIANCE_ORDER) of a calibration from robot positions too large by a factor exp(off).
 
-    Translation and scale then shrink by that factor.
+    Translation and scale shrink by that factor.
     """
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
@@ -171,7 +171,10 @@ def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
 def _fused(
     case: Case, hand_eye: Calibration, lengths: list[Length], fault: Float[ndarray, "7 7"]
 ) -> tuple[Calibration, Solution]:
-    """Return the calibration and adjustment with the lengths as priors of the scale; `fault` adds to its covariance."""
+    """Return calibration and adjustment with the lengths as priors of the scale.
+
+    `fault` is a covariance (COVARIANCE_ORDER) that is added to the calibration's covariance.
+    """
     adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
     assert adjusted is not None
     for one in lengths:
@@ -250,7 +253,7 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
 def _depths(
     capture: Capture, reconstruction: Reconstruction, scale: float
 ) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
-    """Return measured depths (m), reconstructed depths (m), and image indices of all features that have both."""
+    """Return measured depths (m), reconstructed depths (m), and image indices of the k features that have both."""
     tracks, depths = reconstruction.tracks, list(capture.depths or [])
     parts = [np.zeros((3, 0))]
     for k, row in enumerate(reconstruction.image_index):
@@ -272,7 +275,7 @@ def _depths(
 
 
 def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
-    """Return a (m) and b (1/m) of the noise sigma² = a² + (b z²)², fitted to the residuals in bins of the depth z."""
+    """Return a (m) and b (1/m) of the variance a² + (b z²)² of residuals (m) at depths z (m), fitted in bins of z."""
     from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
 
     bins = np.array_split(np.argsort(depth), BINS)
