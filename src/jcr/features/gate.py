@@ -69,7 +69,7 @@ class RotationOfX:
 
 @dataclass(frozen=True)
 class Gate:
-    """Pairs of a capture, classified by whether their relative rotation agrees with the gripper's motion."""
+    """Image pairs, divided into confirmed, undecided and contradicted by the gripper's rotation, with the hand-eye."""
 
     confirmed: tuple[Pair, ...]
     """Pairs that agree with the gripper's motion; the first of their `readings` is the motion that agrees best."""

@@ -57,7 +57,7 @@ def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
-    """Return the mean cost (0 to 1) of the colour differences between the images, at the best depth of each point."""
+    """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth."""
     host, x_px = strongest(level, _per_image(level, stage))
     return on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
@@ -75,17 +75,17 @@ def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
 
 
 def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
-    """Return the free steps of cameras that move as one, as columns: six of the pose, then the log focal length.
+    """Return the free steps when all cameras move as one, one per column: six of the pose, then the log focal length.
 
-    The focal length is free only where the intrinsics are not known.
+    The column of the focal length (row 6) is left out where the intrinsics are known.
     """
     return np.eye(7)[:, : 6 if intrinsics_known else 7]
 
 
 def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, "p q"]:
-    """Return the free steps of cameras that move one by one, as orthonormal columns.
+    """Return an orthonormal basis (columns) of the free steps when each camera moves by itself.
 
-    The rows are six per camera, then the log focal length. The first camera and the common scale are fixed, and so is
+    The p rows are six per camera, then the log focal length. The first camera and the common scale are fixed, and so is
     the focal length where the intrinsics are known.
     """
     pose = cameras.base_from_camera
@@ -120,7 +120,10 @@ def align_photometrically(
 def _after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Return cameras and points after damped Gauss-Newton steps; the cameras move as one if there are 7 parameters."""
+    """Return cameras and points after damped Gauss-Newton steps along the columns of `directions`.
+
+    With 7 rows of `directions`, all cameras move as one. `sigma` is the scale of the robust cost.
+    """
 
     def step(
         at: tuple[Cameras, Points], system: PhotometricEquations, damping: float
@@ -143,9 +146,9 @@ def _after_descent(
 
 
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
-    """Return the cameras after a step: twists (v, ω) in camera axes, then the change of the log focal length.
+    """Return the cameras after a step: translation and rotation in camera axes, last the change of log focal length.
 
-    The step has one twist for all cameras, or one for each.
+    The step has six numbers for all cameras together, or six for each.
     """
     pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(

@@ -125,7 +125,7 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
 
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """Return a factor per image that makes the images equally bright; all 1 where the camera kept its exposure."""
+    """Return a factor per image that makes all images equally bright; all are 1 where brightness hardly differs."""
     factor = np.ones(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
@@ -137,11 +137,11 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
 def images_that_fit(
     level: Level, cameras: Cameras, intrinsics_known: bool
 ) -> tuple[Int[ndarray, " m"], Cameras]:
-    """Return the rows of the images that agree with the others, and their cameras, aligned without the rest.
+    """Return the rows of the images that agree with the others, and their cameras, aligned without the other images.
 
-    The measure is the share of the other images' points that an image shows in their colour. An image with a far lower
-    share than the median, even with a free camera, has a wrong pose or shows another scene. Raises RejectedError where
-    fewer than three images are left.
+    The measure is the share of the points of other images that an image shows in the same colour. An image with a far
+    lower share than the median, even with a free camera, has a wrong pose or shows another scene. Raises RejectedError
+    where fewer than three images are left.
     """
     rows = np.arange(level.count)
     while True:
@@ -162,7 +162,7 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Return the undistorted images at every height in pixels that a stage needs, by height."""
+    """Return the images, undistorted and reduced, by their height in pixels; the heights are those of all stages."""
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
@@ -173,11 +173,11 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -
 def camera_covariance(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> Float[ndarray, "r r"]:
-    """Return the covariance (6n,6n) of the cameras' steps in the first camera's axes, as in records.CameraEvidence.
+    """Return the covariance (6n,6n) of the camera poses' steps (records.CameraEvidence), in the first camera's axes.
 
-    Residuals within one region of the scene are correlated, in all images that see it. The inverse normal matrix is
-    scaled by the measured scatter of the regions' gradients. This sandwich estimate has one number instead of a full
-    matrix, for which there are too few regions.
+    Residuals within one region of the scene are correlated. So the inverse normal matrix is scaled by the measured
+    scatter of the regions' gradients: one factor, because there are too few regions for a full sandwich estimate. The
+    columns of `directions` are the free steps.
     """
     system = equations(level, cameras, points, sigma, tied=False)
     inverse_normal = np.linalg.inv(directions.T @ system.normal @ directions)

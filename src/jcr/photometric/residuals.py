@@ -37,7 +37,7 @@ _CHUNK = 500
 
 @dataclass(frozen=True)
 class Level:
-    """Blurred images of one size, stacked along the rows, with their derivatives by u and v (per px)."""
+    """Blurred images of one height, stacked along the rows, with their derivatives by pixel coordinates u and v."""
 
     color: Float32[ndarray, "nh w 3"]
     by_u: Float32[ndarray, "nh w 3"]
@@ -51,7 +51,7 @@ class Level:
         return len(self.color) // self.grid.height
 
     def rows(self, which: Int[ndarray, " m"]) -> "Level":
-        """Return the level with only the images `which`."""
+        """Return only the images `which` (rows), as a level."""
         color, by_u, by_v = (
             x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
             for x in (self.color, self.by_u, self.by_v)
@@ -59,14 +59,14 @@ class Level:
         return Level(color, by_u, by_v, self.grid)
 
     def times(self, factor: Float[ndarray, " n"]) -> "Level":
-        """Return the level with every image multiplied by its factor."""
+        """Return the images, each with its brightness multiplied by its factor, as a level."""
         of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
         return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """Camera poses in the base frame (m), and the focal length of all cameras as a factor (`zoom`) of the grid's."""
+    """Camera poses in the base frame (m), and a factor `zoom` of the focal lengths, common to all cameras."""
 
     base_from_camera: Float[ndarray, "n 4 4"]
     zoom: float = 1.0
@@ -74,7 +74,7 @@ class Cameras:
 
 @dataclass(frozen=True, kw_only=True)
 class Points:
-    """Points to align: a pixel in a host image (its row), with colour (0 to 1) and depth (m) there."""
+    """Scene points: each is a pixel in one image (its host, given by row), with colour (0 to 1) and depth (m) there."""
 
     host: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
@@ -90,9 +90,10 @@ class Points:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotometricEquations:
-    """Gauss-Newton equations of p camera parameters, with the log depths of k points eliminated (Schur complement).
+    """Normal equations of a Gauss-Newton step in p camera parameters; the log depths of k points are eliminated.
 
-    The parameters are six per camera, or six for all cameras, and last the log focal length.
+    The parameters are six per camera, or six for all cameras, and last the log focal length. The log depths follow from
+    their step (Schur complement).
     """
 
     normal: Float[ndarray, "p p"]
@@ -103,7 +104,7 @@ class PhotometricEquations:
     depth_information: Float[ndarray, " k"]
 
     def depth_step(self, step: Float[ndarray, " p"]) -> Float[ndarray, " k"]:
-        """Return the steps of the log depths that belong to a step of the cameras and the log focal length."""
+        """Return the step of each point's log depth, given the step of the camera parameters."""
         return -(self.depth_gradient + self.by_depth @ step) / self.depth_information
 
 
@@ -121,10 +122,7 @@ def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: in
 
 
 def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
-    """Return image row and pixel (u, v) of the strongest colour changes, at most one per block of pixels.
-
-    Each image has at most `per_image` of them.
-    """
+    """Return image row and pixel (u, v) of the strongest edges, at most one per block and `per_image` per image."""
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
     change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
@@ -151,10 +149,11 @@ def on_rays(
     sigma: float,
     least: float,
 ) -> tuple[Points, float]:
-    """Return the points at the best of the tried `depths`, and the mean of their costs.
+    """Return points at the given pixels with the best of the tried `depths`, and the mean of the points' costs.
 
-    `depths` has one row per trial and one column per image. The cost of a point is the mean of r²/(r² + sigma²) over
-    the images with the smallest colour difference r. Points with a cost below `least` are marked as agreed.
+    `host` is the image row of each pixel; `depths` (m) has one row per trial and one column per image. The cost of a
+    point is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r. Points with a cost
+    below `least` are marked as agreed.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)
@@ -166,7 +165,10 @@ def on_rays(
 
 
 def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
-    """Return the cost of each point: mean r²/(r² + sigma²) over the best views; 1 where fewer than two see it."""
+    """Return the cost of each point, 0 to 1; it is 1 where fewer than two images see the point.
+
+    The cost is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r.
+    """
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
@@ -179,7 +181,7 @@ def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
-    """Return the squared colour difference between each image at pixels u, v and the points."""
+    """Return for each image and point the squared difference of the image's colour at u, v and the point's colour."""
     return _squared(_sample(level.color, level, u, v) - points.color)
 
 
@@ -201,7 +203,7 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
 def in_view(
     level: Level, cameras: Cameras, points: Points
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
-    """Return the points in every camera's frame, their pixels u and v, and whether the camera sees them.
+    """Return per image and point: the point in the camera frame, its pixel u and v, and whether the image shows it.
 
     A host image does not count as seeing its own points.
     """
@@ -220,7 +222,7 @@ def in_view(
 def _sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Return bilinear samples of every image of a stack at the pixels u, v."""
+    """Return the colour of every image of `stack` (images below each other) at its own pixels u, v, bilinearly."""
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -256,9 +258,9 @@ def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> floa
 def equations(
     level: Level, cameras: Cameras, points: Points, sigma: float, tied: bool
 ) -> PhotometricEquations:
-    """Return the Gauss-Newton equations for twists (v, ω) in camera axes, T ← T·exp(ξ), and the log focal length.
+    """Return the normal equations for twists (translation, rotation in camera axes) and the log focal length.
 
-    There is one twist for all cameras if `tied`, otherwise one for each camera.
+    A twist ξ changes a pose T to T·exp(ξ). There is one twist for all cameras if `tied`, otherwise one for each camera.
     """
     n, k = level.count, len(points.host)
     p = 7 if tied else 6 * n + 1
@@ -299,10 +301,10 @@ def equations(
 def _linearised(
     level: Level, cameras: Cameras, points: Points, sigma: float
 ) -> Iterator[tuple[slice, ndarray, ndarray, ndarray, ndarray, ndarray]]:
-    """Yield weighted residuals and derivatives for chunks of points, each an array (images, points, 3 colours, …).
+    """Yield per chunk of points: their slice, the weighted residuals, and four arrays of weighted derivatives.
 
-    The derivatives are by the twist of the viewing camera, the twist of the host, the log focal length and the log
-    depth. The first element is the slice of the points.
+    The derivatives are by the twist of the viewing camera, the twist of the point's host camera, the log focal length
+    and the log depth. Residuals and derivatives are arrays (images, points, 3 colours, …).
     """
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)

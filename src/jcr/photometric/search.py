@@ -44,9 +44,10 @@ def search(
     intrinsics_known: bool,
     report: Progress,
 ) -> Cameras:
-    """Return the cameras posed by the hand-eye transform for which the colours of the images agree best.
+    """Return the cameras by the hand-eye transform for which the images agree best in colour.
 
-    Raises RejectedError where a different hand-eye transform fits as well, or where the images have no edges.
+    `levels` are the images by their height in pixels. Raises RejectedError where a different hand-eye transform fits as
+    well, or where the images have no edges.
     """
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
@@ -61,7 +62,10 @@ def search(
         begin: float,
         share: float,
     ) -> list[tuple[float, Cameras]]:
-        """Align each of the cameras at `stage`, and return them with their costs at `judge`."""
+        """Align each of the cameras `found` at the level `stage`; return them with their costs at the level `judge`.
+
+        The progress goes from `begin` to `begin` + `share`.
+        """
         made = []
         for k, (_, cameras) in enumerate(found):
             report("direct alignment", begin + share * k / len(found))
@@ -85,7 +89,7 @@ def search(
 
 
 def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
-    """Return initial hand-eye transforms, without translation, by which all cameras look at a common place.
+    """Return t initial gripper_from_camera, without translation, by which all cameras look at one place.
 
     They are rotations about the common viewing direction, and tilts of it.
     """
@@ -110,7 +114,7 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
 
 
 def _different(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
-    """Return the best of each group of equal results, best first, with their costs."""
+    """Return (cost, cameras) of the best of each group of nearly equal results, best first."""
     kept: list[tuple[float, Cameras]] = []
     for cost, cameras in sorted(found, key=lambda each: each[0]):
         gaps = [inverse(cameras.base_from_camera[0]) @ other.base_from_camera[0] for _, other in kept]

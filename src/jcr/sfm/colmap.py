@@ -81,10 +81,10 @@ def reconstruct_colmap(
     progress: Progress | None = None,
     working_size_px: int = WORKING_SIZE_PX,
 ) -> Reconstruction:
-    """Reconstruct camera poses and tracks of a capture, up to one similarity; a seed gives the same result bit for bit.
+    """Reconstruct camera poses and tracks of a capture, in a frame and unit of their own; a seed gives the same bits.
 
-    The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated. Raises
-    RejectedError when fewer than three images register, with their number, the likely reason and a remedy.
+    The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated.
+    Raises RejectedError when fewer than three images register, with their number, the likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
@@ -114,7 +114,7 @@ def reconstruct_near_cameras(
 ) -> Reconstruction | None:
     """Return cameras and tracks adjusted from predicted poses of all images; None where an image has too few points.
 
-    `intrinsics` are held if `known`, and otherwise are the initial estimate.
+    `intrinsics` are held if `known`, and otherwise are the initial estimate. The images are matched with `features`.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
     with matched_database(capture, images, intrinsics, known, features, 0, report) as (database, camera):
@@ -134,9 +134,10 @@ def matched_database(
     seed: int,
     report: Progress,
 ) -> Iterator[tuple[Path, pycolmap.Camera]]:
-    """Yield the path of a COLMAP database with the verified matches of a capture's images, and its camera.
+    """Match a capture's images; yield the path of a COLMAP database of the verified matches, and its camera.
 
-    COLMAP's log is silent meanwhile. `intrinsics` are given if `known`, else an initial estimate.
+    The database exists, and COLMAP's log is silent, within the context. `intrinsics` are given if `known`, else an
+    initial estimate.
     """
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         (camera,) = working_cameras([intrinsics], known)
@@ -158,9 +159,10 @@ def _adjusted(
     known: bool,
     seed: int,
 ) -> Reconstruction:
-    """Return the reconstruction of a model after least-squares matching of its observations and a last adjustment.
+    """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
-    `like` are the intrinsics at the images' size, held if `known`.
+    All cameras and points are adjusted before and after. `like` are the intrinsics at the images' size, held if
+    `known`.
     """
     _thin(model, seed)
     adjust_robustly(model, known, _ROUGHLY)
@@ -177,9 +179,10 @@ def _adjusted(
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
-    """Return the initial intrinsics to try in turn, whether they are given, and warnings about them.
+    """Return the initial intrinsics to try in turn, true if they are given rather than guessed, and warnings.
 
-    Given intrinsics that are usable are the only ones. Otherwise each has a guessed focal length and no distortion.
+    If the capture has usable intrinsics, they are the only ones. Otherwise each has a guessed focal length and no
+    distortion.
     """
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
@@ -205,9 +208,10 @@ def map_images(
 ) -> tuple[Matched, pycolmap.Reconstruction | None]:
     """Match the images and map the verified pairs by COLMAP's mapper; return the matches and the model.
 
-    The model is None if no pair could be mapped. The initial `cameras` are tried in turn, after the intrinsics estimated
-    from the gripper's angles if there are any. A model `begun` is continued with the images that it lacks and that match
-    others. Images that the mapper leaves out are added near cameras predicted from the gripper poses.
+    The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size. The mapper
+    tries the initial `cameras` in turn, after intrinsics estimated from the gripper's angles if there are any. A model
+    `begun` is continued with the images that it lacks. Images that the mapper leaves out are added near cameras
+    predicted from the gripper poses.
     """
     report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
@@ -241,9 +245,9 @@ def matcher_of(
     seed: int,
     report: Progress,
 ) -> Matcher:
-    """Return a matcher for one kind of features; SIFT features are found here, those of a network during the matching.
+    """Return a matcher of the images by SIFT or XFeat (`features`); SIFT keypoints are found now, XFeat's later.
 
-    `known` says that the intrinsics of `camera` are given.
+    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`.
     """
     if features != "xfeat":
         give_back()
@@ -260,9 +264,10 @@ def matcher_of(
 
 
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
-    """Return the matches of random features, so that at most _MOST_MATCHED keypoints remain.
+    """Return the matches of randomly chosen features, so that at most _MOST_MATCHED keypoints remain.
 
-    A feature is a set of keypoints that matches connect; either all its matches are kept or none.
+    A feature is a set of keypoints that matches connect; either all its matches are kept or none. `images` is the
+    number of images.
     """
     rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
     ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]
@@ -289,10 +294,10 @@ def _map_incrementally(
     report: Progress,
     begun: pycolmap.Reconstruction | None,
 ) -> pycolmap.Reconstruction | None:
-    """Return the model with most images over all initial cameras; None if none could be mapped.
+    """Map the images once with each initial camera; return the model with most images, or None if there is none.
 
-    Thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with the images
-    that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
+    COLMAP's thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with
+    the images that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
     """
     n_images, pipeline = len(matcher.x_px), _pipeline_options(matcher.known, matcher.seed)
     if n_images > _MANY:
@@ -365,9 +370,10 @@ def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
 def _align_observations(
     model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
 ) -> Float[ndarray, " k"] | None:
-    """Refine the model's observations by least-squares matching, in images of the size that features were found in.
+    """Refine the model's observations by least-squares matching, in images of the size of COLMAP's camera.
 
-    Returns the standard deviation of each observation, in pixels of the original images and in the order of `tracks_of`.
+    Returns the standard deviation of each observation, in pixels of the original images and in the order of
+    `tracks_of`.
     """
     camera, rows = model.camera(1), rows_of(model)
     size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]

@@ -76,7 +76,10 @@ def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
 
 
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
-    """Return the tracks of the COLMAP model at `cameras` in the images `names`, in pixels of images of `size`."""
+    """Return the tracks of the COLMAP model at path `cameras` in the images `names`, in pixels of images of `size`.
+
+    The size is (width, height).
+    """
     model = colmap.read_model(cameras)
     id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
     return tracks_of(model, [id_of[name] for name in names], size)

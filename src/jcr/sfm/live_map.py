@@ -30,7 +30,7 @@ class LiveMap:
     """Map (camera poses and tracks) of the images of a capture that is being taken."""
 
     def __init__(self, capture: Capture) -> None:
-        """Begin a map without images; the intrinsics are those of the capture, or are estimated."""
+        """Create a map without images; intrinsics that the capture does not have are estimated during the mapping."""
         self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
         self._cameras = working_cameras(self._all_intrinsics, self._known)
         camera = self._cameras[0]
@@ -47,12 +47,12 @@ class LiveMap:
         return sorted(self._places[row] for row in self._rows())
 
     def matched_with(self, place: int) -> int:
-        """Return the number of images with verified matches to the image in the capture's row `place`."""
+        """Return how many other images have verified matches to the image in row `place` of the capture."""
         row = self._places.index(place)
         return sum(row in key for key in self._geometries)
 
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
-        """Update the map to the images of a capture; `new` has the images that the map lacks, by name.
+        """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
         Images that are no longer in the capture are removed, and the map then begins anew.
         """
@@ -83,11 +83,14 @@ class LiveMap:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
 
     def _rows(self) -> list[int]:
-        """Return the rows, in the matcher's order of images, of the images that the model has registered."""
+        """Return the rows of the images that the model has registered, counted in the order of the matcher."""
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:
-        """Return the map as a reconstruction, with the capture's rows; None with fewer than two registered images."""
+        """Return the map as a reconstruction; None with fewer than two registered images.
+
+        Its `image_index` counts the rows of the capture.
+        """
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None

@@ -45,10 +45,10 @@ def with_missing_images(
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
 ) -> pycolmap.Reconstruction:
-    """Return the model with images that it lacks, near cameras predicted by its own hand-eye transform X.
+    """Return the model with the missing images that enough points confirm, near camera poses predicted by the robot.
 
-    An image is added only where enough points confirm its camera. `base_from_gripper` has a row per image of the
-    matcher.
+    The prediction uses the hand-eye transform of the images in the model. `base_from_gripper` has a row per image of
+    the matcher.
     """
     rows = rows_of(model)
     poses = poses_of(model, rows)
@@ -83,10 +83,10 @@ def model_near_cameras(
     known: bool,
     mapped: Container[int] | None = None,
 ) -> pycolmap.Reconstruction:
-    """Return a model adjusted from predicted cameras, by row, to all verified matches of the database.
+    """Return COLMAP's model of all verified matches of the database, adjusted from predicted camera poses by image row.
 
-    Intrinsics are held if `known`. Images with fewer than LEAST_POINTS points are removed, where only points that an
-    image of the rows `mapped` (None: any) sees are counted.
+    The intrinsics of `camera` are held if `known`. Images with fewer than LEAST_POINTS points are removed. Only points
+    that an image of the rows `mapped` sees are counted, or all points if `mapped` is None.
     """
     model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
     for largest_px, refinements, scale_px in PASSES:
@@ -110,7 +110,7 @@ def model_near_cameras(
 
 
 def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
-    """Add observations to an image: free keypoints within `radius_px` of projected points of similar descriptor."""
+    """Add observations to an image: unused keypoints within `radius_px` of a projected point of similar descriptor."""
     image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
     free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)

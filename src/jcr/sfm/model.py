@@ -30,8 +30,8 @@ ENOUGH = 1e-6
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
     """Return COLMAP's camera with these intrinsics.
 
-    If they are not `known`, the model is RADIAL with the given focal length and without distortion; COLMAP then refines
-    the focal length and two coefficients.
+    If the intrinsics are not `known`, the camera's model is RADIAL with their focal length and no distortion; COLMAP
+    then refines the focal length and two coefficients.
     """
     centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     both = [intrinsics.fx, intrinsics.fy, *centre]
@@ -52,7 +52,10 @@ def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
 def working_cameras(
     all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int = WORKING_SIZE_PX
 ) -> list[pycolmap.Camera]:
-    """Return COLMAP's cameras for images of the working size, whose long side is at most `working_size_px`."""
+    """Return COLMAP's camera of each of the intrinsics, for images reduced to a long side of at most `working_size_px`.
+
+    If the intrinsics are not `known`, COLMAP refines focal length and distortion.
+    """
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -60,7 +63,7 @@ def working_cameras(
 
 
 def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Intrinsics:
-    """Return `like` if the intrinsics are `known`, else those of COLMAP's `camera`, for images of the size of `like`."""
+    """Return the intrinsics of COLMAP's `camera` for images of the size of `like`; if `known`, return `like` itself."""
     if known:
         return like
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
@@ -96,7 +99,7 @@ def rows_of(model: pycolmap.Reconstruction) -> list[int]:
 
 
 def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarray, "m 4 4"]:
-    """Return recon_from_camera of the model's images `rows`."""
+    """Return recon_from_camera of the images `rows` of the model, in the model's frame and unit."""
     mapped = [model.image(row + 1).cam_from_world() for row in rows]
     if not mapped:
         return np.zeros((0, 4, 4))
@@ -133,9 +136,10 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return (image, keypoint, point) of each observation, as rows.
+    """Return all observations of a model as (image, keypoint, point), point by point.
 
-    The rows are those of `image_ids`, of the image's keypoints, and of the points by ascending id.
+    Image is a position in `image_ids`, keypoint a row among the image's keypoints, point a position among ascending
+    point ids.
     """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [
@@ -153,7 +157,7 @@ def triangulated_model(
     largest_px: float = 4.0,
     refinements: int = 5,
 ) -> pycolmap.Reconstruction:
-    """Return a model of fixed cameras, by row, with points triangulated from all verified matches of the database.
+    """Return a model of images (by row) with fixed poses, and points triangulated from all matches of the database.
 
     Points with a reprojection error above `largest_px` are removed. The same input gives the same bits.
     """
@@ -181,7 +185,7 @@ def triangulated_model(
 def adjust_robustly(
     model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = ENOUGH, scale_px: float = 0.5
 ) -> None:
-    """Adjust all cameras and points of a model under a Cauchy loss of scale `scale_px`.
+    """Adjust all cameras and points of a model, which is changed, under a Cauchy loss of scale `scale_px`.
 
     `enough` is the relative change of the cost that ends the adjustment. In COLMAP's plain least squares mismatches
     distort the result; the loss halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).

@@ -49,13 +49,13 @@ class KnownImages:
         camera: Intrinsics,
         recon_from_camera: Float[ndarray, "m 4 4"],
     ) -> "KnownImages":
-        """Find the features of images with known poses and intrinsics `camera`."""
+        """Find the features of m images of one camera, whose poses and intrinsics (`camera`) are known."""
         return cls(camera, recon_from_camera, tuple(features(image, camera) for image in images))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedPoints:
-    """Features of a new image that match images of known poses, with points triangulated from two or more of those."""
+    """Features of a new image that match images of known poses, with points triangulated from at least two of these."""
 
     known: KnownImages
     x_px: Float[ndarray, "n 2"]
@@ -88,7 +88,7 @@ def register(
     older: Sequence[UInt8[ndarray, "h w 3"]],
     new: Sequence[UInt8[ndarray, "h w 3"]],
 ) -> list[CameraPose | int]:
-    """Return the camera pose of each new image in the recon frame, or the number of points it shares if too few.
+    """Return for each new image its camera pose in the recon frame, or the number of points that agree if too few.
 
     `older` are the images of the reconstruction's rows, in their order. All images are of one camera.
     """
@@ -99,7 +99,7 @@ def register(
 
 
 def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFeatures:
-    """Return the SIFT features of an image with these intrinsics, found at the working size."""
+    """Return the SIFT features of an image with these intrinsics; large images are reduced to WORKING_SIZE_PX first."""
     scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
     size = round(intrinsics.width * scale), round(intrinsics.height * scale)
     found, descriptors = detect(grey_of(image, size))
@@ -140,8 +140,8 @@ def registration(
 ) -> Registration | int:
     """Return the pose on which the shared points agree, or the number of points that agree if below MIN_POINTS.
 
-    `camera` are the new image's intrinsics, whose focal length is held or free; `gate_px` is the largest reprojection
-    error of an inlier.
+    `camera` are the new image's intrinsics; their focal length is held (`given`) or estimated (`free`). `gate_px` is
+    the largest reprojection error of an inlier.
     """
     known, std_px, pose = shared.known, 1.0, None
     if len(shared.points) < MIN_POINTS:
@@ -180,10 +180,10 @@ def triangulated_features(
     gate: float,
     n: int,
 ) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"], Bool[ndarray, " n"]]:
-    """Return for each of `n` features its point, its covariance per rad² of ray noise, and whether two rays agree on it.
+    """Return each of `n` features' point, its covariance per rad² of ray variance, and whether two rays agree on it.
 
     Observation c is the ray `seen[c]` (x/z, y/z) of image `row[c]` to the feature `feature[c]`. Rays that miss their
-    point by more than `gate` (rad) are mismatches.
+    point by more than `gate` (rad) are mismatches. Points are in the recon frame.
     """
     rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
     direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])

@@ -53,10 +53,11 @@ def align_tracks(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> Tracks:
-    """Align observations to their track's reference, and return the tracks with standard deviations.
+    """Return the tracks with observations aligned to one reference observation per track by least-squares matching.
 
-    `greys` are the images in the order of the cameras. Images, tracks and `intrinsics` are of one size. The reference is
-    the observation that shows the surface at the median scale, and stays where it is.
+    The result has standard deviations. `greys` are the images in the order of the cameras. Images, tracks and
+    `intrinsics` are of one size. The reference is the observation that shows the surface at the median scale, and keeps
+    its pixel.
     """
     order = np.lexsort((tracks.image, tracks.point))
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
@@ -72,7 +73,7 @@ def align_tracks(
     )
 
     def align(level: UInt8[ndarray, "m h2 w2"], job: tuple[Any, ...], first: int) -> None:
-        """Align the tracks from `first` on; each thread writes only to observations of its own tracks."""
+        """Align the tracks from number `first` on; each thread writes only to observations of its own tracks."""
         some = slice(first, first + _POINTS_AT_ONCE)
         _align_all(level, image, ends[first : some.stop + 1], reference[some], *job)
 
@@ -103,9 +104,9 @@ def align_tracks(
 
 
 def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
-    """Return the normal of each point's plane: the sum of the unit vectors from the point to its cameras.
+    """Return the normal of each point's assumed plane: the sum of the unit vectors from the point to its cameras.
 
-    Planes through neighbouring points gave the same result, because the affine part is free.
+    Planes through neighbouring points gave the same result, because the affine part of a warp is free.
     """
     toward = recon_from_camera[tracks.image, :3, 3] - tracks.points_in_recon[tracks.point]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
@@ -121,9 +122,9 @@ def _scales(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> Float[ndarray, " k"]:
-    """Return the image area (px²) per unit area of the point's plane, for each observation.
+    """Return for each observation the image area (px²) of a unit area on the plane of its point, times a factor.
 
-    It is multiplied by the length of the plane's normal, which is the same for all observations of a point.
+    The factor, the length of the plane's normal `facing`, is the same for all observations of a point.
     """
     camera_from_recon = inverse(recon_from_camera)[image]
     x_in_camera = _x_in_b(camera_from_recon, x_in_recon)
@@ -141,11 +142,11 @@ def _warps(
     recon_from_camera: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Float[ndarray, "k 2 2"], Float[ndarray, "k 2 3"]]:
-    """Return affine part A and bend B of each observation's warp, from offsets (u, v) px at the reference's keypoint.
+    """Return affine part A and bend B of the warp of each observation, from the image of its reference observation.
 
-    The offset in the observation's image is A·(u, v) + B·(u², uv, v²), by central differences; B comes from perspective
-    and distortion. Both are 0 where the plane is seen at a grazing angle or from behind; such observations are not
-    aligned.
+    An offset (u, v) px from the reference's keypoint becomes A·(u, v) + B·(u², uv, v²) px in the observation's image.
+    Both come from central differences; B is due to perspective and distortion. Both are 0 where the plane is seen at a
+    grazing angle or from behind; such observations are not aligned.
     """
     recon_from_reference = recon_from_camera[image[of_reference]]
     camera_from_recon = inverse(recon_from_camera)[image]
@@ -176,10 +177,10 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
 @compiled
 @no_type_check
 def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
-    """Align all observations except the references: update `warp` (centres, affine parts, bends) and `variance_px`.
+    """Align all observations except the references: update `warp` (pixels, affine parts, bends) and `variance_px`.
 
-    `ends` are the first observations of the tracks and the end of the last track; `reference` is the reference of each
-    track. The variance (px²) of an observation that could not be aligned stays infinite.
+    `ends` are the first observations of the tracks and the end of the last track; `reference` is the reference
+    observation of each track. The variance (px²) of an observation that could not be aligned stays infinite.
     """
     offsets, window = _window(_RADIUS)
     wide, _ = _window(_RADIUS + 1)
@@ -232,7 +233,10 @@ def _window(radius):
 @compiled
 @no_type_check
 def _patch(grey, x_px, affine, bend, offsets, patch):
-    """Write the greys at the warped offsets to `patch`, and return whether the image contains all of them."""
+    """Write to `patch` the grey at each of the `offsets`, warped about x_px; return whether the image contains all.
+
+    The warp is that of `_warps`, with `affine` (2,2) and `bend` (2,3).
+    """
     for k in range(len(offsets)):
         u = offsets[k, 0]
         v = offsets[k, 1]
@@ -270,10 +274,11 @@ def _smooth(grey, x, y):
 @compiled
 @no_type_check
 def _template(around, offsets, window, template, pull):
-    """Write the reference patch minus its mean to `template`, and the unknowns' change per grey level to `pull` (n,8).
+    """Write the reference patch minus its mean to `template`, and the gain matrix of the unknowns to `pull` (n,8).
 
-    Returns the standard deviation of the patch. Where the texture does not determine the unknowns, `pull` is very large,
-    and the resulting variance rejects the patch.
+    Row k of `pull` is the change of the eight unknowns (shift, gain, offset, affine part) per grey level of difference
+    at pixel k. Returns the standard deviation of the patch. Where the texture does not determine the unknowns, `pull`
+    is very large, and the resulting variance rejects the patch.
     """
     side = 2 * _RADIUS + 3
     mean = 0.0
