@@ -160,7 +160,7 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
 def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
     """Return the band-pass filtered grey levels b of an image, reduced to 640 px, as b / (|b| + c): between -1 and 1.
 
-    c is the median of |b|, but at least USUAL_GREY. The filter suppresses noise and shading; the division keeps a
+    c is the median of |b|, but at least 2 grey levels. The filter suppresses noise and shading; the division keeps a
     printed board in front of the camera from outweighing the scene behind the board.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -35,9 +35,9 @@ def build_scene(
     values: dict[str, Float[ndarray, "n d"]] | None = None,
     device: str = "cpu",
 ) -> SceneMap:
-    """Return the map of a cloud: seen space, and fields of occupancy, colour and label.
+    """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
 
-    `values` are other properties of the n points by name, each (n,d), for which fields are trained, too. Raises
+    `values` are other properties of the cloud's n points by name, (n,d) each, which the networks learn, too. Raises
     InputError if fewer than 100 points lie in the workspace, or a number is not finite.
     """
     options = options or MapOptions()
@@ -77,7 +77,7 @@ def build_scene(
             fields = Fields([occupancy, surface], lattices).to(device)
 
             def fit(field: Field) -> int:
-                """Train a field on the rays, and return the number of steps."""
+                """Train the network `field` on the rays of the cloud, and return the number of training steps."""
                 stage = f"map: {', '.join(field.heads)}"
                 return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
 
@@ -87,7 +87,7 @@ def build_scene(
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
-    """Return three lattices: spacing of four cells everywhere, of one cell near surfaces, of half a cell on surfaces."""
+    """Return three grids of trainable features: nodes 4 map cells apart everywhere, 1 near surfaces, 1/2 on surfaces."""
     hit = (seen.state & HIT) != 0
     nz, ny, nx = ((n // 2 + 3) // 4 for n in hit.shape)
     everywhere = torch.ones(nz, ny, nx, dtype=torch.bool, device=hit.device)
@@ -100,7 +100,7 @@ def feature_lattices(seen: SeenGrid) -> list[Lattice]:
 
 
 def threads_of_one_core(device: torch.device) -> Executor:
-    """Return a pool with one thread per core, each of which computes in torch without other threads; for a GPU, one.
+    """Return a pool with one thread per core (for a GPU, one thread), in which torch starts no further threads.
 
     The threads inside torch wait for each other in a busy loop after every short operation. When another process used
     one core, a training of one second therefore lasted a minute. The limit holds in the threads of this pool only.

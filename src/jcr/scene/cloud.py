@@ -39,10 +39,10 @@ def point_cloud(
     options: CloudOptions | None = None,
     label_names: tuple[str, ...] = ("none",),
 ) -> PointCloud:
-    """Return the confident points of the pointmaps in the base frame, with colour, label, margin and image of each.
+    """Return the confident points of the depth images in the base frame, with colour, label, std (m) and image of each.
 
-    `labels` (m,h,w) are rows of `label_names` at the pixels of the pointmaps, 0 = none. Raises InputError if no point
-    has enough confidence.
+    `labels` (m,h,w) are indices into `label_names`, 0 = none, at the pixels of the m registered images' depth. Raises
+    InputError if no point has enough confidence.
     """
     options = options or CloudOptions()
     dense = reconstruction.dense
@@ -92,10 +92,11 @@ def point_cloud(
 def _clears(
     reason: UInt8[ndarray, " n"], confidence: Float[ndarray, " n"], added: Bool[ndarray, " n"]
 ) -> Bool[ndarray, " n"]:
-    """Test for each point whether the space between camera and point counts as free.
+    """Return True for each point whose ray marks the space between camera and point as free.
 
-    It does not for priors, nor for the LEAST_SURE percent of least confident matches. Matches in images `added` to a run
-    always count, because they show that an object was removed even if earlier images contradict them.
+    `reason` is the origin of a point's depth. False for depth from plane priors, and for the 40 % of matched points
+    with the lowest confidence. Matched points of images `added` to a run later always give True, because these images
+    show that an object was removed.
     """
     alone = (reason == MATCHED) & ~added
     least = np.percentile(confidence[alone], LEAST_SURE) if alone.any() else 0.0
@@ -108,11 +109,11 @@ def position_std(
     image: Integer[ndarray, " n"],
     x_in_recon: Float[ndarray, "n 3"],
 ) -> Float[ndarray, " n"]:
-    """Return the standard deviation (m) of each point along its worst direction, caused by errors of the calibration.
+    """Return the standard deviation (m) of n points in the base frame along their worst direction, from the calibration.
 
-    `recon_from_camera` (m,4,4) and points `x_in_recon` (n,3) are in metres; `image` are rows of `recon_from_camera`.
-    After a bundle adjustment this is the uncertainty of the scene's pose in the base frame. Otherwise it follows from
-    the covariance of gripper_from_camera and scale, for the point's position in the camera of its image.
+    `recon_from_camera` (m,4,4) and points `x_in_recon` (n,3) are scaled to metres; `image` is the index of the image of
+    each point. After a bundle adjustment the covariance of the scene's pose in the base frame is propagated, otherwise
+    that of gripper_from_camera and scale, at the point's position in its camera.
     """
     placed = hand_eye.uncertainty.scene
     if placed is not None:

@@ -44,11 +44,11 @@ class DistanceGrid:
 def distance_grid(
     lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], is_solid: IsSolid, closed: bool
 ) -> DistanceGrid:
-    """Return the signed distances of grid nodes from the boundary of solid space.
+    """Return the signed distances (m) of grid nodes from the boundary of solid space, negative inside.
 
-    The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` on. `closed`: the space outside of the
-    grid is solid, too. For each node next to the boundary the nearest boundary point is computed; every other node takes
-    the point of its nearest such node. Without any boundary, the distance is the diagonal of the grid.
+    The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m) on. `is_solid` tests points (n,3)
+    m. `closed`: space outside of the grid is solid. Nodes next to the boundary have an interpolated boundary point;
+    every other node takes that of the nearest such node. Without any boundary, the distance is the grid's diagonal.
     """
     node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
@@ -79,10 +79,11 @@ def distance_grid(
 def _boundary(
     lower: Float[Tensor, "3"], cell: float, solid: Bool[Tensor, "nz ny nx"], is_solid: IsSolid
 ) -> tuple[Float[ndarray, "3 nz ny nx"], Bool[ndarray, "nz ny nx"]]:
-    """Return offsets (z, y, x in cells) from nodes to their nearest boundary points, and a mask of the nodes next to it.
+    """Return the offsets (z, y, x; in cells) from grid nodes to the nearest boundary point, and a mask of valid nodes.
 
-    The boundary intersects the edges of a node at distances t_a along the axes a. The nearest point of the plane through
-    the intersections is n·d, with n_a = d / t_a and 1/d² = Σ 1/t_a² (Adalsteinsson and Sethian 1999).
+    Valid are nodes with an edge that the boundary of solid space intersects. With t_a the signed distance of the
+    intersection along axis a, the nearest point of the plane through the intersections has the offset
+    (1/t_a) / Σ 1/t_b², summed over the axes b (Adalsteinsson and Sethian 1999).
     """
     inverse = np.zeros((3, *solid.shape), np.float32)
     for axis in range(3):

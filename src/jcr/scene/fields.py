@@ -49,7 +49,7 @@ class Lattice(nn.Module):
         return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
 
     def corners(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
-        """Return the feature rows (n,8) of the eight nodes around each point (n,3) m, and trilinear weights (n,8)."""
+        """Return the 8 nodes around each of n points (m), as rows of the table of features, and trilinear weights."""
         nz, ny, nx = self.shape
         at = (x_in_base - self.lower) * (1.0 / self.cell)
         last = torch.tensor([nx - 2, ny - 2, nz - 2], dtype=torch.int32, device=at.device)
@@ -66,17 +66,20 @@ class Lattice(nn.Module):
 
 
 class Interpolate(torch.autograd.Function):
-    """Differentiable weighted sum of table rows; its gradient is several times faster than that of embedding_bag."""
+    """Differentiable weighted sum of 8 rows of a table per point, with a faster gradient than torch's embedding_bag."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-        """Return weighted sums (features, n) of rows of a table (k, features); `rows` and `weight` are (n,8)."""
+        """Return the sum of 8 weighted rows of `table` (k, features) for each of n points, shape (features, n).
+
+        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights.
+        """
         ctx.save_for_backward(table, rows, weight)
         return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
-        """Return the gradients by table and weights, each only if needed; one feature is scattered at a time."""
+        """Return the gradient by `table`, None for `rows`, and the gradient by `weight`; None if one is not needed."""
         (gradient,) = gradients
         table, rows, weight = ctx.saved_tensors
         of_table = of_weight = None
@@ -97,9 +100,9 @@ def interpolate_grid(
     cell: float,
     x_in_base: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "k n"]:
-    """Return k values (k,n) of a regular grid, interpolated trilinearly at points (n,3) m of its box.
+    """Return k quantities of a regular grid, interpolated trilinearly at n points (m) in its box, shape (k,n).
 
-    `table` holds the values at the nodes, `lower` is the position of the first node, `cell` the spacing (m).
+    `table` has the k quantities at each node; `lower` is the position (m) of the first node, `cell` the spacing (m).
     """
     cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
     at = ((x_in_base - lower) * (2.0 / (cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
@@ -115,7 +118,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.L
 
 
 class Field(nn.Module):
-    """Network that returns properties at positions: logits of occupancy and labels, values of other properties."""
+    """Neural network from a position (m, base frame) to properties: logits of occupancy and label, values of others."""
 
     frequency: Tensor
     center: Tensor
@@ -130,10 +133,11 @@ class Field(nn.Module):
         grids: Sequence[Sequence[int]] = (),
         generator: torch.Generator | None = None,
     ) -> None:
-        """Initialise the layers from `generator`; `heads` maps names of properties to their numbers of outputs.
+        """Initialise the layers from `generator`; `heads` maps the name of each property to its number of outputs.
 
-        `hidden` is the number of hidden units, `box` the workspace (m). The encoding is made of sinusoids of that number
-        of `frequencies`, or of interpolated features; `grids` lists (row of `lattices`, features per node).
+        `hidden` is the number of hidden units, `box` the workspace (m). The input is encoded by sinusoids of so many
+        `frequencies`, or, if this is 0, by features of `lattices` (grids of nodes); each entry of `grids` is the index
+        of a lattice and its number of features per node.
         """
         super().__init__()
         self.about = {"heads": heads, "hidden": hidden, "frequencies": frequencies, "grids": grids}
@@ -161,13 +165,13 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set mean and standard deviation of the plain values to those of the training targets, each (n, outputs)."""
+        """Set offset and scale of the outputs that are no logits to mean and std of their `targets` (n, outputs)."""
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
     def expand(self) -> None:
-        """Store the trained features of every node in a dense grid: queries need more memory and a third of the time."""
+        """Copy the trained features to dense grids; queries then need more memory, and a third of the time."""
         self._dense = [
             table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
             for table, lattice in zip(self.tables, self._lattices, strict=True)
@@ -179,9 +183,10 @@ class Field(nn.Module):
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
-        """Return the encoding (f,n) of points (n,3) m: features of the lattices, or sinusoids.
+        """Return the f inputs of the network's first layer for n points (m): interpolated features, or sinusoids.
 
-        The sinusoids are sin and cos of 2^k·π·x, for positions x scaled to [-1, 1] (Mildenhall 2020, eq. 4).
+        The sinusoids are sin and cos of 2^k·π·x, k = 0, 1, …, for coordinates x scaled to [-1, 1] (Mildenhall 2020,
+        eq. 4).
         """
         if len(self.frequency):
             angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
@@ -206,18 +211,18 @@ class Field(nn.Module):
 
 
 class Fields(nn.Module):
-    """All fields of a map, each with one or several properties, and the lattices that they share."""
+    """All networks of a map, each for one or several properties, and the grids of features that they share."""
 
     of: Iterable[Field]
     """Fields of the map."""
 
     def __init__(self, fields: Sequence[Field], lattices: Sequence[Lattice] = ()) -> None:
-        """Combine fields and the lattices on which they interpolate their features."""
+        """Combine networks and the grids of features (`lattices`) that are their inputs."""
         super().__init__()
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return the outputs (n, outputs) of the fields at points (n,3) m, for each property in `names`."""
+        """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`."""
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):
@@ -230,14 +235,15 @@ CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
 
 
 def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
-    """Call `ask` for pieces of the rows of `columns`, and return its results joined to whole columns.
+    """Return the tensors of `ask(*columns)`, computed for a limited number of rows at a time.
 
-    Gradients are computed if a column requires them. Otherwise the pieces are divided among the cores.
+    `ask` is a function that treats each row alone. Its gradients are kept if a column requires them; otherwise the
+    calls are divided among the cores.
     """
     wanted = any(column.requires_grad for column in columns)
 
     def answer(piece: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """Return the results of `ask` for one piece."""
+        """Return the tensors of `ask` for some rows of all columns."""
         with torch.inference_mode(not wanted):
             return ask(*piece)
 

@@ -47,6 +47,9 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """Raise InputError if one of `PACKAGES` is missing; `what` needs them, and `otherwise` ends the message."""
+    """Raise InputError if one of the `PACKAGES` of the map is not installed.
+
+    In the message, `what` is the part of jcr that needs the package; `otherwise` is the end, such as another remedy.
+    """
     for package in PACKAGES:
         extra(package, "map", what, otherwise)

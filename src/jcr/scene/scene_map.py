@@ -40,7 +40,11 @@ class Sample:
     def __init__(
         self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], *, unknown: str, tensors: bool
     ) -> None:
-        """Take the points of a query; `tensors`: the results are tensors, else arrays."""
+        """Prepare a query of the map `scene` at n points (m, base frame).
+
+        `unknown`: unseen space counts as "occupied" or "free", or is reported ("report"). `tensors`: the results are
+        tensors, else arrays.
+        """
         self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
 
     @property
@@ -123,11 +127,11 @@ class Sample:
         return self._answers(distance_gradient)
 
     def _continuous(self, name: str, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n d"]:
-        """Return the property `name` (n,d) at points (n,3) m; NaN outside of the workspace."""
+        """Return the d values of the property `name`, such as "color", at n points (m); NaN outside of the workspace."""
         return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
-        """Return the results of `ask` at all points, as tensors if the query had tensors, else as arrays."""
+        """Return the results of the function `ask` at the query's points, as tensors or arrays like the query."""
         answers = in_chunks(ask, self._x)
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 
@@ -275,7 +279,7 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
-        """Test which spheres (centres and radii in m) collide, with unknown space "occupied" or "free"."""
+        """Return True for each of n spheres (centre `x`, `radius`; m) that collides; `unknown`: "occupied" or "free"."""
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -291,7 +295,7 @@ class SceneMap:
         return in_chunks(touches, x, radius)[0]
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
-        """Return the grid of signed distances, with unknown space "occupied" or "free"; computed once for each."""
+        """Return the grid of signed distances; unseen space counts as `unknown` says, "occupied" or "free"."""
         with self._lock:
             if unknown not in self._distance:
                 self._distance[unknown] = self._transform(unknown)
@@ -355,7 +359,7 @@ class SceneMap:
 
 
 def digest(tensors: dict[str, Tensor]) -> str:
-    """Return a checksum of names and numbers of all tensors of a map, which detects a damaged file."""
+    """Return a checksum over the names and values of all tensors of a map, by which a damaged file is detected."""
     total = blake2b(digest_size=16)
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
@@ -363,9 +367,9 @@ def digest(tensors: dict[str, Tensor]) -> str:
 
 
 def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
-    """Return the map from the tensors and the metadata `about` of a file of `save`.
+    """Return the map from the tensors and metadata (`about`) of a file that `SceneMap.save` wrote.
 
-    Raises KeyError, ValueError or a similar error for other content.
+    Raises KeyError, ValueError or a similar error if the content is not that of a map.
     """
     seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
     lattices = [
@@ -378,7 +382,10 @@ def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> Scene
 
 
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
-    """Return the result of each body from those of its k spheres: OCCUPIED before UNKNOWN before FREE."""
+    """Combine the results of k spheres into one: OCCUPIED if any is occupied, else UNKNOWN if any is, else FREE.
+
+    If `unknown` is not "report", the results are booleans; the result is then True if any sphere collides.
+    """
     if unknown != "report":
         return np.asarray(states.any(-1))
     rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too

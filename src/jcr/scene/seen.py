@@ -30,7 +30,7 @@ PER_BIN = 2.0
 
 @dataclass(frozen=True)
 class SeenGrid:
-    """State of each cell of the workspace: crossed, hit, both or unseen."""
+    """Grid over the workspace with a state per cell: crossed by a ray, hit (has a surface point), both or unseen."""
 
     lower: Float[Tensor, "3"]
     """Lower corner (m) of the workspace in the base frame."""
@@ -65,11 +65,11 @@ class SeenGrid:
 
 
 def without_doubts(seen: SeenGrid) -> SeenGrid:
-    """Return the grid with doubtful cells reset: crossed cells without a hit next to unseen cells become unseen.
+    """Return the grid in which crossed cells that are not hit, but next to an unseen cell, are unseen.
 
-    A ray shows only its own line, and the rest of such a cell may belong to an object without points there. Hit cells
-    next to a reset cell lose the state CROSSED, because the object may continue there. Without this, 13 times as much
-    space inside of objects is called free.
+    A ray shows only its own line, and the rest of such a cell may be inside an object. Hit cells next to a reset cell
+    lose the state CROSSED, because the object may continue there. Without this step, 13 times as much space inside of
+    objects counts as free.
     """
     hit, state = (seen.state & HIT) != 0, seen.state.clone()
     unsure = dilate(state == 0, 1) & ((state & CROSSED) != 0) & ~hit
@@ -79,7 +79,7 @@ def without_doubts(seen: SeenGrid) -> SeenGrid:
 
 
 def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx"]:
-    """Return the mask grown by `cells` cells in both directions of every axis."""
+    """Return the mask in which cells are set up to `cells` cells from a set cell along each axis (box dilation)."""
     for axis in range(3):
         grown, n = mask.clone(), mask.shape[axis]
         for step in range(1, min(cells, n - 1) + 1):
@@ -103,12 +103,11 @@ def carve(
     measured: Bool[ndarray, " n"],
     device: str = "cpu",
 ) -> SeenGrid:
-    """Return the grid of seen space from the rays between cameras and points; the box has even numbers of cells.
+    """Return the grid of seen space from the rays between m cameras and n points; `box` has an even number of cells.
 
-    `image` are rows of `camera_centers_in_base`. Rays of points that are not `measured` cross no cells, and block
-    neighbouring rays behind their points. Far from surfaces, blocks of two cells a side count as crossed if they are
-    nearer to the camera than the nearest point in their direction. The last RAY_END_M of each ray are followed cell by
-    cell.
+    `image` is the index of each point's camera. Rays of points that are not `measured` cross no cells, and block
+    neighbouring rays behind their points. Blocks of 2 × 2 × 2 cells count as crossed if they are nearer to a camera
+    than the nearest point in their direction. The last 6 cm of each ray are followed cell by cell.
     """
     lower, block = box[0].astype(np.float32), np.float32(2 * cell)
     crossed = np.zeros(np.rint((box[1] - box[0]) / (2 * cell)).astype(int)[::-1], bool)
@@ -133,11 +132,11 @@ def carve(
 def _depth_image(
     points: Float[ndarray, "n 3"], measured: Bool[ndarray, " n"]
 ) -> tuple[Float[ndarray, "r c"], Float[ndarray, "3 3"], tuple[float, float], float]:
-    """Return a depth image (r,c) of a camera: the nearest depth (m) in each bin of a pinhole image, 0 in empty bins.
+    """Return a coarse depth image (r rows, c columns): depth (m) of the nearest point in each pixel, 0 without points.
 
-    `points` are relative to the camera, in base axes; the image looks along the mean direction of the measured ones.
-    Return also the rotation from base axes to the image's axes, and the image's corner and bin size, both as tangents.
-    Points that are not measured reduce the depth of bins, but fill no empty bin.
+    `points` (m) are relative to the camera centre, along the base axes. Return also the rotation from base axes to
+    image axes, whose z is the mean direction of the measured points; the x/z and y/z of the image's corner; and the
+    pixel size (x/z). Points that are not `measured` reduce the depth of a pixel, but fill no empty pixel.
     """
     points, assumed = points[measured], points[~measured]
     axis = (points / np.linalg.norm(points, axis=1, keepdims=True)).mean(0)
@@ -166,10 +165,10 @@ def _depth_image(
 @compiled
 @no_type_check
 def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
-    """Mark in `crossed` (z,y,x) the blocks of side `block` (m) that lie completely before the nearest point there.
+    """Set `crossed` (z,y,x) for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
 
-    `nearest`, `rotation`, `corner` and `pitch` are a depth image (see `_depth_image`); `start` is the centre of the
-    first block in the axes of the image.
+    `nearest`, `rotation`, `corner` and `pitch` are the results of `_depth_image`; `start` is the centre (m) of the first
+    block, relative to the camera, in the axes of the depth image.
     """
     per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
     rows, columns = nearest.shape
@@ -190,10 +189,11 @@ def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
 @compiled
 @no_type_check
 def _follow(state, points, towards, reach, measured, cell):
-    """Mark in `state` the cells that CROSSINGS samples of rays cross near their points, and the cells that points hit.
+    """Set HIT in `state` for cells that contain a point, and CROSSED for cells that rays cross near their points.
 
-    `points` (m) are relative to the grid's lower corner, `towards` are unit vectors to their cameras, `reach` the
-    distances (m) to them. The place half a cell behind a point is hit, too, so that surfaces have a thickness.
+    A cell is crossed if it contains four samples of rays, taken every half `cell` (m). `points` (m) are relative to the
+    grid's lower corner; `towards` and `reach` are unit vector and distance (m) from a point to its camera. The cell half
+    a cell behind a point is hit, too, so that surfaces have a thickness. Rays that are not `measured` cross no cells.
     """
     samples = np.zeros(state.shape, np.uint8)
     nz, ny, nx = state.shape

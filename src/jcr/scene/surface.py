@@ -70,7 +70,7 @@ def sample_surface(
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:
-    """Return the side (m) of squares that close most gaps between points (n,3) m when they are drawn as squares."""
+    """Return the size (m) at which points (n,3) m are drawn so that few gaps remain: 2.2 times their median spacing."""
     if len(points) < 2:
         return 0.01
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # takes a third of the time

@@ -101,10 +101,11 @@ def workspace_rays(
     cell: float,
     device: str,
 ) -> Rays:
-    """Return the rays of the points inside the box, with colours, labels and `values` (see `build_scene`) as targets.
+    """Return the training rays of the points inside `box` (m), with colour, label and `values` of each point as targets.
 
-    The weight of a point is w / (1 + (margin² + depth_std²) / cell²). w is its confidence relative to the median,
-    limited to 0.25 to 4.
+    `values` are other properties of the points by name, (n,d) each. The weight of a point is proportional to
+    w / (1 + (margin² + depth_std²) / cell²), with margin and depth_std its standard deviations (m) from calibration and
+    depth, and w its confidence divided by the median confidence, limited to 0.25 to 4.
     """
     inside = rows_inside(cloud, box)
     x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
@@ -144,11 +145,11 @@ rays, which also have the other properties."""
 
 
 def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samples:
-    """Return samples of occupancy along a batch of rays, so that the field is 0.5 at the surface itself.
+    """Return positions (m) near a batch of rays, their occupancy (1 or 0), and their weights, to train the occupancy.
 
-    Positives are the points, and positions up to BEHIND cells behind them that no ray crossed. Negatives lie between
-    camera and point, half of them near the point, and some anywhere in the workspace. With uniform negatives, as in the
-    paper, the distance of the 0.5 level from the surface would depend on the density of the points.
+    Occupancy 1: the points, and positions up to 2 map cells behind them that no ray crossed. Occupancy 0: positions
+    between camera and point, half of them near the point, and some anywhere in the workspace. The trained occupancy is
+    then 0.5 at the surface itself; with uniform negatives the offset would depend on the density of the points.
     """
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
@@ -183,7 +184,10 @@ def train(
     max_seconds: float,
     report: Callable[[float], None],
 ) -> int:
-    """Fit a field to the rays until the loss on 2 % validation rays no longer falls; return the number of steps."""
+    """Train the network `field` until the loss on 2 % validation rays no longer falls; return the number of steps.
+
+    `max_seconds` limits the time. `report` is called with the fraction of the work that is done.
+    """
     device, start = rays.x.device, time.perf_counter()
     generator = torch.Generator(device).manual_seed(seed)
     field.standardise(rays.targets)
@@ -194,7 +198,7 @@ def train(
     ]
 
     def draw(batch: Rays) -> Samples:
-        """Return the samples of a batch: along its rays for occupancy, else its surface points."""
+        """Return positions, occupancy and weights for a batch of rays; without occupancy, only the surface points."""
         if "occupancy" in field.heads:
             return draw_samples(batch, seen, generator)
         return batch.x, torch.ones_like(batch.weight), batch.weight  # others are known on surfaces only
@@ -228,7 +232,7 @@ def train(
 
 
 def total_loss(field: Field, rays: Rays, samples: Samples) -> Tensor:
-    """Return the sum of the weighted mean losses of a field's properties.
+    """Return the training loss: the sum over the properties of `field` of the weighted mean loss of each.
 
     The loss is binary cross-entropy for occupancy, cross-entropy for labels, and for other properties the squared error
     divided by the variance of the property, so that units do not matter.

@@ -60,12 +60,12 @@ class Measurement:
 
 
 def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:
-    """Measure all labelled objects above the support plane.
+    """Measure all labelled objects above the support plane; `support` is fitted if it is None.
 
     Label 0 and the support plane's own label are not objects. `scale_std` is the relative standard deviation of the
     calibration's scale. Standard deviations come from a jackknife over images (Efron and Stein 1981), because depth
-    errors are correlated within an image. Added are the error of the scale, half a cell for the sides and, for the
-    height, the bend of the table and the spread of the top divided by the root of the number of images. Raises
+    errors are correlated within an image. Added in quadrature are the error of the scale, half a cell for the sides and,
+    for the height, the bend of the table and the spread of the top divided by the root of the number of images. Raises
     InputError if no plane carries the scene.
     """
     support = support or fit_support(cloud)
@@ -118,11 +118,11 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, given_rad: float | None = None
 ) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
-    """Measure one object: height of its top, spread of the top, rotation, centre, side lengths, outline.
+    """Return height of the top, spread of the top, rotation, centre, side lengths and outline of one object.
 
-    Top and spread are in m along the plane's normal. Rotation (rad, about the normal, from the x axis to the longer
-    side) is estimated if `given_rad` is None. Centre, side lengths and the k corners of the convex outline are in m in
-    the plane.
+    `x_in_support` are its n points (m), z normal to the support plane; `roughness` is their noise (m). The spread is
+    the standard deviation (m) of heights at the top. The rotation (rad, about z) is that from the x axis to the longer
+    side; `given_rad` replaces its estimate. Centre, side lengths and the k corners of the outline are in m in the plane.
     """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
@@ -142,16 +142,16 @@ def _shape(
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """Return the k corners of the convex hull; it is computed in single precision, exact enough near the origin."""
+    """Return the k corners of the convex hull of n points (m); they must be near the origin, because float32 is used."""
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
 
 
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
-    """Return the height (m) of an object's top, and the robust standard deviation (m) of the heights of its points.
+    """Return the height (m) of an object's top, and the robust standard deviation (m) of its points' heights at the top.
 
-    The density of points over the height has a peak at a flat top and a step at a round one. The result is the median
-    height around the highest peak that is not scatter. A high quantile would be 2 % and more too large for narrow tops
-    with stray points above them.
+    `height` are the heights of the points, `roughness` their noise (m). The result is the median height around the
+    highest peak in the density of heights that is not scatter. A high quantile would be 2 % and more too large for
+    narrow tops with stray points above them.
     """
     width = max(2 * roughness, SHARPEST)
     step = width / 4
@@ -169,9 +169,9 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 
 
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
-    """Return the points (m) without the sparse fringe around them, and a weight for each: 1 / points in its cell.
+    """Return the k of n points (m) that are not in the sparse fringe around an object, and a weight for each.
 
-    Cells are squares of side CELL seen from above.
+    The weight is 1 / number of points in the same cell, a square of side CELL in the plane.
     """
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     count = np.zeros([rows.max() + 2 for rows in cell])

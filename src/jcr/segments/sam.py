@@ -78,7 +78,10 @@ def sam_labels(
     hand_eye: Calibration,
     progress: Progress | None = None,
 ) -> LabelImages:
-    """Return labels at the pointmaps' pixels: masks of Segment Anything, merged into objects by overlap in space."""
+    """Return label images of the registered images, and label names.
+
+    Labels are masks of Segment Anything, merged into objects by their overlap in space.
+    """
     dense = reconstruction.dense
     images = steps(progress or silent, "segment anything", list(dense.colors))
     masks = [image_masks(model, image) for image in images]
@@ -130,7 +133,7 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
 def merged(
     masks: list[Bool[ndarray, "_ h w"]], x_in_base: Float[ndarray, "m h w 3"], known: Bool[ndarray, "m h w"]
 ) -> LabelImages:
-    """Return labels (m,h,w) of the objects in m images, 1 for the largest, 0 for no object, and the labels' names.
+    """Return label images (m,h,w) from the masks of m images, 1 for the largest object, 0 for none, and label names.
 
     `masks` has the masks of each image, `x_in_base` the position of each pixel (m) and `known` the pixels with a
     position. Two masks of different images show one object if they fill the same cells of space, counted in cells that

@@ -21,7 +21,7 @@ MOST = 1024
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
-    """Read the capture's label images `labels/NAME.png` at the pointmaps' pixels; None if there are none.
+    """Read the capture's label images `labels/NAME.png`, resampled to the depth images; None if there are none.
 
     Label images have 8 or 16 bits and the image's size; 0 is no object. `labels/names.json` may name the labels: {"1":
     "mug", …}. Raises InputError if the label image of a registered image is missing, unreadable, of another size, or
@@ -79,7 +79,7 @@ def image_labels(
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:
-    """Return labels at the pointmaps' pixels from label images or Segment Anything; None for other methods.
+    """Return a label per pixel of the depth images, from label images or Segment Anything; None for other methods.
 
     With "auto" the result is None if the capture has no label images. Raises InputError if requested label images are
     missing or Segment Anything cannot be loaded.
@@ -102,9 +102,10 @@ def image_labels(
 def label_cloud(
     cloud: PointCloud, options: SegmentOptions, support: Support | None = None
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """Label a cloud without labels by its geometry, if the options allow it; return it with notes for the user.
+    """Return the cloud with labels of the objects on its support plane, and notes for the user.
 
-    `support` is fitted if it is None. Raises InputError if the option is "tabletop" and no plane carries the scene.
+    The cloud is unchanged if it has labels or the options exclude this method. `support` is fitted if it is None.
+    Raises InputError if the option is "tabletop" and no plane carries the scene.
     """
     if options.segments not in ("auto", "tabletop") or len(cloud.label_names) > 1:
         return cloud, ()

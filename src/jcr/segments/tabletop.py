@@ -113,14 +113,14 @@ def fit_support(cloud: PointCloud) -> Support:
 
 
 def _noise(distance: Float[ndarray, " n"]) -> float:
-    """Return the robust standard deviation: 1.4826 times the median absolute deviation."""
+    """Return the robust standard deviation of distances: 1.4826 times their median absolute deviation."""
     return float(1.4826 * np.median(np.abs(distance - np.median(distance))))
 
 
 def label_tabletop(
     cloud: PointCloud, options: TabletopOptions | None = None, support: Support | None = None
 ) -> PointCloud:
-    """Label the cloud: 1 for the support plane, 2, 3, … for the objects that stand on it, largest first.
+    """Return the cloud with labels: 1 for the support plane, 2, 3, … for the objects that stand on it, largest first.
 
     Objects are separated as seen from straight above, so objects that touch or lie on one another are one object.
     Raises InputError if no plane carries the scene.
@@ -162,10 +162,11 @@ def _objects(
     bare: Bool[ndarray, " n"],
     options: TabletopOptions,
 ) -> Int[ndarray, " n"]:
-    """Return the object of each point: 1 for the object with most points, 2, 3, … for the others, 0 for none.
+    """Return the number of each point's object: 1 for the object with most points, 2, 3, … for the others, 0 for none.
 
-    `part` is the connected part of each point, seen from above, 0 for none. `bare` marks the points of the plane with
-    nothing above them.
+    `part` is the number of the connected group of points, seen from above, to which each point belongs, 0 for none.
+    `x_in_support` are the points (m), z normal to the plane. `bare` marks points of the plane with nothing above them.
+    Raises InputError if too little of the plane is bare.
     """
     part = _joined(part, x_in_support, options)
     count = np.bincount(part)
@@ -193,10 +194,10 @@ def _objects(
 def _joined(
     part: Int[ndarray, " n"], x_in_support: Float[ndarray, "n 3"], options: TabletopOptions
 ) -> Int[ndarray, " n"]:
-    """Return the part of each point after joining the parts of one object.
+    """Return `part`, the number of each point's connected group (0: none), after joining groups of one object.
 
-    Joined are parts whose outlines overlap, such as the two sides of a ring, and small parts in the air close to a
-    larger one, such as a cup's handle.
+    Groups are joined if their outlines overlap in the plane, such as the two sides of a ring, and if a small one is
+    above the plane and close to a larger one, such as a cup's handle. `x_in_support` are the points (m).
     """
     count = np.bincount(part)
     count[0] = 0

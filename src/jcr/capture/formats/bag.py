@@ -140,7 +140,7 @@ class _Bag:
     def depth_near(self, stamp: int, logged: int) -> UInt16[ndarray, "h w"] | None:
         """Return the depth image (mm) whose time stamp is nearest to `stamp` (ns), that of a colour image.
 
-        None: no depth image is within SAME_MOMENT_NS. `logged` (ns) is the time at which the colour image was recorded.
+        None: no depth image is within 20 ms. `logged` (ns) is the time at which the colour image was recorded.
         """
         span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
         near = [
