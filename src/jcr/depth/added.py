@@ -33,7 +33,7 @@ def extend(
     added: Capture,
     report: Progress,
 ) -> Reconstruction:
-    """Return the reconstruction with the images of `added`, oldest first, posed by their gripper poses.
+    """Return the reconstruction with the images of `added` (oldest first), their depth, and camera poses by the robot.
 
     The added images are the last rows; their `image_index` counts from `capture_size`, the number of images of the
     capture. Pixels of an earlier image that a later image contradicts get confidence 0. Raises InputError for an added
@@ -83,7 +83,7 @@ def extend(
 def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"]) -> Pointmaps:
     """Return the pointmaps `dense` followed by the pointmaps `found` of later images; `colors` are those of all images.
 
-    The confidences of `found` are scaled to the median confidence of `dense`.
+    The confidences of `found` are multiplied so that their median is that of `dense`.
     """
     assert found.reason is not None and found.depth_std is not None
     known, unit = dense.confidence > 0, 1.0
@@ -109,13 +109,13 @@ def _contradicted(
     later: int,
     pinhole: Intrinsics,
 ) -> Bool[ndarray, "h w"]:
-    """Return which pixels of the view `earlier` have a depth that the view `later` contradicts.
+    """Return which pixels of image `earlier` have a depth that image `later` contradicts; `known` marks depths.
 
-    The later view sees a surface behind the earlier view's point, or has points in front of the earlier view's surface.
+    The later image shows a surface behind the earlier point, or has points in front of the earlier surface.
     """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
-        """Return pixels v, u in view `other` of the points of view `row`, and whether each hides the surface there."""
+        """Return pixels v, u in image `other` of the points of image `row`, and whether each hides the surface."""
         other_from_recon = inverse(recon_from_camera[other])
         depth = apply(other_from_recon, points_in_recon[other])[..., 2]
         nearest = np.where(known[other], depth, np.inf).astype(np.float32)
@@ -137,7 +137,7 @@ def _contradicted(
 def _pixels(
     x_in_camera: Float[ndarray, "n 3"], pinhole: Intrinsics
 ) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
-    """Return the nearest pixel u, v of each point, its depth, and whether it lies in the image; else u = v = 0."""
+    """Return each point's nearest pixel u and v, its depth, and whether it lies in the image; outside, u = v = 0."""
     z = x_in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = np.round(project(pinhole, x_in_camera)).T
@@ -148,7 +148,7 @@ def _pixels(
 def _with_projections(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], first: int, pinhole: Intrinsics
 ) -> Tracks:
-    """Return the tracks with further observations: projections of all points into the images from row `first` on."""
+    """Return the tracks with the projections of all points into the images from row `first` on as more observations."""
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row in range(first, len(recon_from_camera)):
         u, v, _, inside = _pixels(apply(inverse(recon_from_camera[row]), tracks.points_in_recon), pinhole)

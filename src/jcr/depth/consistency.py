@@ -23,9 +23,10 @@ error."""
 def inverse_depth_evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
-    """Return the maps that `agreement` compares: inverse depth, 0 where not `known`, negated where not `sees`.
+    """Return inverse depth with a code in its sign: 0 where it is not `known`, negative where `sees` is false.
 
-    A pixel of `sees` may contradict depths of other images. The rows are padded with zeros to a multiple of LANES.
+    Such maps are the input of `agreement`. A pixel of `sees` may contradict depths of other images. The rows are padded
+    with zeros to a multiple of LANES.
     """
     maps = np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0).astype(np.float32, copy=False)
     return np.pad(maps, [(0, 0), (0, 0), (0, -maps.shape[2] % LANES)])
@@ -34,13 +35,14 @@ def inverse_depth_evidence(
 @compiled
 @no_type_check
 def agreement(i, compared, others, a, b, centre, k, width, tolerance):
-    """Compare the depths of image i with those of the images `others`; return four maps (4,h,w).
+    """Compare the depth of each pixel of image i with the depths of the images `others`; return four maps (4,h,w).
 
     The maps are the mean inverse depth over image i and the images that agree, the number of images that agree, the
     number of images that see through the point, and Σ |∂x/∂(inverse depth)|² (px²) over the pixels x in the images that
-    agree. `compared` comes from `inverse_depth_evidence`, and `width` is the images' width before padding. `a` (n,3,3)
-    is K R and `b` (n,3) is K t of each other image from image i; `centre` (n) is the z coordinate of its camera in
-    image i; `k` is fx, fy, cx, cy; `tolerance` is the largest relative difference of depths that agree.
+    agree. `compared` comes from `inverse_depth_evidence`, and `width` is the images' width before padding. With the
+    rotation R and translation t from image i to another image and intrinsics K, `a` (n,3,3) is K R and `b` (n,3) is K
+    t; `centre` (n) is the z coordinate of the other camera in image i; `k` is fx, fy, cx, cy; `tolerance` is the
+    largest relative difference of depths that agree.
     """
     _, h, w = compared.shape
     one, tolerance = np.float32(1), np.float32(tolerance)
@@ -58,12 +60,12 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 @compiled
 @no_type_check
 def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tolerance):
-    """Count for each point of image i the other images with its colour, with another colour, and with sight through it.
+    """Count for each pixel of image i the images that show its point in the same colour, in another, or see through it.
 
-    The three counts are (3,h,w). `asked` (h,w) is the inverse depth of the points, 0 for no point. `inverse_depth`
+    The three counts are (3,h,w). `asked` (h,w) is the inverse depth to test at each pixel, 0 for none. `inverse_depth`
     (m,h,w) is the matched inverse depth of all images, 0 for none, and `colors` (m,h,w,3) are their colours. An image
-    with a nearer matched depth at a point does not see the point and is not counted. `others`, `a`, `b`, `centre` and
-    `k` are as in `agreement`.
+    with a nearer matched depth at a point does not see the point and is not counted. `tolerance` is the least
+    difference of colours that are not the same. `others`, `a`, `b`, `centre` and `k` are as in `agreement`.
     """
     h, w = asked.shape
     half, most = np.float32(0.5), np.float32(tolerance * tolerance)
@@ -96,10 +98,10 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
 @inlined
 @no_type_check
 def _row(v, n, a, b, k, width, height):
-    """Return the factors that project row v of an image into the n-th other image.
+    """Return the factors that project row v of an image into the n-th other image; `a`, `b`, `k` are as in `agreement`.
 
-    Each homogeneous coordinate x, y, z there is (first factor)·(x of the ray) + (second) + (third)·(inverse depth). The
-    last element is the largest x and y in the image, cx and 1/fx.
+    The first three elements give the homogeneous coordinates x, y, z: (first factor)·(x of the ray) + (second) +
+    (third)·(inverse depth). The last element is the largest x and y in the image, cx and 1/fx.
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]
@@ -109,7 +111,7 @@ def _row(v, n, a, b, k, width, height):
 
 
 def _numbers(builder: Any, row: Any) -> list[Any]:
-    """Return each number of a tuple, repeated in all lanes."""
+    """Return a vector for each number of the tuple `row`; the vector has this number in all lanes."""
     return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
 
 
@@ -131,9 +133,10 @@ def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
 
 
 def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Interpolate a map of `inverse_depth_evidence` at x, y; return inverse depth and whether the nearest pixel `sees`.
+    """Interpolate inverse depth at x, y in a map of `inverse_depth_evidence`; return it, and whether the image sees it.
 
-    Where one of the four pixels around is unknown, the inverse depth is that of the nearest pixel.
+    Seeing is the sign of the nearest pixel. Where one of the four pixels around is unknown, the inverse depth is that
+    of the nearest pixel. `width` is the padded width of the map.
     """
     left, top = x.as_ints(), y.as_ints()
     first = top * width + left
@@ -150,7 +153,10 @@ def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
 @intrinsic
 @no_type_check
 def _compare_depths(typing, sums, compared, place, rays, rest):
-    """Add to the maps of `agreement` the comparison of 16 pixels of image i with image j; `place` is (i, j, v, u)."""
+    """Add to `sums`, the maps of `agreement`, the comparison of 16 pixels of image i with image j.
+
+    `place` is (i, j, v, u), with u the first column; `rays` comes from `_row`; `rest` is (centre, tolerance).
+    """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         out, maps = (context.make_array(signature.args[n])(context, builder, given[n]) for n in range(2))

@@ -101,7 +101,7 @@ def choose_neighbours(
 
 
 def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
-    """Return for each image the nearest and farthest plane of its depth search, as vectors p with p·x_in_camera = 1.
+    """Return for each image the farthest and nearest plane of its depth search, as vectors p with p·x_in_camera = 1.
 
     The inverse depth of a pixel on plane p is p·(x/z, y/z, 1). Both planes have the slope of the plane fitted to the
     image's points, mostly the table (least absolute deviations of inverse depth). Percentiles 1 to 99 of the points lie
@@ -135,11 +135,12 @@ def dense_pointmaps(
     priors: bool = True,
     before: Pointmaps | None = None,
 ) -> Pointmaps:
-    """Estimate pointmaps in the recon frame of undistorted images, with confidence, reason and standard deviation.
+    """Estimate pointmaps of undistorted images in the recon frame, with confidence, origin of the depth, and its error.
 
     The confidence is the correlation times the number of images that agree, 0 for no estimate. `neighbours` and
-    `planes` come from `choose_neighbours` and `sweep_planes`. `before` are known pointmaps of the first images, taken
-    at an earlier time: only later images are matched, images may show a changed scene, and `priors` is ignored.
+    `planes` come from `choose_neighbours` and `sweep_planes`. With `priors`, fitted planes give depth where no match is
+    found. `before` are pointmaps of the first images, from an earlier time: only later images are matched, the scene
+    may have changed, and `priors` is ignored.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth
@@ -201,7 +202,7 @@ def pointmaps_of(
 
 
 def compile_loops() -> None:
-    """Compile or load every loop of dense depth by a run on a small random texture before three cameras."""
+    """Compile every numba loop of dense depth, or load it from the cache, by a run on three small random images."""
     pinhole = Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60)
     wall = np.random.default_rng(0).integers(0, 256, (30, 60, 3)).repeat(2, 0).repeat(2, 1).astype(np.uint8)
     images = np.stack([wall[:, 10 * k : 10 * k + pinhole.width] for k in range(3)])

@@ -110,7 +110,11 @@ def _checked(
     sees: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
-    """Return the maps of `agreement` of all images, (m,h,w) each; inverse depths that are not `known` are unchanged."""
+    """Return for all images the four maps (m,h,w) of `agreement`, by relative differences of depth below `tolerance`.
+
+    `depth` is inverse depth; it is returned unchanged where it is not `known`. Pixels of `sees` may contradict other
+    images.
+    """
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
     found = pool.map(
         lambda i: agreement(i, compared, *views[i], k, pinhole.width, tolerance), range(len(views))
@@ -128,7 +132,7 @@ def _priors(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> list[ndarray]:
-    """Return the maps of `planar_prior` of all images, (m,h,w) each."""
+    """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks."""
     support = _support(inverse_depth, matched, recon_from_camera, pinhole)
     even = evened(colors, inverse_depth, matched, views, pinhole)
     smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
@@ -148,9 +152,10 @@ def _chosen(
     reasons: list[int],
     stds: list[Float[ndarray, "m h w"]],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return the inverse depth, and confidence, reason and standard deviation per pixel.
+    """Return the given inverse depth, and for each pixel the confidence, reason and standard deviation that apply.
 
-    These three belong to the first mask of `which` that is true at the pixel; without any they are 0, NO_DEPTH and 0.
+    They come from the lists' element at the first mask of `which` that is true at the pixel; without any they are 0,
+    NO_DEPTH and 0.
     """
     return (
         inverse_depth,

@@ -10,7 +10,7 @@ FLOAT, INT, LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
 
 class Lanes:
-    """Vector register with one number or condition per lane, as the result of an LLVM instruction of `builder`."""
+    """Vector of numbers or conditions (one per lane) in a register, as the LLVM value that `builder` has emitted."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         """Wrap `value`, an LLVM value of a vector type."""
@@ -34,7 +34,7 @@ class Lanes:
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any, used: int) -> "Lanes":
-        """Load 64 bits from memory for the first `used` lanes, each at its index after `start`; other lanes are 0."""
+        """Load 64 bits for each of the first `used` lanes, at `start` plus the lane's index; other lanes are 0."""
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
         for lane in range(used):
             place = b.zext(b.extract_element(self.value, INT(lane)), LONG)

@@ -38,7 +38,10 @@ b = K t, and the z coordinate of each neighbour's camera centre in the image's c
 def relative(
     i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
 ) -> Relative:
-    """Return the projection of pixels of image i into the images `others`, all on the pixel grid of `pinhole`."""
+    """Return the projection of pixels of image i into the images `others`, as the tuple `Relative`.
+
+    All images are on the pixel grid of `pinhole`.
+    """
     motion = inverse(recon_from_camera[others]) @ recon_from_camera[i]
     a, b = pinhole.matrix @ motion[:, :3, :3], motion[:, :3, 3] @ pinhole.matrix.T
     a, b, centre = (np.ascontiguousarray(part, np.float32) for part in (a, b, inverse(motion)[:, 2, 3]))
@@ -66,9 +69,10 @@ class _Level:
         recon_from_camera: Float[ndarray, "m 4 4"],
         space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """Return `packed`, `motions`, `windows` and k of image i, the arguments that the loops of patch_match.py share.
+        """Return the greys of the images `others`, the projections into them, windows of image i, and fx, fy, cx, cy.
 
-        The windows are written to the buffer `space`.
+        They are the arguments `packed`, `motions`, `windows` and `k` of patch_match.py. The windows are written to the
+        buffer `space`.
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
@@ -76,7 +80,7 @@ class _Level:
         return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
-        """Return a map of half the resolution at this resolution, each number repeated in the pixels that it covers."""
+        """Return a map of half the resolution at this resolution; each pixel is repeated where it lies."""
         h, w = self.pinhole.height, self.pinhole.width
         row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
         column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)
@@ -95,8 +99,9 @@ def match_depth(
 ) -> tuple[Float[ndarray, "k h w"], Float[ndarray, "k h w"]]:
     """Match the images `rows` with their neighbours; return inverse depth (per recon unit) and correlation (-1 to 1).
 
-    The search lies between the two `planes` of `densify.sweep_planes`, and half of the initial planes are parallel to
-    them. The result does not depend on the number of threads.
+    `neighbours` and `planes` are those of all images, from `densify.choose_neighbours` and `densify.sweep_planes`. The
+    search lies between the two planes; half of the initial planes lie between them, too. The result does not depend on
+    the number of threads.
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)

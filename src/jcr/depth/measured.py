@@ -26,12 +26,12 @@ REACH_M = (0.1, 6.0)
 def with_measured_depth(
     capture: Capture, reconstruction: Reconstruction, check: DepthCheck | None, scale: float
 ) -> tuple[Reconstruction, tuple[str, ...]]:
-    """Return the reconstruction with the depth images in its pointmaps, and notes for the user.
+    """Return the reconstruction with the measured depth images merged into its pointmaps, and notes for the user.
 
-    `check` is the comparison of the depth images with the robot's motions, None if there is none to rely on; `scale` is
-    in metres per recon unit. The depth is divided by the scale error of `check`. Measured and matched depth are
-    averaged where they agree; where they differ the matched depth stays. Measured depth replaces the depth of fitted
-    planes.
+    `check` compares the depth images with the robot's motions; it is None if no comparison is reliable, and then they
+    are not used. `scale` is in metres per recon unit. The depth is divided by the scale error of `check`. Measured and
+    matched depth are averaged where they agree; where they differ the matched depth stays. Measured depth replaces the
+    depth of fitted planes.
     """
     if capture.depths is None:
         return reconstruction, ()
@@ -82,7 +82,10 @@ def with_measured_depth(
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
-    """Return the depth (m) at pixels `at` (u, v), and where it is valid: away from edges, and in the range REACH_M."""
+    """Return the depth (m) of a depth image at the pixels `at` (u, v), and where it is valid.
+
+    It is valid away from edges and within the range REACH_M.
+    """
     height, width = depth.shape
     u, v = at[..., 0], at[..., 1]
     inside = (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)

@@ -43,11 +43,11 @@ def _ray(v, u, k):
 @inlined
 @no_type_check
 def _look(v, u, asked, packed, motions, k, near, starts):
-    """Write `near` and `starts` for 16 pixels of row v, from column u on.
+    """Write the projections of 16 pixels of row v, from column u on, into their neighbours to `near` and `starts`.
 
-    `near` holds the projection into each neighbour image (rotation R, translation t from this image, intrinsics K): K R
-    times the change of a ray by one patch sample in u and in v, K R times the ray, and K t. `starts` are the indices at
-    which the neighbour images begin in `packed`.
+    `asked` are the indices of each pixel's neighbour images. A neighbour has intrinsics K, rotation R and translation t
+    from this image. `near` holds K R times the change of a ray by one patch sample in u and in v, K R times the ray,
+    and K t. `starts` are the indices at which the neighbour images begin in `packed`.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     size = packed.shape[1] * packed.shape[2]
@@ -67,7 +67,11 @@ def _look(v, u, asked, packed, motions, k, near, starts):
 @inlined
 @no_type_check
 def _score(v, u, tried, packed, windows, k, near, starts, each):
-    """Write to row 6 of `tried` the scores of its planes: the mean of the BEST highest correlations with neighbours."""
+    """Write to row 6 of `tried` the scores of 16 planes: the mean of the BEST highest correlations with neighbours.
+
+    Rows 0 to 2 of `tried` are the planes of the pixels of row v from column u on. The correlations are written to
+    `each`; the other arrays are described in the module's docstring.
+    """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
@@ -87,7 +91,11 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
 @inlined
 @no_type_check
 def _keep_better(found, v, u, k, tried):
-    """Replace planes of `found` by those of `tried` that score higher, face the camera and are not too slanted."""
+    """Replace the planes of 16 pixels in `found` by those in `tried` with a higher score that face the camera.
+
+    Planes that are too slanted are not used. Rows of both arrays: the first three are the plane; the score is row 3 of
+    `found` and row 6 of `tried`.
+    """
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
         p0, p1, p2, here = tried[0, lane], tried[1, lane], tried[2, lane], tried[5, lane]
@@ -101,7 +109,11 @@ def _keep_better(found, v, u, k, tried):
 @inlined
 @no_type_check
 def _try_passed(found, row, u, side, tried):
-    """Write to `tried` the planes of a row in the same columns (`side` 0), or the best to one side (-1 or 1)."""
+    """Write to `tried` for 16 pixels from column u on the planes that `found` has in row `row`.
+
+    They are those of the same columns (`side` 0), or the planes of highest score within _BESIDE columns to the left
+    (-1) or right (1).
+    """
     last = found.shape[2] - 1
     for lane in range(LANES):
         best = min(max(u + lane + side, 0), last)
@@ -116,7 +128,11 @@ def _try_passed(found, row, u, side, tried):
 @inlined
 @no_type_check
 def _try_changed(found, v, u, k, search, halvings, state, tried):
-    """Write to `tried` random variations of the pixels' planes, at half of the size in `search` after each halving."""
+    """Write to `tried` random changes of the planes of 16 pixels of row v, from column u on.
+
+    `search` begins with the lowest and highest inverse depth and the largest relative change, which is halved
+    `halvings` times. `state` is that of the random numbers.
+    """
     lowest, highest, size = search[:3]
     scale = size * 0.5**halvings
     for lane in range(LANES):
@@ -134,9 +150,10 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
 @compiled
 @no_type_check
 def random_planes(family, span, k, h, w, seed):
-    """Return `found` with a random plane per pixel: half between the planes of `family`, half with random normals.
+    """Return a random plane without a score for each pixel, (4,h,w): half of them lie between the two of `family`.
 
-    The inverse depth of planes with a random normal lies in `span` (lowest, highest).
+    The other planes have random normals and an inverse depth in `span` (lowest, highest). Planes are vectors p with p·x
+    = 1; k is fx, fy, cx, cy.
     """
     state = random_state(seed)
     lowest, highest = span
@@ -163,11 +180,11 @@ def random_planes(family, span, k, h, w, seed):
 @compiled
 @no_type_check
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
-    """Update the plane of every pixel once by planes of the row before or random changes, wherever these score higher.
+    """Update the planes of all pixels in `found` once by planes of the row before or random changes that score higher.
 
-    The module's docstring describes the arrays. Passes go down for even and up for odd seeds (Bleyer et al. 2011,
-    section 3.2). `search` is (lowest inverse depth, highest one, relative change to try, number of tries, whether the
-    planes have no score yet). The change of inverse depth and normal halves from try to try.
+    The module's docstring describes the arrays. Rows are visited downwards for even and upwards for odd seeds (Bleyer
+    et al. 2011, section 3.2). `search` is (lowest inverse depth, highest one, relative change to try, number of tries,
+    whether the planes have no score yet). The change of inverse depth and normal halves from try to try.
     """
     state = random_state(seed)
     slots, h, w = asked.shape
@@ -195,9 +212,9 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
 @compiled
 @no_type_check
 def best_neighbours(found, asked, packed, motions, windows, k, count):
-    """Return the `count` neighbours (count,h,w) with which each pixel's plane correlates best, the best first.
+    """Return for each pixel the indices (count,h,w) of the neighbours with which its plane correlates best, best first.
 
-    The arguments are described in the module's docstring.
+    `found` are the planes, and `asked` the neighbours to compare. The module's docstring describes the arguments.
     """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
@@ -222,9 +239,10 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
 @compiled
 @no_type_check
 def peaks(found, asked, packed, motions, windows, k, step):
-    """Return the inverse depth (h,w) at the peak of the parabola through three scores of each pixel.
+    """Return the inverse depth (h,w) of best score for each pixel, at the peak of a parabola through three scores.
 
-    The scores are those of the pixel's plane with inverse depth times 1 - step, 1 and 1 + step.
+    The scores are those of the pixel's plane with inverse depth times 1 - step, 1 and 1 + step. The module's docstring
+    describes the other arguments.
     """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)

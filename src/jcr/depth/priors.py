@@ -75,10 +75,11 @@ def evened(
     views: Sequence[Relative],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "m h w 3"]:
-    """Return colours (0 to 1) corrected for exposure and vignetting, which are estimated from matched points.
+    """Return colours (0 to 1) corrected for exposure and vignetting, which are estimated from `matched` pixels.
 
     The log brightness of one point differs between images 1 and 2 by the difference of their exposures plus a·(r₁² -
-    r₂²), where r is the tangent of the angle off the optical axis. The fit uses least absolute deviations.
+    r₂²), where r is the tangent of the angle off the optical axis and a is common to all images. The fit uses least
+    absolute deviations. `views` are the projections of each image into its neighbours.
     """
     color = colors.astype(np.float32) / 255
     m, h, w = matched.shape
@@ -131,13 +132,14 @@ def planar_prior(
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
 ) -> tuple[ndarray, ...]:
-    """Return six maps (h,w) of the planes of image i's regions; `support` is a plane (normal, d) in the recon frame.
+    """Fit a plane to the matched depth of each colour region of image i; return six maps (h,w) of these planes.
 
-    `surfaces` are the matched inverse depths of all images (0: none) and their colours, corrected and slightly
-    smoothed. The maps are: inverse depth of the plane; whether it holds, because colours agree and no image sees
-    through it; whether it confirms a match of the pixel, because it holds or the only other image there agrees; number
-    of images that must agree with it (1 on the support plane); matched pixels that a well-supported plane shows to be
-    wrong; relative standard deviation of the inverse depth.
+    The maps are: inverse depth of the plane; whether it holds, because colours agree and no image sees through it;
+    whether it confirms a match of the pixel, because it holds or the only other image there agrees; number of images
+    that must agree with it (1 on the support plane); matched pixels that a well-supported plane shows to be wrong;
+    relative standard deviation of the inverse depth. `surfaces` are the matched inverse depths of all images (0: none)
+    and their colours, corrected and slightly smoothed. `support` is the scene's main plane (normal, d) in the recon
+    frame.
     """
     k, (depths, colors) = grid(pinhole), surfaces
     label, count = colour_regions(colors[i])
@@ -173,7 +175,7 @@ def planar_prior(
 
 
 def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Return which regions touch one of the `chosen` regions."""
+    """Return for each of r regions whether it touches one of the `chosen` regions; `label` is each pixel's region."""
     beside = np.zeros(len(chosen), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
         beside[one[chosen[other]]] = True

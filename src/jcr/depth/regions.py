@@ -25,9 +25,10 @@ region. Pixels along one edge do not determine the slope across it, and may belo
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:
-    """Return the label of each pixel's region and the number of regions (Felzenszwalb and Huttenlocher, IJCV 2004).
+    """Return for each pixel the number of its region of one colour, and the number of regions.
 
-    The image is smoothed first, with its edges kept; otherwise noise and JPEG blocks would join regions.
+    The method is that of Felzenszwalb and Huttenlocher, IJCV 2004. The image is smoothed first, with its edges kept;
+    otherwise noise and JPEG blocks would join regions.
     """
     smooth = cv2.bilateralFilter(color, 7, 0.07, 3)
     weight = np.concatenate([np.abs(np.diff(smooth, axis=axis)).max(-1).ravel() for axis in (1, 0)])
@@ -86,12 +87,13 @@ def region_planes(
     tolerance: float,
     seed: int,
 ) -> tuple[ndarray, ...]:
-    """Fit a plane p, p·ray = inverse depth, to the matched pixels of each region (RANSAC, then least squares).
+    """Fit to the matched pixels of each region a plane p with p·ray = inverse depth (RANSAC, then least squares).
 
-    Returns per region: plane (count,3), whether it is the support plane, numbers of inliers and of matched pixels, root
-    mean square of the inliers' relative residuals, and mean (count,2) and inverse covariance (count,2,2) of the
-    inliers' pixels. A region without a plane has 0 inliers. `support` is the scene's support plane in the camera frame,
-    preferred where it has nearly as many inliers as the best plane. `tolerance` is relative to the inverse depth.
+    Returns per region: plane (count,3), whether it is the plane `support`, numbers of inliers and of matched pixels,
+    root mean square of the inliers' relative residuals, and mean (count,2) and inverse covariance (count,2,2) of the
+    inliers' pixels. A region without a plane has 0 inliers. `label` is each pixel's region. `support` is the scene's
+    main plane in the camera frame, preferred where it has nearly as many inliers as the best plane. `tolerance` is
+    relative to the inverse depth.
     """
     pixel = np.stack(np.nonzero(label >= 0)[::-1], -1).astype(float)
     fixed = np.bincount(label[matched], minlength=count)
@@ -134,9 +136,10 @@ def _drawn_planes(
     tolerance: float,
     seed: int,
 ) -> tuple[Float[ndarray, "n 3"], Bool[ndarray, " n"]]:
-    """Return for each region the plane with most inliers among random ones and `support`, and whether it is `support`.
+    """Return for each of n regions the plane with most inliers, from random planes and `support`; true if `support`.
 
-    `of_region` are the index of the first pixel and the number of pixels of each region; `depth` is inverse depth.
+    The k pixels are sorted by region; `of_region` are the index of the first pixel and the number of pixels of each
+    region. `depth` is inverse depth, and `tolerance` relative to it.
     """
     start, size = of_region
     share = np.random.default_rng(seed).random((len(start), TRIALS, 3))
@@ -161,7 +164,7 @@ def _drawn_planes(
 def _moments(
     label: Int[ndarray, " n"], pixel: Float[ndarray, "n 2"], count: int
 ) -> tuple[Int[ndarray, " r"], Float[ndarray, "r 2"], Float[ndarray, "r 2 2"]]:
-    """Return number, mean (px) and covariance (px²) of the pixels of each label."""
+    """Return number, mean (px) and covariance (px²) of the pixels of each label from 0 to `count` - 1."""
     number = np.bincount(label, minlength=count)
 
     def mean(values: Float[ndarray, " n"]) -> Float[ndarray, " r"]:

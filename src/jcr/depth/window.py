@@ -35,7 +35,7 @@ COLOR_SIGMA = 25.5
 
 
 def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
-    """Pack four greys into the 64 bits of each pixel, from the lowest: itself, right, below, below right.
+    """Return for each pixel four greys in 64 bits, from the lowest: its own, right, below, below right.
 
     A bilinear interpolation then reads memory once.
     """
@@ -47,13 +47,13 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 @compiled
 @no_type_check
 def windows(image, space):
-    """Return weight and weighted grey of each tap of each pixel's window, (h, blocks of 16 pixels, taps, 2, 16).
+    """Return weight and weighted grey of each tap (sampled pixel) of each pixel's window.
 
-    `image` (4,h,w) comes from `continued`. The weights of a window have the sum 1; a tap's weight grows with the
-    similarity of its colour to the central one (Schönberger et al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for
-    exp(-x)). The weighted grey is weight · (grey - mean) / standard deviation, both over the window, the latter with
-    noise. The result is written to the beginning of the buffer `space` of `floats_of_windows` floats, which is reused
-    for every image.
+    The shape is (rows, blocks of 16 pixels, taps, 2, 16). `image` (4,h,w) comes from `continued`. The weights of a
+    window have the sum 1; a tap's weight grows with the similarity of its colour to the central one (Schönberger et
+    al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for exp(-x)). The weighted grey is weight · (grey - mean) / standard
+    deviation, both over the window, the latter with noise. The result is written to the beginning of the buffer `space`
+    of `floats_of_windows` floats, which is reused for every image.
     """
     h, blocks = image.shape[1] - 2 * MARGIN, (image.shape[2] - 2 * MARGIN) // LANES
     rows = space[: h * blocks * TAPS * 2 * LANES].reshape((h, blocks, TAPS, 2, LANES))
@@ -74,7 +74,10 @@ def floats_of_windows(h: int, w: int) -> int:
 
 
 def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> Float[ndarray, "4 _ _"]:
-    """Return colours and grey of an image as `windows` needs them, padded by the window's reach and to whole blocks."""
+    """Return the three colours and grey of an image, padded by half a window on all sides and to a multiple of LANES.
+
+    This is the input of `windows`.
+    """
     around = ((MARGIN, MARGIN), (MARGIN, MARGIN + -grey.shape[1] % LANES))
     channels = [*np.moveaxis(color, -1, 0), grey]
     return np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
@@ -83,7 +86,7 @@ def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> F
 @intrinsic
 @no_type_check
 def _write_windows(typing, rows, image, v, block):
-    """Write the numbers of `windows` for 16 pixels of row v."""
+    """Write to `rows`, the result of `windows`, the weights and weighted greys of the 16 pixels of a block of row v."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         out, channels = (context.make_array(signature.args[k])(context, builder, given[k]) for k in range(2))
@@ -121,12 +124,12 @@ def _write_windows(typing, rows, image, v, block):
 @intrinsic
 @no_type_check
 def correlate(typing, out, slot, packed, starts, motions, windows, place, tried):
-    """Write to out[slot] the correlations of the windows of 16 pixels with one other image each; -1 outside of it.
+    """Write to out[slot] the correlation of each of 16 pixels' windows with another image; -1 where it lies outside.
 
     `place` (v, block) is the position of the pixels in `windows`. starts[slot] (16) are the indices at which the other
     images begin in `packed` (n,y,x; made by `quads`, padded by `PAD`). Rows 3 to 5 of `tried` (7,16) are the changes of
-    inverse depth from tap to tap in a row and in a column, and the inverse depth. motions[slot] (12,16) are their
-    factors (`near` of patch_match.py).
+    inverse depth from one sampled pixel of the window to the next, in a row and in a column, and the inverse depth.
+    motions[slot] (12,16) are the projections into the other images (`near` of patch_match.py).
     """
     sums = signature(types.void, out, types.int64, packed, starts, motions, windows, place, tried)
 
@@ -156,9 +159,10 @@ def correlate(typing, out, slot, packed, starts, motions, windows, place, tried)
 
 
 def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) -> tuple[list[Lanes], Lanes]:
-    """Return six vectors that place the windows in the padded other images, and whether they lie there.
+    """Return six vectors that place the windows of 16 pixels in the padded other images, and whether they lie there.
 
-    The vectors are the centre x, y and the steps from tap to tap: x, y along a row, x, y down a column. The homography
+    The vectors are the centre x, y and the steps between sampled pixels: x, y along a row, x, y down a column. `motion`
+    is the projection, `plane` the change of inverse depth in a row, in a column, and the inverse depth. The homography
     of a window is approximated as affine about its centre, which saves divisions.
     """
     (x0, y0, z0, x1, y1, z1, x, y, z, tx, ty, tz), (du, dv, here) = motion, plane
@@ -178,9 +182,10 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 
 
 def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
-    """Return Σ c·g / std(g) per lane: g are the interpolated greys at the taps, and c the weighted greys of `windows`.
+    """Return Σ c·g / std(g) per lane: g are the greys at a window's sampled pixels in `image`, c those of this image.
 
-    The standard deviation std(g) includes the pixel noise.
+    The greys g are interpolated at the places `window`; `weights` has weights and weighted greys c from `windows`. The
+    standard deviation std(g) includes the pixel noise.
     """
     x, y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]
