@@ -46,7 +46,7 @@ if not find_spec("torch"):
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name, or read the version of the installed distribution."""
+    """Import and return the public name `name`, or return the version of the distribution for "__version__"."""
     if name == "__version__":
         from importlib.metadata import version
 

@@ -35,14 +35,17 @@ def inlined(function: Callable[..., Any]) -> Any:
 @compiled
 @no_type_check
 def random_state(seed):
-    """Return the initial state of `uniform` for a seed; it does not depend on thread or version."""
+    """Return the initial state of the generator `uniform` for an integer seed, an array of one uint64.
+
+    The state does not depend on the thread or on the version of NumPy.
+    """
     return np.array([np.uint64(88172645463325252) ^ (np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15))])
 
 
 @inlined
 @no_type_check
 def uniform(state):
-    """Return a random number between 0 and 1 and update `state` (Marsaglia, "Xorshift RNGs", 2003)."""
+    """Return a random number in [0, 1) and update the array `state` (Marsaglia, "Xorshift RNGs", 2003)."""
     x = state[0]
     x ^= x << np.uint64(13)
     x ^= x >> np.uint64(7)

@@ -12,7 +12,7 @@ LONGEST_SHOWN = 80
 
 
 def printable(text: str) -> str:
-    """Return the text with unprintable characters escaped, such as control characters in file names."""
+    """Return the text with unprintable characters, except line ends, replaced by Python's escape sequences."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
@@ -23,13 +23,13 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as text for a message, cut after LONGEST_SHOWN characters."""
+    """Return the repr of a value for a message, cut after LONGEST_SHOWN characters."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
 
 
 def first_fault(error: "ValidationError") -> str:
-    """Return the first fault of a validation as "place: fault", where the place is the path of keys."""
+    """Return the first fault of a validation as "place: fault"; the place is a path of keys such as frames.0.pose."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
     what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")

@@ -13,7 +13,8 @@ DISTRIBUTION = "jcr-handeye"
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
     """Import and return an optional module that the feature `what` needs.
 
-    Raises InputError if that fails; its message names the extra `name` to install, followed by the text `otherwise`.
+    Raises InputError if the import fails; the message contains the pip command for the extra `name` (as in
+    jcr-handeye[name]), followed by the text `otherwise`.
     """
     try:
         return import_module(module)
@@ -24,7 +25,7 @@ def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
 
 
 def install(name: str) -> str:
-    """Return the pip command that installs an extra of this distribution."""
+    """Return the pip command that installs this distribution with the extra `name`."""
     return f"pip install '{DISTRIBUTION}[{name}]'"
 
 

@@ -18,7 +18,7 @@ COPIES = "capture", "added"
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `path`; on success it replaces `path`, on failure it is deleted."""
+    """Yield a temporary path to write to; on success this file replaces `path`, on an exception it is deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.part{path.suffix}"
     # With mode 0o666 the umask decides on the permissions, as for any other file of the user.
@@ -56,9 +56,10 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Create and lock a folder for this process, as a context; raise InputError if another process has locked it.
+    """Create a folder and lock it for this process within a `with` block.
 
-    Temporary files of killed processes are removed. A new folder is removed again if it stays empty.
+    Raises InputError if another process has locked the folder. Temporary files of killed processes are removed. A new
+    folder is removed again if it stays empty.
     """
     new = not path.exists()
     try:

@@ -31,9 +31,9 @@ class Weights:
 
 
 def cached_files(hub_id: str, revision: str | None = None) -> list[Path]:
-    """Return the paths of the HUB_FILES of a hub id in the local cache; empty unless all are there.
+    """Return the paths of the HUB_FILES (settings and weights) of a hub id in the local cache; empty unless all exist.
 
-    `revision` is a commit; None: the newest downloaded one. The network is not accessed.
+    `revision` is a commit; None: the newest downloaded one. The internet is not accessed.
     """
     if not is_installed("huggingface_hub"):
         return []
@@ -53,7 +53,7 @@ def cached_files(hub_id: str, revision: str | None = None) -> list[Path]:
 
 
 def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> Path:
-    """Download the HUB_FILES of a hub id to the local cache and return their folder.
+    """Download the HUB_FILES (settings and weights) of a hub id to the local cache and return their folder.
 
     `revision` is a commit; None: the newest one. Files in the cache are not downloaded again, but compared with their
     published checksums. Raises InputError if the hub cannot be reached, lacks a file, or if a checksum differs; that

@@ -12,7 +12,7 @@ Progress = Callable[[str, float], None]
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Ignore the progress; a callback that shows nothing."""
+    """Do nothing: the callback of progress for a run without display."""
 
 
 def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:
@@ -25,7 +25,7 @@ def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Ite
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Yield a progress callback as a context; it draws bars if stderr is a terminal."""
+    """Yield to a `with` block a callback of progress that draws bars, or `silent` unless stderr is a terminal."""
     if not sys.stderr.isatty():
         yield silent
         return
@@ -43,7 +43,7 @@ def progress_bars() -> Iterator[Progress]:
     bars = Progress(*columns, console=Console(file=sys.stderr))
 
     def report(stage: str, fraction: float) -> None:
-        """Draw the bar of a stage."""
+        """Draw the bar of a stage at the finished fraction, 0 to 1."""
         if stage not in tasks:
             bars.start()  # not before the first stage, so that an earlier error message is not mixed with bars
             tasks[stage] = bars.add_task(stage, total=1.0)

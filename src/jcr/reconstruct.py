@@ -45,8 +45,8 @@ logger = logging.getLogger(__name__)
 def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
     """Return a function that imports and runs the back end `function`, given as "module:function".
 
-    `arguments` are the names of the options that are passed to it between capture and progress. For networks, the
-    option `weights` is replaced by the weights found, and `device` by the device chosen; both need torch.
+    The back end is called with capture, the options named in `arguments`, and progress. The option `weights` is passed
+    as the weights found on this machine, and `device` as "cpu" or "cuda".
     """
 
     def reconstruct(
@@ -64,7 +64,7 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """Back end: its reconstruction function, the options that it uses, and its packages, weights and licence."""
+    """Method of reconstruction (back end): its function, the options that it uses, packages, weights and licence."""
 
     name: str
     """Value of the option --backend that selects this back end."""
@@ -296,10 +296,10 @@ def reconstruct(
 
 
 def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " n"]:
-    """Return the indices that sort images by gripper pose, for a reconstruction that does not depend on image names.
+    """Return the indices that sort images by gripper pose, so that the reconstruction does not depend on image names.
 
-    Matching, RANSAC and the initial pair depend on the order; with different names, calibrations differed by up to
-    1.7 σ. Equal poses keep their order.
+    Matching, RANSAC and the initial pair depend on the order: with other names, calibrations differed by up to 1.7
+    standard deviations. Equal poses keep their order.
     """
     # Adding zero turns -0 into 0. Poses are sorted by position, x first, then by rotation.
     pose = np.round(base_from_gripper, DECIMALS) + 0.0
@@ -308,7 +308,7 @@ def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " 
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """Return the reconstruction of sorted images in the order of the capture; sorted image k is row order[k] there."""
+    """Return a reconstruction of sorted images in the order of the capture; sorted image k is its row order[k]."""
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
@@ -334,10 +334,10 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """Return the names of the back ends to try, best first; only the named one unless the back end is `auto`.
 
-    For `auto`, an option such as `features` selects its back end. With given weights, their network is followed by the
-    best back end without weights; with a board, back ends that use it together with features are followed by the board
-    alone. Raises InputError for an unknown back end, for options that select different back ends, and for an option
-    that none of the returned back ends uses.
+    For `auto`, an option such as `features` selects its back end. Given weights select their network, followed by the
+    best back end without weights. A board selects the back ends that use features and board, followed by `marker`,
+    which uses the board alone. Raises InputError for an unknown back end, for options that select different back ends,
+    and for an option that none of the returned back ends uses.
     """
     given = _given_options(options)
     selecting = [row for row in BACKENDS.values() if row.selected_by in given]
@@ -406,9 +406,9 @@ def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOp
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """Return the options with `cameras` set to the capture's own COLMAP model.
+    """Return the options with `cameras` set to the COLMAP model that belongs to the capture.
 
-    They are unchanged if the capture has none, or if the options select another back end.
+    They are unchanged if the capture has no model, or if the options name `cameras` or another back end.
     """
     if capture.cameras is None or options.cameras is not None:
         return options
@@ -446,14 +446,14 @@ def network_weights(options: ReconstructOptions) -> Weights:
 
 
 def weights_command(row: Backend) -> str:
-    """Return a text with the command that downloads the published weights of a network, their size and licence."""
+    """Return a phrase with the command that downloads the published weights of a network, and their size (GB)."""
     size = f" ({row.download_gb:g} GB)" if row.download_gb else ""
     licence = "" if row.commercial else ", non-commercial"
     return f"jcr models get {row.name} downloads {row.hub_id}{size}{licence}"
 
 
 def _given_options(options: ReconstructOptions) -> dict[str, Any]:
-    """Return names and values of the options that differ from their defaults and are specific to some back ends."""
+    """Return names and values of the options that only some back ends use and that differ from their defaults."""
     own = {name for row in BACKENDS.values() for name in row.options}
     unset = {field.name: field.default for field in fields(options) if field.name in own}
     return {name: value for name in unset if (value := getattr(options, name)) != unset[name]}

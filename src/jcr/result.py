@@ -57,7 +57,7 @@ class RunOptions:
     depth: DepthOptions = field(default_factory=DepthOptions)
 
     def for_capture(self, capture: Capture, backend: str | None = None) -> "RunOptions":
-        """Return the options for a capture: with `backend` if given, and with the camera poses that the capture has."""
+        """Return the options with `backend` if it is not None, and with the capture's COLMAP model if it has one."""
         reconstruct = self.reconstruct if backend is None else replace(self.reconstruct, backend=backend)
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
@@ -91,15 +91,15 @@ class RunResult:
     """Whether nothing was computed, because the folder held the results of the same run already."""
 
     def __init__(self, out: str | Path, **parts: Any) -> None:
-        """Open a run folder; `parts` are properties that are known already, such as `calibration`."""
+        """Open the run folder `out`; `parts` are properties known already, such as `calibration`, which are not read."""
         vars(self).update(parts, out=Path(out))
 
     def with_parts(self, **parts: Any) -> "RunResult":
-        """Return the result with some parts, such as `calibration`, replaced."""
+        """Return the result with the properties named in `parts`, such as `calibration`, replaced."""
         return RunResult(**(vars(self) | parts))
 
     def __getattr__(self, name: str) -> Any:
-        """Return the attribute of this name of the calibration."""
+        """Return the attribute `name` of the calibration, for names that the result does not have itself."""
         if name.startswith("_"):
             raise AttributeError(name)
         return getattr(self.calibration, name)
@@ -141,12 +141,12 @@ class RunResult:
 
     @cached_property
     def added(self) -> Capture:
-        """Images that were added to the run later, for the map only."""
+        """Capture of the images that `build_map` added later for the map only; empty if there are none."""
         return read_added(self.out, self.capture)
 
     @cached_property
     def others(self) -> tuple[CellCamera, ...]:
-        """Further cameras of the cell: those of the capture, and those that were added to the run."""
+        """Cameras of the cell besides the calibrated one: from the capture, then added to the run (`add_camera`)."""
         if self.capture.mount == "base":
             return ()
         return (*self.capture.others, *read_added_cameras(self.out, self.capture))
@@ -185,12 +185,12 @@ class RunResult:
 
     @cached_property
     def cameras(self) -> CamerasFile | None:
-        """Calibration of the further cameras of the cell; None without further cameras."""
+        """Content of cameras.json: calibration of the cell's other cameras; None without other cameras."""
         return read_cameras(self.out)
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:
-        """Rows of the capture of the registered images."""
+        """Rows, in the capture, of the images that the reconstruction registered."""
         return self.reconstruction.image_index
 
     @property

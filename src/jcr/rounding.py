@@ -7,7 +7,7 @@ MOST_DECIMALS = 9
 
 
 def decimals_of(std: float) -> int:
-    """Return the number of decimals for a value with this standard deviation: the last is worth std/10 to std."""
+    """Return the number of decimals for a value with this standard deviation; the last place is worth std/10 to std."""
     if not np.isfinite(std) or std <= 0:
         return MOST_DECIMALS if std == 0 else 0
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))

@@ -121,7 +121,10 @@ def batch(
 
 
 def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
-    """Run one capture, unless its folder has the finished run, and return its row; errors are reported in the row."""
+    """Run all stages for one capture in the folder `out`, and return its row, in which an error is reported.
+
+    A finished run of the same inputs and options in the folder is not repeated.
+    """
     start, reason = time.perf_counter(), ""
     row = BatchRow(capture=str(capture), out=str(out), status="failed")
     try:
@@ -154,9 +157,10 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
 
 
 def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
-    """Return the rows with `moved_mm` and `moved_deg`, and a reason where the camera moved significantly.
+    """Return the rows with the camera's motion between episodes, and a reason where the motion is significant.
 
-    The reference of a data set is the camera of the episode whose median χ² difference to all episodes is the smallest.
+    `moved_mm` and `moved_deg` are relative to one episode of the same capture, whose median χ² difference to all its
+    episodes is the smallest.
     """
     found = list(rows)
     for capture in {row.capture for row in rows}:
@@ -205,7 +209,7 @@ def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Batch
 
 
 def _over_pool(tasks: list[Task], processes: int):
-    """Yield the row of each task when it ends; return the tasks that are unfinished because a process was killed."""
+    """Yield the row of each task when it ends; finally return the tasks that a killed process left unfinished."""
     left: list[Task] = []
     # Processes are spawned, because libraries with threads do not survive a fork. Ctrl-C, which reaches every process of
     # the terminal, ends each of them without a traceback.

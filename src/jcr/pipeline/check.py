@@ -109,11 +109,11 @@ def check_capture(
 ) -> Examination:
     """Examine a capture, or the capture at a path: its motion, images, expected uncertainty, and poses to add.
 
-    `look`: reconstruct the images from sparse features and compare the cameras with the gripper poses. A few reduced
-    images are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have given
-    camera poses, which are compared instead. `suggest` is the number of gripper poses to propose, `robot_noise` (m, rad)
-    one sigma per axis, and `reach` (2,3) the box (m, base frame) of proposed positions. Raises InputError if gripper
-    poses and joint angles contradict each other.
+    `look`: reconstruct the images from sparse features and compare the camera poses with the gripper poses. A few images
+    of reduced size are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have
+    given camera poses, which are compared instead. `suggest` is the number of gripper poses to propose, drawn with
+    `seed`. `robot_noise` is the standard deviation per axis (m, rad), `reach` (2,3) the box (min, max; m, base frame)
+    of proposed positions. Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)[0]
@@ -163,9 +163,9 @@ def check_capture(
 def _look(
     capture: Capture, views: tuple[Finding, ...]
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, " n"], list[str]]:
-    """Return the rows of well exposed sharp images, the relative sharpness of every image, and remarks on exposure.
+    """Return the rows of well exposed sharp images, the sharpness of all n images (median 1), remarks on exposure.
 
-    `views` are the findings of the images alone, which name the blurred images.
+    `views` are the findings of `view_findings`, which name the blurred images.
     """
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
@@ -185,7 +185,7 @@ def _compare_with_images(
     progress: Progress | None,
     thorough: bool,
 ) -> _Comparison:
-    """Compare the gripper poses with camera poses from features, by a calibration.
+    """Calibrate from gripper poses and camera poses from features, and return whether and how well both agree.
 
     First QUICK images of reduced size are compared; then all images if `thorough` is set, or if the first comparison
     fails, is rejected, or does not use all QUICK images.
@@ -219,7 +219,7 @@ def _compare_with_images(
 
 
 def _compare_pairs(pairs: PosePairs, options: CalibrateOptions) -> _Comparison:
-    """Compare the gripper poses with the given camera poses, by a calibration."""
+    """Calibrate from gripper poses and given camera poses, and return whether and how well both agree."""
     hand_eye = calibrate_pose_pairs(pairs, options)
     used, assumptions = hand_eye.inliers, None
     if hand_eye.converged:
@@ -273,10 +273,10 @@ def read_and_compare(
 def _fits(
     read: list[tuple[Capture, ReadOptions]], progress: Progress | None
 ) -> list[tuple[float, str, Capture, ReadOptions]]:
-    """Return (error in m, error in words, capture, options) of each reading of a capture, best fit first.
+    """Return (error in m, error in words, capture, options) for one capture read with several options, best first.
 
-    The error is the median residual between gripper poses and camera poses from a few reduced images. The list is empty
-    if these images cannot be reconstructed.
+    The error is the median residual between gripper poses and camera poses from a few images of reduced size. The list
+    is empty if these images cannot be reconstructed.
     """
     rows = spread_rows(len(read[0][0]))
     try:

@@ -211,9 +211,9 @@ def measure(out: str | Path) -> "Measurement":
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """Return the options, without the map if none can be made, and a note on the packages that are missing for it.
+    """Return the options, without a map if none can be made, and a note if packages for the map are missing.
 
-    Raises InputError if the options want a map but no dense depth, which the map needs.
+    A fixed camera has no map. Raises InputError if the options want a map but no dense depth, which the map needs.
     """
     # A fixed camera observes the object that the gripper carries; a map would not be fixed in the base frame.
     if options.map is None or capture.mount == "base":

@@ -48,9 +48,9 @@ class NothingFoundError(RejectedError):
     def __init__(
         self, failure: RejectedError, attempts: tuple[Attempt, ...] = (), causes: tuple[Finding, ...] = ()
     ) -> None:
-        """Take the failure of the last back end, the records of all attempts, and findings of the images alone.
+        """Make the error from the failure of the last back end, the records of all attempts, and findings `causes`.
 
-        `causes`, the findings of the images, come before the failure, so that the message names the cause.
+        `causes` are findings of the images alone; if one rejects, the message states it instead of the failure.
         """
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
@@ -76,7 +76,7 @@ class Trial:
 
     @property
     def rejection(self) -> Finding | None:
-        """Strongest finding that rejects the calibration; None if it is sound, or there is no calibration."""
+        """First finding that rejects the calibration; None without one, or if only the required accuracy is missed."""
         if self.hand_eye is None or self.hand_eye.is_sound:
             return None
         return next(finding for finding in self.hand_eye.findings if finding.severity == "rejects")
@@ -95,7 +95,10 @@ class Trial:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the calibration failed, is not accepted, or leaves images out, which the images may explain."""
+        """Whether findings of the images matter: no calibration, warnings, a rejection, or images left out.
+
+        An InputError of the back end is no doubt about the images.
+        """
         if self.hand_eye is None:
             return not isinstance(self.failure, InputError)
         return self.hand_eye.verdict != "accepted" or not all(one.used for one in self.hand_eye.images)
@@ -113,7 +116,7 @@ class Trial:
 
     @property
     def why_not(self) -> str:
-        """Name of the back end, and the reason why the trial is not selected, for messages."""
+        """Name of the back end, and for messages the reason why it failed or is rejected."""
         if self.hand_eye is None:
             return f"{self.name} failed ({self.failure})"
         return f"{self.name} is rejected ({self.hand_eye.doubt})"
@@ -140,10 +143,10 @@ def select_reconstruction(
     """Reconstruct and calibrate a capture with the back ends of `reconstruct.tries`, and return the best trial's result.
 
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
-    a note names the selected one and the reason. `keep` is called with the reconstruction before its calibration, if
-    there is only one back end to try. `before` returns the reconstruction of an earlier selection, which is then only
-    calibrated. Raises InputError if a back end does, or if gripper poses and joint angles contradict each other;
-    NothingFoundError if no back end gives a calibration.
+    a note names the selected one and the reason. If there is only one back end to try, `keep` receives its
+    reconstruction before the calibration. If `before` is given, only the reconstruction that it returns is calibrated.
+    Raises InputError if a back end does, or if gripper poses and joint angles contradict each other; NothingFoundError
+    if no back end gives a calibration.
     """
     robot_errors(capture, options.calibrate)  # raises InputError before time is spent on the images
     trials, notes = list[Trial](), list[str]()
@@ -179,10 +182,11 @@ def _why_untried(
 ) -> tuple[str | None, bool]:
     """Return the reason why the next back end is not tried, and whether the back ends after it may be tried.
 
-    The reason is None if the back end is tried, or if there is nothing to report. No other back end is tried if the best
-    trial is accepted, if its rejection holds for every reconstruction of the same images, or if the images alone are
-    rejected. Other features are not tried if SIFT registers nearly all images. A back end that does not test the
-    camera's intrinsics is not tried if SIFT finds enough features, because it could accept a wrong calibration.
+    `options` are those of the next back end, `images` is the number of images, and `of_images` returns the findings of
+    the images alone. The reason is None if the back end is tried, or if there is nothing to report. No other back end
+    is tried if the best trial is accepted, if its rejection does not depend on the back end, or if `of_images` reject.
+    Other features are not tried if SIFT registers nearly all images. A back end that does not test the camera's
+    intrinsics is not tried if SIFT finds enough features, because it could accept a wrong calibration.
     """
     best = max(trials, key=lambda one: one.rank)
     if best.hand_eye is not None:
@@ -209,9 +213,9 @@ def _why_untried(
 
 
 def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding, ...]) -> Selected:
-    """Return reconstruction and calibration of the trial of highest rank, with notes and findings of the images.
+    """Return reconstruction and calibration of the trial of highest rank, with `notes` and the findings `of_images`.
 
-    Raises NothingFoundError if no trial has a calibration, or its InputError if there is only one trial.
+    Raises NothingFoundError if no trial has a calibration. The InputError of an only trial is raised unchanged.
     """
     kept = max(trials, key=lambda one: one.rank)
     hand_eye, reconstruction = kept.hand_eye, kept.reconstruction
@@ -258,10 +262,11 @@ def _try(
     progress: Progress | None,
     keep: Keep | None = None,
 ) -> Trial:
-    """Reconstruct with the options of one back end, or read a reconstruction by a function; then calibrate it.
+    """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
-    With a known length, whose ends are points of surfaces, dense depth is estimated before the calibration. An
-    InputError of the calibration is raised, because it would occur with every back end; other errors are in the trial.
+    `source` is the options of the back end, or a function that returns a reconstruction. A known length, whose ends are
+    points of surfaces, needs dense depth, which is estimated before the calibration. An InputError of the calibration
+    is raised, because it would occur with every back end.
     """
     start, report = time.perf_counter(), progress or silent
     candidate = source if isinstance(source, ReconstructOptions) else None

@@ -59,9 +59,9 @@ LARGE = 50_000_000
 
 
 def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
-    """Return the result of a run before its first stage: capture, options, fingerprint of the reconstruction's inputs.
+    """Return the RunResult of a run before its first stage, with capture, options and a fingerprint of the inputs.
 
-    Raises InputError for a folder whose name is not UTF-8.
+    The fingerprint covers all inputs of the reconstruction. Raises InputError if the capture's path is not UTF-8.
     """
     folder = str(capture.folder.resolve())
     try:
@@ -101,7 +101,7 @@ def is_unchanged(result: RunResult) -> bool:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run stages in order and measure their times; return the result with their records."""
+    """Run the named stages in this order; return the result with their outputs and times (s)."""
     for name in stages:
         start = time.perf_counter()
         result = STAGES[name][1](result, progress)
@@ -113,7 +113,7 @@ def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunRes
 
 
 def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run the stages after the calibration, and mark the run as finished in run.json."""
+    """Run the named stages, which follow the calibration; mark the run as finished in run.json; return its result."""
     if not result.others:
         (result.out / CAMERAS).unlink(missing_ok=True)
         result = result.with_parts(cameras=None)
@@ -123,14 +123,14 @@ def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> Ru
 
 
 def complete(result: RunResult) -> RunResult:
-    """Mark a run as finished in run.json: write the fingerprints of its inputs and the identities of its files."""
+    """Write fingerprints of inputs and files to run.json, which marks the run as finished; return the result."""
     result = with_state(result, made=made_of(result), files=files_of(result.out))
     write_state(result)
     return result
 
 
 def made_of(result: RunResult) -> dict[str, str]:
-    """Return two fingerprints: "reconstruct" of the inputs of the reconstruction, "run" of all inputs and options."""
+    """Return two fingerprints: key "reconstruct" for the reconstruction's inputs, "run" for all inputs and options."""
     capture, folder = result.capture, result.capture.folder
     depths = [folder / name for name in capture.depths or () if name is not None]
     others = [
@@ -142,9 +142,9 @@ def made_of(result: RunResult) -> dict[str, str]:
 
 
 def files_of(out: Path) -> dict[str, str]:
-    """Return name and identity of the files of a run folder: those of its stages, and images added later.
+    """Return {name: identity} of the existing files of a run folder: outputs of stages, and images added later.
 
-    The identity of calibration.json and of added images is a hash of the content; that of other files is empty.
+    The identity of calibration.json and of added images is a hash of their content, that of other files an empty text.
     """
     names = [*(name for files, _ in STAGES.values() for name in files), ADDED]
     return {
@@ -155,12 +155,15 @@ def files_of(out: Path) -> dict[str, str]:
 
 
 def fingerprint(*values: Any) -> str:
-    """Return a SHA-256 hash of values, which covers the fields of records and the content of arrays and files."""
+    """Return a SHA-256 hash of `values`: of the fields of records, and the content of arrays and files (Path)."""
     return hashlib.sha256(json.dumps(values, default=_identity).encode()).hexdigest()
 
 
 def _identity(value: Any) -> Any:
-    """Return the value that stands for an array, file, folder or record in `fingerprint`: hash, list or fields."""
+    """Return the value that `fingerprint` hashes for a value that JSON lacks.
+
+    For an array or file: a hash; for a large file: size and date; for a folder: its files; for a record: its fields.
+    """
     if isinstance(value, ndarray):
         return hashlib.sha256(value.tobytes()).hexdigest()
     if not isinstance(value, Path):
@@ -175,10 +178,10 @@ def _identity(value: Any) -> Any:
 
 
 def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
-    """Select a reconstruction and its calibration; reuse a reconstruction that was made from the same inputs.
+    """Return the result with a selected reconstruction and its calibration, and write the reconstruction.
 
-    Such a reconstruction is searched in the run folder and in the one that `jcr capture` wrote. For a fixed camera the
-    images are reduced to the object that the gripper carries, which is then the scene.
+    A reconstruction of the same inputs in the run folder, or in the one that `jcr capture` wrote, is used again. For a
+    fixed camera, only the pixels of the object that the gripper carries are used.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture
@@ -217,7 +220,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
 
 
 def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
-    """Write a reconstruction without estimated pointmaps, which depth.npz holds; then run.json with its fingerprint."""
+    """Write a reconstruction, then run.json; pointmaps that are not a network's are left out, as depth.npz has them."""
     forget_reconstruction(result.out)
     pointmaps = reconstruction.pointmaps
     predicted = pointmaps if pointmaps is not None and pointmaps.is_predicted else None
@@ -226,13 +229,16 @@ def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> No
 
 
 def forget_reconstruction(out: Path) -> None:
-    """Delete run.json, depth and reconstruction, in this order: run.json never describes other inputs than the files."""
+    """Delete run.json, then depth and reconstruction, so that run.json never describes files of other inputs."""
     for name in (STATE, DEPTH, RECONSTRUCTION):
         (out / name).unlink(missing_ok=True)
 
 
 def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
-    """Write the reason of a failed selection to the run folder; return the error with a proposed `--board`."""
+    """Write calibration.json and report with the reason of a failed selection; return the error to raise.
+
+    The error proposes the option `--board` if the images show a board.
+    """
     capture, tried = result.capture, error.attempts
     board = proposed_for(capture, result.state.options.reconstruct.board)
     content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
@@ -243,7 +249,7 @@ def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
 
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
-    """Complete the calibration of the selected reconstruction, and write calibration.json and log.txt."""
+    """Add attempts, notes and a proposed board to the calibration; write calibration.json and log.txt."""
     capture, reconstruction, content = result.capture, result.reconstruction, result.found
     if capture.mount == "base":
         content = refined(capture, reconstruction, content, result.state.options.calibrate)
@@ -282,7 +288,7 @@ def write_state(result: RunResult) -> None:
 
 
 def place(result: RunResult, progress: Progress) -> CamerasFile:
-    """Locate the other cameras of the cell, and return the content of cameras.json."""
+    """Calibrate the other cameras of the cell in the run's reconstruction; return the content of cameras.json."""
     from jcr.cell.stage import place_cameras
 
     parts = result.capture, result.others, result.reconstruction, result.found
@@ -290,21 +296,21 @@ def place(result: RunResult, progress: Progress) -> CamerasFile:
 
 
 def _cameras(result: RunResult, progress: Progress) -> RunResult:
-    """Locate the other cameras of the cell, and write cameras.json."""
+    """Calibrate the other cameras of the cell, write cameras.json, and return the result with its content."""
     found = place(result, progress)
     write_cameras(result.out, found)
     return result.with_parts(cameras=found)
 
 
 def _depth_made_from(result: RunResult) -> str:
-    """Return the fingerprint of the inputs from which the depth.npz of this run is made."""
+    """Return the fingerprint of the reconstruction's inputs and the depth options, which depth.npz stores."""
     # The option `dense` decides whether depth is estimated, and does not change its values.
     depth = replace(result.state.options.depth, dense=True)
     return fingerprint(result.state.made["reconstruct"], depth, DEPTH_FORMAT)
 
 
 def _densify(result: RunResult, progress: Progress) -> RunResult:
-    """Add dense depth to the reconstruction: predicted by a network, read from the folder, or estimated now."""
+    """Return the result with dense depth in its reconstruction, estimated unless it is there, and write depth.npz."""
     options = result.state.options.depth
     result = result.with_parts(
         reconstruction=densify(result.capture, result.reconstruction, options, progress)
@@ -321,9 +327,10 @@ def _keep_depth(result: RunResult) -> None:
 
 
 def _map(result: RunResult, progress: Progress) -> RunResult:
-    """Make cloud, map and measured objects, with images that were added later, and write cloud and map.
+    """Return the result with cloud, map and measured objects, and write cloud and map.
 
-    Raises InputError if no point is confident enough, or the options leave no points for a map.
+    Images that were added later are included. Raises InputError if no point is confident enough, or the options leave
+    no points for a map.
     """
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added import extend
@@ -367,7 +374,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
 
 
 def _report(result: RunResult, progress: Progress = silent) -> RunResult:
-    """Write report.html."""
+    """Write report.html and return the result."""
     from jcr.report.html import report_html
 
     progress("report", 0.0)
@@ -381,7 +388,7 @@ def _report(result: RunResult, progress: Progress = silent) -> RunResult:
 
 
 def noted(result: RunResult, *notes: str | None) -> RunResult:
-    """Return the result with `notes` added to those of its calibration; None is ignored."""
+    """Return the result with `notes` added to the notes of its calibration; a note None is ignored."""
     every = [*result.calibration.notes, *filter(None, notes)]
     return result.with_parts(calibration=replace(result.calibration, notes=tuple(every)))
 

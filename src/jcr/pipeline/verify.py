@@ -78,7 +78,7 @@ class Verification(Drift):
 
     @property
     def finding(self) -> str:
-        """Phrase that names the body that has moved: camera, scene or one of the two."""
+        """Phrase that states what has moved: nothing, the camera, the scene, or one of the two."""
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
@@ -146,10 +146,10 @@ def verify_run(
 def _new_images(
     then: Capture | CellCamera, capture: Capture, now: Capture | CellCamera, new: Capture
 ) -> tuple[list[UInt8[ndarray, "h w 3"]], list[UInt8[ndarray, "h w 3"]]]:
-    """Read the images of a camera from its calibration, and its new ones; return both lists.
+    """Return the images of a camera's calibration, and its new images.
 
-    `then` and `now` name the images, `capture` and `new` the captures that hold them. Raises InputError if the new
-    images have another size, or one of them is an image of the calibration, which would confirm itself.
+    `then` and `now` are the camera in the captures `capture` and `new`. Raises InputError if the new images have another
+    size, or if one of them was used for the calibration, which it would confirm.
     """
     if now.image_size != then.image_size:
         (width, height), (wide, high) = now.image_size, then.image_size
@@ -177,10 +177,10 @@ def _in_old_scene(
     notes: list[str],
     options: VerifyOptions,
 ) -> Verification:
-    """Test with the new images that are located in the old reconstruction; `located` maps their rows to camera poses.
+    """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 
-    Gripper and camera poses of the calibration are fitted again, without bundle adjustment, because calibration.json
-    does not contain the joint covariance that the test needs.
+    `located` maps rows of `new` to these poses. Gripper and camera poses of the calibration are fitted again, without
+    bundle adjustment, because calibration.json does not contain the joint covariance that the test needs.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
     calibrate_options, rows = run.state.options.calibrate, list(located)
@@ -260,7 +260,7 @@ def _fixed_cameras(
 def _by_recalibration(
     run: RunResult, new: Capture, options: VerifyOptions, progress: Progress | None
 ) -> Verification:
-    """Calibrate from images of another scene; test the difference of both calibrations with the sum of covariances."""
+    """Calibrate from images of another scene; return the χ² test of the difference from the old gripper_from_camera."""
     calibration, then = run.calibration, run.state.options
     if calibration.intrinsics is not None:
         new = replace(new, intrinsics=calibration.intrinsics)
@@ -275,10 +275,9 @@ def _by_recalibration(
 
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
-    """Return the drift of a camera from its old to its new pose, with a χ² test.
+    """Return the drift of a camera from its old to its new pose, with a χ² test of the step between both.
 
-    `offset` is the difference of the poses (three translations in m, three rotations in rad), `covariance` its
-    covariance.
+    `offset` is that step (translation in m, rotation vector in rad), `covariance` its covariance.
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, options.alpha)
@@ -289,7 +288,10 @@ def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], opti
 def _judged(
     found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str], how: str
 ) -> Verification:
-    """Return the result for a drift: the camera moved if the drift is significant and larger than the tolerance."""
+    """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
+
+    `images` are the new images that were used, `how` is the method in words.
+    """
     notes = list(notes)
     if found.is_noisier:
         notes.append(
