@@ -47,7 +47,7 @@ def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
 
 
 def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
-    """Return a camera of the same model and image size with the values of a vector in the order of `parameters`."""
+    """Return a camera of the same model and image size with the p `values`, in the order of `parameters`."""
     fx, fy, cx, cy, *distortion = values.tolist()
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
@@ -58,7 +58,7 @@ def is_distorted(camera: Intrinsics) -> bool:
 
 
 def with_thin_prism(camera: Intrinsics) -> Intrinsics:
-    """Return a pinhole or rational camera as one of the thin prism model with the same projection."""
+    """Return a pinhole or rational camera converted to the thin prism model, with the same projection."""
     padded = [*camera.distortion, *[0.0] * (len(COEFFICIENTS["thin_prism"]) - len(camera.distortion))]
     return replace(camera, distortion=tuple(padded), model="thin_prism")
 
@@ -78,7 +78,10 @@ def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Floa
 
 
 def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Return the rays (...,3) with z = 1 of pixels (...,2), by Newton's method; exact within `fold_distance_px`."""
+    """Return the rays (...,3) with z = 1 in the camera frame of pixels (...,2), by Newton's method.
+
+    They are exact for pixels nearer to the principal point than `fold_distance_px`.
+    """
     target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if camera.model == "fisheye":
         return _fisheye_rays(camera, target)
@@ -94,7 +97,7 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
 
 
 def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2 3"]:
-    """Return the derivatives (...,2,3) of the pixel of `project` by the point in the camera frame."""
+    """Return the derivatives (...,2,3) of the pixel of `project` by the coordinates of the point in the camera frame."""
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
     x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
@@ -119,7 +122,7 @@ def by_parameters(
 
 
 def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Return the distorted coordinates of rays (x, y, 1), before focal lengths and principal point."""
+    """Return the distorted coordinates x and y of rays (x, y, 1), before focal lengths and principal point."""
     r2 = x * x + y * y
     radial, _ = _radial(camera, r2)
     if camera.model == "fisheye":
@@ -136,7 +139,7 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 def _slopes(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return the derivatives of the x of `_distorted` by x and by y, then those of its y by x and by y."""
+    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y."""
     r2 = x * x + y * y
     radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
@@ -153,7 +156,7 @@ def _slopes(
 
 
 def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Return the radial factor on x and y of rays with x² + y² = r2, and its derivative by r2."""
+    """Return the radial distortion factor of rays (x, y, 1) with x² + y² = r2, and its derivative by r2."""
     if camera.model == "fisheye":
         k = camera.distortion
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -175,7 +178,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 def _by_coefficients(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Float[ndarray, "*batch c"], Float[ndarray, "*batch c"]]:
-    """Return the derivatives (...,c) of the x, and of the y, of `_distorted` by the c distortion coefficients."""
+    """Return the derivatives (...,c) of the two distorted coordinates, x then y, by the c distortion coefficients."""
     r2, xy = x * x + y * y, 2 * x * y
     if camera.model == "fisheye":
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
@@ -198,7 +201,10 @@ def _by_coefficients(
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Return the rays with z = 1 of distorted coordinates of a fisheye, by Newton's method in the angle to the axis."""
+    """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
+
+    The unknown of Newton's method is the angle between ray and optical axis.
+    """
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
     angle = np.minimum(bent, _WIDEST_ANGLE)
@@ -243,9 +249,9 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
 
 
 def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
-    """Return given intrinsics and warnings; a distortion that folds over inside the image is set to zero.
+    """Return given intrinsics (or None) and warnings; distortion that folds over inside the image is set to zero.
 
-    Images with such a distortion do not register.
+    Images with such a distortion could not be registered.
     """
     # A fisheye's border, beyond the widest angle, may have pixels without rays; the rest of the image is usable.
     if camera is None or camera.model == "fisheye" or (fold := fold_distance_px(camera)) is None:
@@ -283,14 +289,15 @@ def cropped(camera: Intrinsics, left: int, top: int, width: int, height: int) ->
 
 
 def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
-    """Return the camera with both focal lengths multiplied by a factor."""
+    """Return the camera with both focal lengths multiplied by a factor; image size and principal point do not change."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
-    """Return the undistorted pinhole camera with the largest view inside the image, and a long side of this length.
+    """Return the undistorted pinhole camera that sees the largest view whose pixels are all inside the camera's image.
 
-    Where the distortion folds over, the view is a rectangle of the image's shape within the fold.
+    Its long side has `long_side_px` pixels. If the distortion folds over, the view is a rectangle of the image's shape
+    within the fold.
     """
     corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     if (fold_px := fold_distance_px(camera)) is not None:

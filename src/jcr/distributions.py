@@ -13,7 +13,10 @@ Number = float | int | np.number | ndarray
 
 
 class chi2:  # noqa: N801
-    """Chi-squared distribution: cdf and sf of x, ppf and isf of a probability; second argument: degrees of freedom."""
+    """Chi-squared distribution with the functions cdf, sf, ppf and isf of scipy.stats.
+
+    The first argument is a value (cdf, sf) or a probability (ppf, isf), the second the degrees of freedom.
+    """
 
     cdf = staticmethod(lambda x, freedom: chdtr(freedom, x))
     sf = staticmethod(lambda x, freedom: chdtrc(freedom, x))
@@ -22,13 +25,13 @@ class chi2:  # noqa: N801
 
 
 class f:  # noqa: N801
-    """F distribution: ratio of two mean squares of independent normal numbers."""
+    """F distribution, the ratio of two mean squares of independent standard normal numbers; only `logsf`."""
 
     @staticmethod
     def logsf(x: Number, over: Number, under: Number) -> Any:
         """Return log P(F > x); `over` and `under` are the degrees of freedom of numerator and denominator.
 
-        Where P underflows, the result is the leading term of the incomplete beta function (DLMF 8.17.7).
+        If P underflows, the result is the leading term of the incomplete beta function (DLMF 8.17.7).
         """
         tail, half = np.asarray(fdtrc(over, under, x)), np.asarray(under) / 2
         share = np.maximum(under / (under + np.asarray(over) * np.asarray(x, float)), 1e-300)

@@ -65,7 +65,7 @@ def skew(v: Vectors) -> Rotations:
 
 
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
-    """Return [I, -skew(v), v], derivatives of points v by translation, rotation about the origin, and log scale."""
+    """Return [I, -skew(v), v], derivatives of points v by translation (3), rotation about the origin (3), log scale."""
     identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
     return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
 
@@ -106,11 +106,10 @@ def step_between(
 
 
 def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
-    """Return the matrices (…,6,6) that turn steps (m, then rad) from the axes of frame b to those of a.
+    """Return the matrices (…,6,6) that turn steps (m, then rad) from the axes of frame b to those of frame a.
 
-    `rotation` (…,3,3) holds the rotations a_from_b.
-
-    To first order `step_axes(R) @ ξ` is the step from T to T·exp(ξ).
+    `rotation` R (…,3,3) holds the rotations a_from_b; both blocks of a matrix are R. To first order `step_axes(R) @ ξ`
+    is the step from T to T·exp(ξ), for a transform T with rotation R.
     """
     out = np.zeros((*rotation.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = rotation
@@ -129,7 +128,7 @@ def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
 
 def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
-    """Return the matrices (...,6,6) that turn small steps of a_from_b into the steps of b_from_a."""
+    """Return the matrices (...,6,6) that turn small steps (`retract`) of a_from_b into those of its inverse b_from_a."""
     rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     out = -step_axes(rotation_t)
     out[..., :3, 3:] = -rotation_t @ skew(a_from_b[..., :3, 3])
@@ -137,7 +136,7 @@ def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
 
 def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
-    """Return the adjoint matrices (n,6,6) that turn twists (v, ω) in frame b into twists in frame a."""
+    """Return the adjoint matrices (n,6,6) that turn twists (linear v, angular ω) in frame b into twists in frame a."""
     return twist_from_step(a_from_b) @ step_axes(a_from_b[:, :3, :3])
 
 
@@ -149,7 +148,7 @@ def apply(a_from_b: Transform, x_in_b: Vectors) -> Vectors:
 def scale_translation(
     a_from_b: Float[ndarray, "*#batch 4 4"], scale: Float[ndarray, "*#batch"] | np.floating | float
 ) -> Float[ndarray, "... 4 4"]:
-    """Return the transforms with their translations multiplied by the scales (...); rotations do not change (S_λ)."""
+    """Return the transforms with their translations multiplied by the scales (...); rotations do not change."""
     return transform(a_from_b[..., :3, :3], np.asarray(scale)[..., None] * a_from_b[..., :3, 3])
 
 
@@ -180,9 +179,9 @@ def fit_similarity(
     x_in_b: Float[ndarray, "*#batch n 3"],
     weights: Float[ndarray, "*#batch n"] | None = None,
 ) -> tuple[Float[ndarray, "... 4 4"], Any]:
-    """Return least-squares `a_from_b` (...,4,4) and scales (...) with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991).
+    """Return least-squares a_from_b (...,4,4; R, t) and scale (...) of x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991).
 
-    One set of points (n,3) gives one scale. Points without weight or extent give scale 1.
+    `weights` of the n points: None for equal ones. Points without weight or extent give scale 1.
     """
     w = np.ones(x_in_a.shape[:-1]) if weights is None else weights
     w = w / np.maximum(w.sum(-1, keepdims=True), TINY)
@@ -207,7 +206,7 @@ def across_lines(direction: Vectors) -> Rotations:
 def nearest_to_lines(
     origin: Float[ndarray, "*#batch n 3"], direction: Float[ndarray, "*#batch n 3"]
 ) -> Float[ndarray, "... 3"]:
-    """Return the point (...,3) nearest to n lines, each given by one of its points and a unit direction (...,n,3)."""
+    """Return the point (...,3) nearest to n lines, each given by a point `origin` on the line and a unit `direction`."""
     across = across_lines(direction)
     normal = across.sum(-3) + PARALLEL * np.eye(3)
     return np.linalg.solve(normal, (across @ origin[..., None]).sum(-3))[..., 0]

@@ -33,7 +33,7 @@ System = TypeVar("System")
 
 @dataclass(frozen=True)
 class Minimum(Generic[Unknowns]):
-    """Result of `minimise`: unknowns at the minimum, their cost and their normal equations."""
+    """Result of `minimise`: unknowns at the minimum, their cost, their normal equations, and whether it converged."""
 
     unknowns: Unknowns
     cost: Any
@@ -56,8 +56,9 @@ def damped_gauss_newton(
 ) -> tuple[Unknowns, Any, bool]:
     """Minimise a cost from `start`; return the unknowns, their cost, and whether the iteration converged.
 
-    `step` returns the unknowns after a step, from the present ones, their linearisation and the damping. The iteration
-    ends when a step changes the cost by less than `enough(cost)`. Independent problems have a damping each.
+    `step` returns the unknowns after a step, from the present ones, the result of `linearise` and the damping. The
+    iteration ends when a step changes the cost by less than `enough(cost)`. For an array of independent problems, costs
+    and dampings are arrays.
     """
     unknowns, least, settled = start, cost(start), False
     system: System | None = None
@@ -77,7 +78,7 @@ def damped_gauss_newton(
 
 
 def _where(better: Any, tried: Any, before: Any) -> Any:
-    """Return `tried` for the problems that are `better`, `before` for the others; arrays, or tuples of arrays."""
+    """Return `tried` for the problems that are `better`, `before` for the others: arrays, or tuples of arrays."""
     if np.all(better):
         return tried
     if isinstance(tried, tuple):
@@ -93,10 +94,11 @@ def minimise(
     tolerance: float = 1e-12,
     iterations: int = 100,
 ) -> Minimum[Unknowns]:
-    """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each, ρ being the loss.
+    """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each; ρ is the loss, applied to the squared length.
 
     `linearised` returns residuals and their derivatives by a step of p numbers; `moved` returns the unknowns after a
-    step. The iteration ends when a step changes the cost by less than the share `tolerance`.
+    step. The iteration ends when a step changes the cost by less than the share `tolerance`. Leading axes (b) are
+    independent problems.
     """
 
     def step(
@@ -126,14 +128,14 @@ def minimise(
 
 
 def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray, "*batch"]:
-    """Return ρ'(s), the derivative of the loss: the weight of residuals of squared length s in the normal equations."""
+    """Return the derivative of the loss by the squared length (`squared`) of a residual: its weight."""
     if loss == "linear":
         return np.ones_like(squared)
     return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)
 
 
 def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
-    """Return ½ Σ ρ(|r|²) over the residuals of each problem."""
+    """Return ½ Σ ρ(|r|²) over the k residuals r (m components each) of each problem b; ρ is the loss."""
     squared = (residual**2).sum(-1)
     if loss == "soft_l1":
         squared = 2 * (np.sqrt(1 + squared) - 1)
@@ -145,7 +147,7 @@ def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
 def _equations(
     loss: Loss, residual: Float[ndarray, "*b k m"], jacobian: Float[ndarray, "*b k m p"]
 ) -> tuple[Float[ndarray, "*b p p"], Float[ndarray, "*b p"]]:
-    """Return the normal equations JᵀWJ and JᵀWr, W being the weights of the loss."""
+    """Return JᵀWJ and JᵀWr of each problem b: J is the Jacobian, r the residuals, W their weights by the loss."""
     root = np.sqrt(loss_weight(loss, (residual**2).sum(-1)))[..., None]
     flat = (root[..., None] * jacobian).reshape(*residual.shape[:-2], -1, jacobian.shape[-1])
     transposed = np.swapaxes(flat, -1, -2)

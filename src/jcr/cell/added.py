@@ -19,7 +19,7 @@ FOLDER, FILE = "cameras", "cameras.json"
 
 
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
-    """Read the cameras that were added to a run; raise InputError if their file or an image is damaged."""
+    """Read the cameras that were added to a finished run; raise InputError if their file or an image is damaged."""
     folder = run_folder / FOLDER
     if not (folder / FILE).is_file():
         return ()
@@ -58,7 +58,7 @@ def added_camera(
 
 
 def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> None:
-    """Add the camera to the run folder: copy its images and write its entry."""
+    """Add the camera to the run folder: copy its images and write its entry to the file of added cameras."""
     folder = run_folder / FOLDER
     for image in camera.images:
         write_bytes(folder / image, ((camera.folder or capture.folder) / image).read_bytes())

@@ -29,7 +29,7 @@ GROWN, SOFT = 0.012, 0.008
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
-    """Return the images of a fixed camera with the static background faded to grey."""
+    """Return the images of a fixed camera with the static background faded to grey; only what moves keeps its colour."""
     height, width = images[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))
     reduced = np.stack(
@@ -50,7 +50,7 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
 
 
 def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w 3"], ndarray]:
-    """Return for each pixel the colour of most images, and a mask of the pixels where enough images agree."""
+    """Return for each pixel the most frequent colour of n images, and a mask of the pixels where enough images agree."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
     )  # (n,h,w): number of images with the same colour as each image
@@ -61,6 +61,9 @@ def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w
 
 
 def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
-    """Write the images `names` of `source`, background removed, to `folder` with the same names; PNG in any case."""
+    """Write images with the static background faded to grey to `folder`.
+
+    The images `names` of the folder `source` keep their names; the format is PNG whatever the name.
+    """
     for name, image in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
         write_bytes(folder / name, encode_png(image))

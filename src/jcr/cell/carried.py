@@ -26,8 +26,9 @@ from jcr.records import Capture, Reconstruction
 def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
     """Return the capture of a fixed camera as a capture of a camera that moves around the carried object.
 
-    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses. Images
-    without the static background are written to the folder `moving` and used, if it is given.
+    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses.
+    `moving` is a folder to which images without the static background are written, which are then used; None: the
+    original images are used.
     """
     if moving is not None:
         write_moving_parts(capture.folder, capture.images, moving)
@@ -49,10 +50,10 @@ def refined(
     found: Calibration,
     options: CalibrateOptions | None = None,
 ) -> Calibration:
-    """Return the calibration `found` from inverse gripper poses after refinement with the reported gripper poses.
+    """Return the calibration of a fixed camera, refined from `found`, with the gripper poses as reported.
 
-    The result is for a camera fixed to the base. A rejected calibration is not refined; it gets the finding WRONG_MOUNT
-    if the camera turns out to be on the gripper.
+    `found` was computed with inverse gripper poses (`eye_to_hand`). A rejected calibration is not refined; it gets the
+    finding WRONG_MOUNT if the camera turns out to be on the gripper.
     """
     options = options or CalibrateOptions()
     rows = reconstruction.image_index

@@ -21,7 +21,10 @@ EXACT = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class CellImages:
-    """Estimation problem of a cell, its initial state and observations; camera 0 is the capture's own."""
+    """Estimation problem of a cell (cameras and arms at one scene), its initial state and its observations.
+
+    Camera 0 is the capture's own camera.
+    """
 
     problem: Problem
     """Estimation problem of the cell, without its observations."""
@@ -41,8 +44,8 @@ class CellImages:
     ) -> "CellImages":
         """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
 
-        `combinations` (e,p) are columns over the parameters of hypotheses.Alternatives. `errors` (s,b) are pose errors
-        by confirmed effects of one standard deviation each.
+        `combinations` (e,p) are p directions in the e parameters of hypotheses.Alternatives. `errors` (s,b) are the
+        pose errors by b confirmed effects of one standard deviation each. None: nothing is added.
         """
         problem = self.problem
         if combinations is not None:
@@ -56,9 +59,10 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the problem of a cell: images of the capture's own camera, then the used images of each other camera.
+    """Return the estimation problem of the own camera's images and the used images of the cameras `members`.
 
-    Given intrinsics of the own camera are not used as a prior if its images contradict them.
+    The order is the own camera, then `members`. Given intrinsics of the own camera are not used as a prior if its
+    images contradict them.
     """
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
@@ -120,7 +124,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:
-    """Return the distribution of the own camera's used poses, for poses that do not come from image features."""
+    """Return the distribution of the own camera's used poses in metres, for a reconstruction without image features."""
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:

@@ -47,7 +47,10 @@ class TransformUncertainty(Part):
         parent_from_camera: Float[ndarray, "4 4"] | None = None,
         scene_distance_m: float | None = None,
     ) -> "TransformUncertainty":
-        """Return the record of a covariance; with a pose and distance (m), also that of a point on the optical axis."""
+        """Return the record of the covariance (m, rad; parent axes) of a transform.
+
+        If the pose and a distance (m) are given, the record includes the uncertainty of a point on the optical axis.
+        """
         std, at_scene = np.sqrt(np.diag(covariance)), None
         if parent_from_camera is not None and scene_distance_m is not None:
             by_step = np.hstack([np.eye(3), -skew(scene_distance_m * parent_from_camera[:3, 2])])
@@ -72,7 +75,7 @@ class TransformUncertainty(Part):
 
 
 class ImageUse(Part):
-    """Use of one image of a further camera in its placement."""
+    """Use of one image in the placement of its camera."""
 
     image: str
     used: bool
@@ -84,7 +87,10 @@ class ImageUse(Part):
 
 
 class CameraPlacement(Part):
-    """Placement of one further camera: pose, uncertainty, intrinsics, findings; no pose if it could not be placed."""
+    """Placement of one camera other than the capture's own: pose, uncertainty, intrinsics, findings.
+
+    The pose is null if the camera could not be placed.
+    """
 
     name: str
     mount: Mount
@@ -117,8 +123,8 @@ class CameraPlacement(Part):
     ) -> "CameraPlacement":
         """Return the placement of a camera with its findings; `placed` are fields: transform, uncertainty, intrinsics.
 
-        `points` has the number of shared points of each image. By image number, `px` has the reprojection errors (px) of
-        used images, and `reasons` the reasons why other images are not used.
+        `points` has for each image the number of points shared with the scene. By image number, `px` has the
+        reprojection errors (px) of used images, and `reasons` the reasons why other images are not used.
         """
         images = [
             ImageUse(
@@ -203,7 +209,7 @@ class CamerasFile(Part):
         found: CameraPlacement,
         base_from_gripper: Mapping[int, Float[ndarray, "4 4"]],
     ) -> list[Float[ndarray, "4 4"]]:
-        """Return base_from_camera of every used image of a camera, as far as its gripper poses are available.
+        """Return base_from_camera of every used image of `camera` (placement `found`), if its gripper pose is known.
 
         `base_from_gripper` has poses of the capture's own arm by image number of the capture. The list is empty if the
         camera was not placed.

@@ -47,10 +47,10 @@ LEAST_POSES = 3
 def localise(
     known: KnownImages, image: UInt8[ndarray, "h w 3"], camera: CellCamera
 ) -> tuple[Registration | None, int]:
-    """Return the registration of an image in the reconstruction and the number of shared points; None if too few.
+    """Return the registration (pose and inliers) of an image in the reconstruction, and the number of inliers.
 
-    The focal length is estimated if none is given, or if another value gives clearly more inliers, because wrong
-    intrinsics give a wrong pose with fewer inliers.
+    The registration is None if there are too few. The focal length is estimated if none is given, or if another value
+    gives clearly more inliers, because wrong intrinsics give a wrong pose with fewer inliers.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
@@ -64,13 +64,16 @@ def localise(
 
 
 def _count(found: Registration | int) -> int:
-    """Return the number of points that agree with a registration; a failed registration is that number itself."""
+    """Return the number of points that agree with a registration; an int is returned unchanged.
+
+    An int stands for a failed registration and is its number of points.
+    """
     return len(found.x_px) if isinstance(found, Registration) else found
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraViews:
-    """Images of one further camera: registrations and rigs of the k used images, reasons for the unused ones."""
+    """Images of one camera other than the own: registrations and rigs of the k used images, reasons for unused ones."""
 
     camera: CellCamera
     points: Sequence[int]
@@ -116,14 +119,17 @@ class CameraViews:
         return given or max(self.used.values(), key=_count).pose.camera
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":
-        """Return the views after the images with the numbers in `reasons` are removed from the used ones."""
+        """Return the views without the images whose numbers are the keys of `reasons`; the values say why."""
         used = {k: one for k, one in self.used.items() if k not in reasons}
         return replace(self, used=used, reasons={**self.reasons, **reasons})
 
     def refused(
         self, why: FindingKind | Sequence[Finding], concerns: Concerns = "none", *images: str, **numbers: Any
     ) -> CameraPlacement:
-        """Return a rejected placement for findings `why`, or for one finding: kind and other arguments of Finding.of."""
+        """Return a rejected placement of the camera with the findings `why`.
+
+        If `why` is one kind of finding, the other arguments are those of Finding.of.
+        """
         if isinstance(why, FindingKind):
             why = (Finding.of(why, "rejects", concerns, *images, **numbers),)
         return CameraPlacement.of(self.camera, why, self.points, self.reasons)
@@ -144,9 +150,10 @@ def known_images(case: Case) -> KnownImages:
 
 
 class Rigs:
-    """All rigs (bodies that carry cameras) of a cell: one for each used image of the own camera, then those of others.
+    """Poses of all rigs of a cell; a rig is a set of cameras that move together, at one time.
 
-    `case` is the calibration of the own camera, `known` are its used images with poses in metres.
+    There is one rig for each used image of the own camera, then those of other cameras. `case` is the calibration of
+    the own camera, `known` are its used images with poses in metres.
     """
 
     def __init__(self, case: Case, known: KnownImages) -> None:
@@ -156,7 +163,10 @@ class Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Assign the images of a camera to rigs, new ones if needed; return a rejected placement if this fails."""
+        """Return the views with a rig for each used image; rigs are added if needed.
+
+        Return a rejected placement if the images cannot be assigned.
+        """
         if not seen.used:
             most = int(np.argmax(seen.points))
             best, count = seen.camera.images[most], float(seen.points[most])
@@ -177,7 +187,10 @@ class Rigs:
         return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Assign the images of another camera on the own gripper to the rigs of the images taken with them."""
+        """Return the views of a second camera on the own gripper; image and own image taken together have one rig.
+
+        Return a rejected placement if the second camera is not rigidly connected, or its images do not suffice.
+        """
         assert seen.camera.frame is not None
         capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}
         frame = {k: int(seen.camera.frame[k]) for k in seen.used}
@@ -245,7 +258,10 @@ class Rigs:
         return replace(kept, rig=rig, arm=len(self.arms))
 
     def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
-        """Return the reported poses of each arm, the capture's own first, and initial X and base_from_world of each."""
+        """Return the reported poses of each arm, and initial (gripper_from_camera, base_from_world) of each.
+
+        The capture's own arm is the first.
+        """
         case = self.case
         poses = case.capture.base_from_gripper[self.rows]
         kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
@@ -269,9 +285,10 @@ class Rigs:
 def fit_views(
     seen: CameraViews, carrier: Float[ndarray, "k 4 4"], scale_std: float
 ) -> tuple[Calibration, tuple[Finding, ...]]:
-    """Return the hand-eye fit of a camera to poses `carrier` of its gripper or rig, and findings such as a slip.
+    """Return the hand-eye calibration of a camera from its images and the poses of its gripper or rig.
 
-    Both are in metres; `scale_std` is the relative standard deviation of the scale between them.
+    `carrier` are these poses; poses are in metres, `scale_std` is the relative standard deviation of the scale between
+    them. The second result is the findings on effects such as a slip.
     """
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
     known = (scale_prior(1.0, scale_std),)
@@ -281,6 +298,6 @@ def fit_views(
 def _apart(
     places: Float[ndarray, "*#k 4 4"], others: Float[ndarray, "*#k 4 4"]
 ) -> tuple[Float[ndarray, "..."], Float[ndarray, "..."]]:
-    """Return the distance (m) and the angle (rad) between poses; the arrays broadcast."""
+    """Return the distances (m) and the angles (rad) between two arrays of poses, which broadcast."""
     step = step_between(places, others)
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)

@@ -54,7 +54,8 @@ def place_cameras(
 ) -> CellPlacement:
     """Return the placement of the cameras `others`, which observe the scene of a calibrated capture.
 
-    A camera that cannot be placed is in the result with the reason.
+    `hand_eye` is the calibration of the capture's own camera. A camera that cannot be placed is in the result with the
+    reason.
     """
     if not others:
         return CellPlacement(())
@@ -108,9 +109,9 @@ def place_cameras(
 
 
 def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
-    """Return the finding that the images of a fixed camera have different poses; no finding if they agree.
+    """Return a finding if the images of a fixed camera have different poses; an empty tuple if the poses agree.
 
-    The images are adjusted with one rig each. The difference of two poses is compared with its covariance, in which
+    Each image is adjusted with a pose of its own. The difference of two poses is compared with its covariance, in which
     common errors, as of the intrinsics, cancel.
     """
     alone = Rigs(rigs.case, rigs.known)
@@ -138,8 +139,8 @@ def _examined(
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Return the joint solution of all images, and for each camera the findings of calibration/checks/effects.py.
 
-    Confirmed effects on cameras are adopted in the solution. Another arm's poses are tested with its camera; those of
-    the capture's own arm were tested in its calibration.
+    `mounted` are the cameras other than the capture's own. Confirmed effects on them are adopted in the solution.
+    Another arm's poses are tested with its camera; those of the capture's own arm were tested in its calibration.
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
@@ -178,7 +179,10 @@ def _examined(
 def _placement(
     views: CameraViews, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
-    """Return the placement of a camera with its findings; the covariances of `faults` add to its covariance."""
+    """Return the placement of a camera from the joint solution; `faults` are findings on effects such as a slip.
+
+    The covariances of `faults` add to the covariance of the camera's pose.
+    """
     c, problem = views.number, solution.problem
     assert problem.observations is not None
     transform, covariance = solution.transform(views.parent_from_camera)
@@ -236,7 +240,11 @@ def _placement(
 def _uncertain(
     camera: CellCamera, covariance: Float[ndarray, "6 6"], focal_std: float = 0.0
 ) -> list[Finding]:
-    """Return a finding if the pose is too uncertain; `focal_std` is the relative std of an unknown focal length."""
+    """Return a list with one finding if the pose is too uncertain, else an empty list.
+
+    `focal_std` is the relative standard deviation of the focal length, for the message on a camera without given
+    intrinsics.
+    """
     metres, radians = np.sqrt(np.diag(covariance)).reshape(2, 3).max(1).tolist()
     if metres <= MAX_STD[0] and radians <= MAX_STD[1]:
         return []

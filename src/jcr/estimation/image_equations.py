@@ -41,7 +41,7 @@ FAINT = 1e-6
 
 
 class RigInformation(NamedTuple):
-    """Quadratic cost of the first m rigs: ½ sᵀ H s + gᵀ s for steps s (6m numbers) from reference poses."""
+    """Quadratic cost ½ sᵀ H s + gᵀ s of steps s of the first m rigs from reference poses; s has r = 6m numbers."""
 
     world_from_rig: Float[ndarray, "m 4 4"]
     """Reference poses."""
@@ -51,13 +51,16 @@ class RigInformation(NamedTuple):
     """Vector g of the cost ½ sᵀ H s + gᵀ s."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
-        """Return the steps (6m,) from the reference poses to the rigs of a state."""
+        """Return the steps (r,) from the reference poses to the rigs of a state: (m, rad) of each rig in turn."""
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageEvidence:
-    """Normal distribution of the d `Problem.columns` about a state, from images and priors, without reported poses."""
+    """Normal distribution of the unknowns other than points and arms, from images and priors, without reported poses.
+
+    It is linearised about a state; the d unknowns are in the order of `Problem.columns`.
+    """
 
     problem: Problem
     state: State
@@ -75,7 +78,7 @@ class ImageEvidence:
 
     @cached_property
     def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
-        """Conditional distribution of the steps r of the arms' rigs given steps f of the free columns.
+        """Conditional distribution of the steps r of the arms' rigs, given steps f of the columns `Problem.free`.
 
         Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b.
         """
@@ -90,7 +93,7 @@ class ImageEvidence:
 def adjust_images(problem: Problem, state: State) -> State:
     """Return the state after bundle adjustment without reported poses, for cameras with exact intrinsics.
 
-    Mean position, rotation and extent of the rigs stay fixed.
+    Mean position, mean rotation and extent of the rigs (the camera poses) stay fixed.
     """
     unseen = information_along(similarities_of_rigs(state.world_from_rig), 1.0)
     world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
@@ -101,9 +104,10 @@ def adjust_images(problem: Problem, state: State) -> State:
 
 
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
-    """Return the state with the pixel noise estimated from its residuals.
+    """Return the state with the pixel noise estimated from the residuals in `view`.
 
-    The first estimate has one size for all observations; later ones distinguish groups and stated variances.
+    The first estimate has one size for all observations; later ones distinguish groups (one for each camera, one for
+    board corners) and the stated variances.
     """
     layout, residual_px, depth, before = problem.layout, view.residual_px, view.depth, state.pixel_noise
     if before is None or (layout.groups == 1 and not layout.states_variances):
@@ -118,7 +122,7 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
 
 
 def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
-    """Return the weight (1/px²) of each observation for the residuals of the state."""
+    """Return the weight (1/px²) of each of k observations, by the pixel noise of the state and the robust loss."""
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
@@ -126,7 +130,7 @@ def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> F
 def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
     """Return the state after bundle adjustment with constant weights, those of the observations at the start.
 
-    `known` is information about the rigs in addition to that of the images and `known_rigs`.
+    `known` is information about the rigs in addition to that of the images and `problem.known_rigs`.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
@@ -154,12 +158,15 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the normal distribution of `Problem.columns` about a state, from images and priors alone."""
+    """Return the normal distribution of `Problem.columns` (intrinsics, boards, rigs) by images and priors at a state."""
     return linearised(problem, state, view_of(problem, state))[0]
 
 
 def linearised(problem: Problem, state: State, view: ProjectedObservations) -> tuple[ImageEvidence, Normal]:
-    """Return the evidence of images and priors about a state, and the normal equations, which give the points' steps."""
+    """Return the evidence of images and priors about a state, and the normal equations from which points are stepped.
+
+    The evidence is the normal distribution of `Problem.columns`.
+    """
     weight = weights_of(problem, state, view)
     normal = _normal_equations(problem, state, view, weight, _known_rigs(problem), 0.0)
     information = normal.hessian
@@ -178,7 +185,10 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
 
 
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
-    """Return the evidence with newly estimated sizes of the remaining distortion, and their largest log change."""
+    """Return the evidence with a new estimate of the size of each camera's remaining distortion.
+
+    The second result is the largest absolute change of the logarithm of a size.
+    """
     state, columns = images.state, [c for c in images.problem.columns.model_error if c.stop > c.start]
     if not columns:
         return images, 0.0
@@ -209,14 +219,20 @@ def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Flo
 
 
 def cost_of_images(images: ImageEvidence, state: State) -> float:
-    """Return the cost of a state in squared standard deviations, with the weights and priors of the evidence."""
+    """Return the cost of a state: squared residuals of images, priors and boards in units of their standard deviations.
+
+    Weights and priors are those of `images`.
+    """
     view, sizes = view_of(images.problem, state), images.state.model_error_std
     state = replace(state, model_error_std=sizes)
     return _cost(images.problem, state, view, images.weight, _known_rigs(images.problem))
 
 
 def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
-    """Return an information matrix of this strength in the space of seven steps, those of a similarity of the world."""
+    """Return an information matrix of this strength in the space of seven `steps`, those of a similarity of the world.
+
+    The seven columns are scaled and orthonormalised first, so only the space that they span matters.
+    """
     unseen = np.linalg.qr(steps)[0]
     return strength * unseen @ unseen.T
 
@@ -255,7 +271,10 @@ def _normal_equations(
     known: Sequence[RigInformation],
     damping: float,
 ) -> Normal:
-    """Return the damped normal equations of all `Problem.columns`, with the points eliminated."""
+    """Return the normal equations of all d `Problem.columns`, with the points eliminated.
+
+    `known` is information about rigs; `damping` is that of `without_points`.
+    """
     first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
     weighted = derivatives(problem, state, view, weight)
     hessian, right = with_fixed_points(weighted, seen)

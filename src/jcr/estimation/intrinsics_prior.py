@@ -68,9 +68,10 @@ class CameraPrior:
 def camera_with_prior(
     intrinsics: Intrinsics, std: Mapping[str, float] | Float[ndarray, " q"] = MEASURED
 ) -> CameraPrior:
-    """Return the prior of a camera; `std` is a mapping like MEASURED, or one number per element of `parameters`.
+    """Return the prior of a camera with mean `intrinsics` and standard deviations `std`.
 
-    NaN stands for the value of MEASURED. Coefficients that the distortion model does not have are ignored.
+    `std` is a mapping with keys as in MEASURED, or one number for each element of `camera.parameters`; NaN stands for
+    the value of MEASURED. Coefficients that the distortion model does not have are ignored.
     """
     if isinstance(std, ndarray):
         usual = camera_with_prior(intrinsics)
@@ -94,18 +95,23 @@ def camera_with_prior(
 
 
 def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> CameraPrior:
-    """Return the prior of intrinsics that were `given`, with or without `std`, or that a reconstruction estimated."""
+    """Return the prior of a camera with mean `found`; `given` tells the source of these intrinsics.
+
+    Given intrinsics have the standard deviations `std`; None: MEASURED. Intrinsics estimated by a reconstruction have
+    the standard deviations ESTIMATED.
+    """
     if not given:
         return camera_with_prior(found, ESTIMATED)
     return camera_with_prior(found, MEASURED if std is None else std)
 
 
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
-    """Return the steps of X, log scale and intrinsics (r = 7 + q rows) that images confuse with a thin prism in x, in y.
+    """Return the steps of X, log scale and intrinsics (r = 7 + q rows) that images confuse with a thin prism.
 
-    To second order, a prism that displaces x by s · r² equals p2 = s, the principal point moved by 2 · s · fx and the
-    camera rotated by 2 · s about its y axis; likewise for y. s is one standard deviation: DECENTRING, or the estimated
-    tangential distortion if larger, because one defect of the optics causes both.
+    Column 0 is for a prism that displaces along x, column 1 along y. To second order, a prism that displaces x by s ·
+    r² equals p2 = s, the principal point moved by 2 · s · fx and the camera rotated by 2 · s about its y axis. s is one
+    standard deviation: DECENTRING, or the estimated tangential distortion if larger, because one defect of the optics
+    causes both.
     """
     names = parameter_names(camera)
     out = np.zeros((7 + len(names), 2))
@@ -132,9 +138,10 @@ WORTH = 2.0
 def displacements(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "k 2 e"]:
-    """Return the displacement (px) of k observations by each of e polynomials with a coefficient of one image width.
+    """Return the displacement (px) of k observations by each of e polynomials of the remaining distortion.
 
-    The part that a change of the intrinsics along `directions` can produce is removed.
+    The polynomials have a coefficient of one image width. The part that a change of the q intrinsics along `directions`
+    (columns) can produce is removed.
     """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     basis = np.linalg.qr(by_prior.reshape(2 * len(x_px), -1))[0]
@@ -143,7 +150,7 @@ def displacements(
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
-    """Return the likeliest size (image widths) of the remaining distortion of one camera, by MacKay's fixed point.
+    """Return the likeliest size (image widths) of one camera's remaining distortion, by MacKay's fixed-point iteration.
 
     `likeliest` and `covariance` of the e polynomial coefficients were estimated under a prior of size `std`.
     """
@@ -166,7 +173,10 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
 def expressed(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "q e"]:
-    """Return the change of q camera parameters along `directions` that best fits each of e distortion polynomials."""
+    """Return the change of q intrinsics along `directions` that best fits each of e polynomials at the pixels `x_px`.
+
+    The polynomials are those of the remaining distortion, with a coefficient of one image width.
+    """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
     return (
@@ -179,7 +189,7 @@ def second_moment_px2(
 ) -> Float[ndarray, "*points 2 2"]:
     """Return the second moment (px²) of the remaining distortion `left` at pixels: squared mean plus covariance.
 
-    A projection with the intrinsics alone has this error.
+    This is the expected squared error of a projection that uses the intrinsics alone.
     """
     flat = x_px.reshape(-1, 2)
     by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
@@ -188,7 +198,11 @@ def second_moment_px2(
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Return the displacements (px) by products of Legendre polynomials, first of x, then of y; one image width each."""
+    """Return the displacements (px) of k pixels by e polynomials with a coefficient of one image width.
+
+    The polynomials are products of Legendre polynomials in both coordinates; the first half displaces along x, the
+    second half along y.
+    """
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
@@ -202,6 +216,9 @@ def joint_covariance(
     of_camera: Float[ndarray, "q q"],
     camera: Intrinsics,
 ) -> JointCovariance:
-    """Return the joint covariance of transform, scale and the q intrinsics from its blocks; `cross` is (7,q)."""
+    """Return the joint covariance of gripper_from_camera, scale and the q intrinsics from its blocks.
+
+    `covariance` is that of transform and scale, `of_camera` that of the intrinsics, `cross` their cross-covariance.
+    """
     together = np.block([[covariance, cross], [cross.T, of_camera]])
     return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))

@@ -75,7 +75,7 @@ class Posture:
 def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return joint angles (n,dof) within the limits for n poses, with little change between poses, and the misfits.
 
-    If the arm does not reach all poses, a constant tool is estimated together with the angles.
+    If the arm does not reach all poses, a constant tool (flange_from_tool) is estimated together with the angles.
     """
     rng = np.random.default_rng(0)
     tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
@@ -115,7 +115,10 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Return the step from the reached to the given pose (base axes; m, angles times geometry.ARM), and the Jacobian."""
+    """Return the step from the reached to the given pose, and the derivative of the reached pose by the joint angles.
+
+    Both are in base axes and m; rotations (rad) are multiplied by geometry.ARM.
+    """
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM
@@ -128,7 +131,7 @@ def _posture(
     flange_from_tool: Transform,
     rng: np.random.Generator,
 ) -> Posture:
-    """Return joint angles for poses of a known tool: the best sequence of solutions from many initial angles."""
+    """Return joint angles for poses of a known tool: from solutions of many initial angles, the smoothest sequence."""
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
     # The initial angles are the rest posture and random ones within the limits, at most ±180° about their middle.
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
@@ -150,7 +153,11 @@ def _misfit(
 
 
 def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:
-    """Return for each pose one of s solutions `found`, with the least change between poses (Viterbi algorithm)."""
+    """Return for each pose one of its s solutions `found`, by the Viterbi algorithm.
+
+    The least weighted sum of `misfit` (m²), squared change of the angles between poses, and squared distance from rest
+    decides.
+    """
     own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []
     for k in range(1, len(found)):
@@ -179,7 +186,10 @@ def _change(
 def _with_tool(
     arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
 ) -> Transform:
-    """Return flange_from_tool that lets the arm reach all poses best, estimated together with the joint angles."""
+    """Return flange_from_tool that lets the arm reach all poses best, estimated together with the joint angles.
+
+    `joints` and `flange_from_tool` are the initial estimates.
+    """
     some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST)).astype(int))
     poses, n, dof = base_from_tool[some], len(some), arm.dof
     weight = 1e-3 / np.repeat(TOOL_STD, 3)
@@ -213,9 +223,9 @@ def _with_tool(
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """Return the arm with base and tool fitted to the poses, and joint angles; `joints` None: by inverse kinematics.
+    """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof).
 
-    Raise InputError if poses, joints and arm do not agree.
+    `joints` None: angles by inverse kinematics. Raise InputError if poses, joints and arm do not agree.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints
@@ -238,14 +248,14 @@ ALIKE, SURE = 0.01, 5.0
 
 
 class LengthError(InputError):
-    """Error for gripper positions that differ from the arm's by a common factor, which images cannot show."""
+    """Error for gripper positions that are a multiple of the arm model's; images do not reveal such a factor."""
 
 
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """Return the arm with the base and tool whose forward kinematics fits the reported poses best.
 
-    Directions that the motions do not determine stay as in `arm`. Raise InputError if angles and poses disagree,
-    LengthError if they disagree by a common factor on all positions.
+    Directions of base and tool that the motions do not determine stay as in `arm`. Raise InputError if angles and poses
+    disagree, LengthError if the positions differ by a common factor.
     """
     nominal = forward_kinematics(arm, joints)
     half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
@@ -268,7 +278,7 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
 
 
 def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
-    """Raise LengthError if the poses agree with forward kinematics `nominal` up to a common factor on all positions."""
+    """Raise LengthError if the gripper positions are those of forward kinematics (`nominal`) times a factor."""
     tool, scale, base = closed_form(base_from_gripper, nominal)
     factor = float(scale)
     if factor <= 0:  # unobservable
@@ -290,5 +300,5 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
 
 
 def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:
-    """Return the rms over n residuals of the distance (m) and of the angle (rad)."""
+    """Return two numbers, the rms distance (m) and the rms angle (rad) of n residuals."""
     return np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))

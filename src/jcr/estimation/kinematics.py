@@ -65,7 +65,10 @@ def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:
 
 
 def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Poses]:
-    """Return base_from_joint (n,dof,4,4) of each joint before its own rotation, and base_from_gripper (n,4,4)."""
+    """Return base_from_joint (n,dof,4,4) without each joint's own rotation, and base_from_gripper (n,4,4).
+
+    `joints` (n,dof) are the joint angles in rad.
+    """
     rotated = transform(rotation_exp(joints[..., None] * arm.axes), np.zeros(3))
     frames = np.empty((*joints.shape, 4, 4))
     at = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
@@ -87,10 +90,10 @@ def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, 
 
 
 def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"]:
-    """Return the standard deviation of each of the p = 5 dof errors of `error_jacobian`.
+    """Return the standard deviation of each of the p = 5 dof kinematic errors, in the order of `error_jacobian`.
 
-    `joint_offset` (rad) and `link` (m) are those of joint offsets and link translations. Link rotations have
-    `link` / geometry.ARM, the typical length of a link: 0.3 mm goes with 0.06°.
+    `joint_offset` (rad) and `link` (m) are the standard deviations of joint offsets and link translations. Link
+    rotations have `link` / geometry.ARM, the typical length of a link: 0.3 mm goes with 0.06°.
     """
     return np.r_[np.full(arm.dof, joint_offset), np.tile([link, link, link / ARM, link / ARM], arm.dof)]
 
@@ -112,20 +115,26 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
 
 
 def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
-    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint, from `joint_frames`."""
+    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint.
+
+    `frames` and `gripper` are base_from_joint and base_from_gripper, the results of `joint_frames`.
+    """
     return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
 
 
 def _twist(
     frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axis_in_base: Float[ndarray, "n dof 3"]
 ) -> Float[ndarray, "n dof 6"]:
-    """Return the gripper's velocity (of its origin, then ω) per rad of rotation about axes through the joint origins."""
+    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of rotation about an axis of each joint.
+
+    The axes pass through the origins of the joint `frames`; their directions are `axis_in_base`.
+    """
     lever = gripper[:, None, :3, 3] - frames[..., :3, 3]
     return np.concatenate([np.cross(axis_in_base, lever), axis_in_base], axis=-1)
 
 
 def perpendicular(axes: Float[ndarray, "dof 3"]) -> Float[ndarray, "dof 3 2"]:
-    """Return two unit vectors (columns) perpendicular to each axis; x and y of the frame for an axis along z."""
+    """Return two unit vectors (columns) perpendicular to each axis; for an axis along z they are along x and y."""
     order = np.argsort(np.abs(axes), axis=1, kind="stable")
     first = np.eye(3)[order[:, 0]]
     first = first - (first * axes).sum(1, keepdims=True) * axes

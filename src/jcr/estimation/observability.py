@@ -31,7 +31,10 @@ EXACT = 0.005
 def excitation(
     base_from_gripper: Poses, gripper_from_camera: Transform | None, priors: Sequence[LinearPrior] = ()
 ) -> Excitation:
-    """Return the excitation of X and λ by n gripper poses; without an estimate of X, the camera is at the gripper."""
+    """Return how strongly n gripper poses determine each direction of X (gripper_from_camera) and the scale.
+
+    `gripper_from_camera` None: the camera is assumed at the gripper's origin.
+    """
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
     # The offset is limited, because an unobservable one may have any value; the excitation hardly depends on it.
@@ -59,9 +62,9 @@ def observability(
     recon_from_camera: Poses | None = None,
     priors: Sequence[LinearPrior] = (),
 ) -> Observability:
-    """Return a finding for each unobservable or weakly observable direction of X and scale.
+    """Return findings for the unobservable or weakly observable directions of X (gripper_from_camera) and scale.
 
-    Camera poses allow to distinguish an orbit about the scene from rotations about a tool point.
+    `recon_from_camera`, if given, distinguishes an orbit about the scene from rotations about a tool point.
     """
     n = len(base_from_gripper)
     if n == 2:
@@ -82,7 +85,7 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """Return the finding that a kind of motion leaves a direction unobservable, with its axis or point in a frame."""
+    """Return the finding that a kind of motion leaves a direction unobservable; `at` is an axis or point in `frame`."""
     where: dict[str, Any] = (
         {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )
@@ -92,7 +95,7 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 def _explained(
     base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
 ) -> list[Finding]:
-    """Return findings that name the degenerate motion; `unseen` is the mask of unobservable directions."""
+    """Return findings that name the degenerate motion; `unseen` masks the unobservable directions of `found`."""
     # The mean of the rotation matrices preserves the length of a common axis and shortens all other directions.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
@@ -124,7 +127,7 @@ def _explained(
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the point of frame b that moves least in frame a, its rms motion, and the rms motion of b's origin."""
+    """Return the point in frame b that moves least in frame a, and two rms motions: its own, and that of b's origin."""
     rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
     rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
     point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]

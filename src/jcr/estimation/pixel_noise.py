@@ -43,7 +43,7 @@ class PixelNoise:
     """Share c of the variance that is equal for all observations; the share 1 − c varies as the matching states."""
 
     def change(self, before: "PixelNoise") -> float:
-        """Return the largest change of log sigma from an earlier estimate."""
+        """Return the largest absolute change of the logarithm of `sigma_px` from an earlier estimate."""
         return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
 
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
@@ -66,7 +66,10 @@ class PixelNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Constant data of k observations for the pixel noise: groups, points, image cells, stated variances."""
+    """Constant data of k observations for the estimate of pixel noise: groups, points, image cells, stated variances.
+
+    A group is the observations of one camera, or of all board corners.
+    """
 
     camera: Int[ndarray, " k"]
     """Camera of each observation."""
@@ -91,11 +94,14 @@ class Layout:
         return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
 
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:
-        """Return each observation's variance over that of the median one: common + (1 − common) · stated variance."""
+        """Return each observation's variance over that of the median one: common + (1 − common) · stated variance.
+
+        `common` is the share of the variance that all observations have alike.
+        """
         return common + (1 - common) * self.stated_variance
 
     def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
-        """Return the sum over cells and both axes of the squared sum of weighted residuals `pull`."""
+        """Return the sum over image cells and both axes of (sum of the weighted residuals `pull` in the cell)²."""
         return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
 
 
@@ -106,11 +112,12 @@ def pixel_noise(
     ratio: Float[ndarray, " g"],
     common: float = 1.0,
 ) -> PixelNoise:
-    """Return the pixel noise: size from the median point without outliers, inflation from image cells.
+    """Return the pixel noise: standard deviation of each of g groups, and inflation by correlation in image cells.
 
-    `ratio` (g,) is each group's variance over that of the first. For independent errors, the squared sum of weighted
-    residuals over a cell equals on average the sum of squares; the inflation is the factor beyond (variance inflation
-    of cluster sampling; Liang and Zeger, Biometrika 73, 1986).
+    `ratio` (g,) is each group's variance over that of the first. The median over points without outliers sets the size.
+    For independent errors, the squared sum of weighted residuals over a cell equals on average the sum of squares; the
+    inflation is the factor by which it exceeds this (variance inflation of cluster sampling; Liang and Zeger,
+    Biometrika 73, 1986).
     """
     relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
@@ -136,8 +143,8 @@ def refined_noise(
     """Return the pixel noise with new estimates of the variance of each group and of the common share.
 
     Squared residuals are corrected for the leverage of the points, which follow groups with few observations.
-    `by_point` are derivatives by the points, `starts` each point's first observation, and `known` is information about
-    each point other than its observations.
+    `by_point` are derivatives by the points, `starts` each point's first observation, and `known` is the information
+    matrix of each point from other sources than its observations; None: there is none.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point
@@ -162,7 +169,8 @@ def _common_share(
 ) -> float:
     """Return the likeliest value of `PixelNoise.common` among COMMON, under the t distribution of the Cauchy loss.
 
-    `left` is the share of each observation's variance in its residual, `ratio` is that of `pixel_noise`.
+    `left` is the share of each observation's variance that the fit leaves in its residual; `ratio` is that of
+    `pixel_noise`.
     """
     if not layout.states_variances:
         return 1.0

@@ -51,8 +51,8 @@ def point_covariance(
 ) -> Covariances:
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
-    `x` is gripper_from_camera; `uncertainty` is the joint one of X, scale and `intrinsics`. `x_px` (...,2) are pixels of
-    the distorted image, `distance_m` (...) is along the ray, and depends on the scale.
+    `x` is gripper_from_camera; `uncertainty` is the joint one of X, scale and `intrinsics`. `x_px` (...,2) are pixels
+    of the distorted image. `distance_m` (...) is the distance along the ray; its error is that of the scale.
     """
     return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
 
@@ -66,9 +66,9 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
     depth_m: Distances,
     base_from_gripper: Float[ndarray, "4 4"],
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
-    """Return the base-frame coordinates (m) of points at pixels, z = `depth_m` in the camera, and their covariance.
+    """Return base-frame coordinates (m) and covariance (m²) of points at pixels with z = `depth_m` in the camera frame.
 
-    `noise` adds the errors of the gripper pose, for a pose in the workspace of the capture.
+    `x` is gripper_from_camera. `noise` adds the errors of the gripper pose, for a pose in the workspace of the capture.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
@@ -114,9 +114,10 @@ def bounds_at(
 def seen_points(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
 ) -> SeenAndCorners:
-    """Return the point uncertainty at the centre and at the worst corner of the image, at a distance.
+    """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` from the camera.
 
-    `camera` None (given camera poses): the point is on the optical axis, without errors of intrinsics.
+    `x` is gripper_from_camera. `camera` None (given camera poses): the point is on the optical axis, without errors of
+    intrinsics.
     """
     if camera is None:
         at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)
@@ -132,10 +133,11 @@ def seen_points(
 def with_given_intrinsics(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, given: Intrinsics, distance_m: float
 ) -> WithGivenIntrinsics | None:
-    """Return the gripper_from_camera to use with `given` intrinsics, and its uncertainty; None if none were estimated.
+    """Return the gripper_from_camera to use with `given` intrinsics, and its uncertainty.
 
-    The transform is the conditional mean of X for the `given` intrinsics. Its difference from the estimated X counts as
-    uncertainty. The comparison is at the centre of the image, at a distance.
+    The result is None if the calibration did not estimate intrinsics (`camera`). The transform is the conditional mean
+    of X for the `given` intrinsics. Its difference from the estimated X counts as uncertainty. Both are compared by a
+    point at the centre of the image at `distance_m`.
     """
     joint = uncertainty.joint
     if camera is None or joint is None:
@@ -160,7 +162,7 @@ def with_given_intrinsics(
 
 
 def within_95(covariance: Float[ndarray, "n n"]) -> float:
-    """Return the length that 95 % of normal errors of this covariance do not exceed, to 1 % (Imhof 1961)."""
+    """Return the length that 95 % of zero-mean normal errors of this covariance do not exceed, to 1 % (Imhof 1961)."""
     spread = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     mean, second, third = (float((spread**power).sum()) for power in (1, 2, 3))
     if third <= 0:
@@ -170,7 +172,7 @@ def within_95(covariance: Float[ndarray, "n n"]) -> float:
 
 
 def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
-    """Return the uncertainty of the scene's pose and scale as a whole, and of its shape, from some of its points."""
+    """Return the uncertainty of the scene's pose and scale as a whole, and of its shape, from a sample of its points."""
     in_base, shared, own = points
     middle, count = np.median(in_base, axis=0), len(in_base)
     by_step = by_similarity(in_base - middle).reshape(3 * count, 7)
@@ -189,9 +191,10 @@ def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
 
 
 def scene_points(solution: Solution) -> ScenePoints:
-    """Return up to SCENE_POINTS random points of a solution with their covariance.
+    """Return up to SCENE_POINTS random points of a solution in the base frame (m), with two covariances.
 
-    The covariance follows by back substitution: of rigs given the unknowns, then of points given rigs and cameras.
+    The first is the joint covariance of all points by the errors of the unknowns and rigs, the second that of each
+    point by triangulation.
     """
     likely, images = solution.most_likely, solution.images
     count = len(images.state.points_in_world)
@@ -216,7 +219,10 @@ def scene_points(solution: Solution) -> ScenePoints:
 def _triangulation(
     solution: Solution, some: Int[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of n points by the d `Problem.columns`, and the points' covariance if these are exact."""
+    """Return the derivative of n points by the d `Problem.columns`, and the points' covariance if the columns are exact.
+
+    `some` are the ascending numbers of the points.
+    """
     images, problem = solution.images, solution.problem
     _, rows_point, rows_rig, _ = problem.rows
     rows = np.flatnonzero(np.isin(rows_point, some))
@@ -237,7 +243,7 @@ def _triangulation(
 def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
     """Return the derivative of `Problem.columns` by the p unknowns, and their covariance if the unknowns are exact.
 
-    The covariance is nonzero for the arms' rigs only.
+    The covariance is nonzero for the rigs that arms move only; the other columns are unknowns.
     """
     problem, equations, (follow, _, rig_covariance) = (
         solution.problem,
@@ -263,7 +269,10 @@ def _covariance(
     by_pixel: Float[ndarray, "*points 3 2"],
     of_pixel: Float[ndarray, "*points 2 2"],
 ) -> Covariances:
-    """Return the covariance (m²) of points from derivatives by j unknowns and by pixels; `of_pixel` is the pixels'."""
+    """Return the covariance (m²) of points: the part by j unknowns plus the part by errors of the pixels.
+
+    `by_unknown` and `by_pixel` are derivatives of the points; `of_pixel` is the covariance of each pixel (px²).
+    """
     of_unknowns = by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2)
     return of_unknowns + by_pixel @ of_pixel @ np.swapaxes(by_pixel, -1, -2)
 

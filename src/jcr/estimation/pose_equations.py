@@ -50,7 +50,10 @@ LEAST_FREE = 0.4
 
 @dataclass(frozen=True)
 class Region:
-    """Linear fit of the effective hand-eye transform (X and Z without scale) to the s = 6n errors of n poses."""
+    """Linear fit of the effective hand-eye transform to n pose errors (s = 6n numbers).
+
+    The effective transform is X and Z that fit best if the robot has systematic errors; the scale is not fitted.
+    """
 
     by_unknown: Float[ndarray, "s u"]
     """J: derivative of the residuals by the u unknowns X and Z, 12 for each arm."""
@@ -61,7 +64,10 @@ class Region:
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
-        """Return the fit for residuals with the derivative `by_unknown` by X and Z; `unknowns` is the number of all."""
+        """Return the fit for residuals with the derivative `by_unknown` (s,u) by X and Z.
+
+        `unknowns` is the number of all unknowns of the problem, with the scale and cameras.
+        """
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
         return Region(by_unknown, fit, unknowns)
@@ -76,10 +82,11 @@ class Region:
         return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
-        """Return the covariance of all p unknowns from the choice of the m poses, given E[e'e'ᵀ] (m,6,6) of each pose.
+        """Return the covariance of all p unknowns that is due to the choice of the m poses.
 
-        The poses are a sample of the workspace; other poses would give another effective transform. Residuals are
-        corrected for each pose's leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
+        The poses are a sample of the workspace; other poses would give another effective transform. `second_moment` is
+        E[e'e'ᵀ] (m,6,6) of the error e' of each pose that X and Z do not absorb. It is corrected for each pose's
+        leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
         """
         own, m = self._corrected, second_moment.shape[-3]
         spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
@@ -90,7 +97,7 @@ class Region:
 
     @cached_property
     def _corrected(self) -> Float[ndarray, "m u 6"]:
-        """Derivative of the u unknowns by each pose's residuals, divided by one minus the pose's leverage."""
+        """Derivative of the u unknowns X and Z by each pose's residual, divided by one minus the pose's leverage."""
         m = len(self.by_unknown) // 6
         u = self.by_unknown.shape[1]
         own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
@@ -114,7 +121,10 @@ def predicted_gripper_poses(
     z: Transforms,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n 4 4"]:
-    """Return predicted gripper poses (...,n,4,4): Z · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
+    """Return predicted base_from_gripper (...,n,4,4): Z · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z).
+
+    X is gripper_from_camera, Z base_from_recon; S_λ multiplies translations by the scale λ.
+    """
     scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
     return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
 
@@ -127,10 +137,11 @@ def pose_residuals(
     recon_from_camera: Poses,
     exchanged: bool = False,
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Return steps (m, rad; base axes) from reported to predicted gripper poses, and their derivative by X, log λ, Z.
+    """Return steps (m, rad; base axes) from reported to predicted gripper poses, and derivatives by X, log scale, Z.
 
-    `exchanged`: the camera is fixed and the gripper carries the scene. X is then base_from_camera, Z is
-    gripper_from_recon, and the predicted gripper_from_base is inverted before it is compared.
+    X is gripper_from_camera, Z is base_from_recon. `exchanged`: the camera is fixed and the gripper carries the scene.
+    X is then base_from_camera, Z is gripper_from_recon, and the predicted gripper_from_base is inverted before it is
+    compared.
     """
     predicted = predicted_gripper_poses(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
@@ -151,7 +162,7 @@ def pose_residuals(
 def residuals_by_camera(
     x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
 ) -> Float[ndarray, "n 6 6"]:
-    """Return the derivative of the residuals of `pose_residuals` by a step of each image's camera pose."""
+    """Return the derivative of the residuals of `pose_residuals` by a step (6) of each image's recon_from_camera."""
     base_from_recon = z[:3, :3]
     lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
     j = np.zeros((len(lever), 6, 6))
@@ -167,7 +178,10 @@ def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"])
 
 
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
-    """Return the information matrix of a weak prior (PRIOR_STD) on each arm's X and on log λ; none on Z."""
+    """Return the diagonal information matrix of a weak prior (PRIOR_STD) on each arm's X and on log scale; zero for Z.
+
+    The u = 12 · arms + 1 unknowns are X (6), log scale and Z (6) of the first arm, then X and Z of further arms.
+    """
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
         std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]
@@ -176,14 +190,20 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Return the largest factor ≤ 1 that keeps rotations and log scale of a step within LARGEST_ROTATION."""
+    """Return the largest factor ≤ 1 with which a step's rotations and log scale are at most LARGEST_ROTATION.
+
+    `step` (u,) has the order of `weak_prior`.
+    """
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
 
 
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Return the covariance of X and log λ from the information about the 13 unknowns and the weak prior."""
+    """Return the covariance (7,7) of X and log scale with the weak prior.
+
+    `hessian` (13,13) is the information matrix of X, log scale and Z without a prior.
+    """
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
 
 
@@ -194,7 +214,11 @@ def paper_residuals(
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
-    """Return the paper's δ_t (m) and δ_R, mean norms of A·X − X·B(λ) over consecutive used images (eq. 16)."""
+    """Return the paper's δ_t (m) and δ_R, mean norms of A·X − X·B(λ) over consecutive used images (eq. 16).
+
+    A and B are the motions of gripper and camera between two images; X is gripper_from_camera, λ the scale. δ_R is the
+    Frobenius norm of the rotation part.
+    """
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
     translation = np.linalg.norm(gap[:, :3, 3], axis=1).mean()
@@ -223,8 +247,8 @@ def reported_poses(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
     """Return the residuals of the n reported poses of all arms, and their derivatives.
 
-    Residuals are steps (m, rad; base axes) from reported to predicted poses. Derivatives are by the u unknowns of the
-    arms, and by a step of each pose's rig.
+    Residuals are steps (m, rad; base axes) from reported to predicted poses. The derivatives are by the u unknowns of
+    the arms (X, log scale and Z), and by a step of the rig (camera pose) that belongs to each pose.
     """
     each, begin = [], 0
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
@@ -241,9 +265,9 @@ def reported_poses(
 
 
 def pose_equations(problem: Problem, state: State, images: ImageEvidence | None) -> PoseEquations:
-    """Return the equations of the reported poses about a state; the rigs are integrated out, given the images.
+    """Return the equations of the reported poses about a state, after the rigs (camera poses) are integrated out.
 
-    If `images` is None, the rigs have the poses and the covariance of `Problem.known_rigs`.
+    The distribution of the rigs is that of `images`; None: that of `Problem.known_rigs`.
     """
     residual, by_arms, by_rig = reported_poses(problem, state)
     n, arms, free = len(residual), problem.arm_unknowns, problem.free

@@ -95,9 +95,10 @@ class Assumptions:
 def assumed(
     base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None = None
 ) -> Assumptions:
-    """Return assumptions before any calibration: typical robot errors, and a camera at the gripper.
+    """Return assumptions before any calibration: typical robot errors, and a camera at the gripper's origin.
 
-    `noise` (m, rad) is a lower bound on the random errors of the robot.
+    `camera` None: camera poses are given and exact. `noise` (m, rad) is a lower bound on the random errors of the
+    robot.
     """
     x = assumed_camera(base_from_gripper)
     return Assumptions(
@@ -109,7 +110,7 @@ def assumed(
 
 
 def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
-    """Return typical errors of a robot; `given` (m, rad) is a lower bound on the random ones."""
+    """Return typical errors of a robot; `given` is a lower bound (m, rad) on the random errors; None: no bound."""
     sizes = np.array(TYPICAL)
     if given is not None:
         sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
@@ -122,9 +123,10 @@ def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
 def typical_camera(
     intrinsics: Intrinsics | None, size: tuple[int, int], std: Float[ndarray, " q"] | None = None
 ) -> PredictedCamera:
-    """Return a typical camera of a prediction, before any images are matched.
+    """Return the camera of a prediction before any images are matched, with typical image information.
 
-    `size` is (width, height) in px; `std` are standard deviations of given `intrinsics`, as in `camera_about`.
+    `intrinsics` None: guessed from `size`, the (width, height) in px. `std` are standard deviations of given
+    `intrinsics`, as in `camera_about`.
     """
     camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
@@ -134,9 +136,9 @@ def typical_camera(
 def predict(
     assumptions: Assumptions, base_from_gripper: Poses, systematic: Float[ndarray, "s s"]
 ) -> Uncertainty:
-    """Return the predicted uncertainty of a calibration from these n gripper poses.
+    """Return the predicted uncertainty of a calibration from n gripper poses.
 
-    `systematic` (6n,6n) is the covariance of their systematic errors for a size σ_s of 1 rad.
+    `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad.
     """
     camera, x = None, assumptions.gripper_from_camera
     if assumptions.camera is None:
@@ -156,9 +158,10 @@ def predict_covariance(
     systematic: Float[ndarray, "s s"],
     averaged: bool = True,
 ) -> Float[ndarray, "7 7"]:
-    """Return the predicted covariance of X and scale for exact camera poses in metres.
+    """Return the predicted covariance of X (gripper_from_camera) and log scale for exact camera poses in metres.
 
-    `averaged`: over the sizes of the robot's errors; else these are known exactly.
+    `averaged`: average over the sizes of the robot's errors; else these sizes are known exactly. `systematic` is that
+    of `predict`.
     """
     x, noise = assumptions.gripper_from_camera, assumptions.noise
     problem, state = pose_problem(
@@ -181,7 +184,7 @@ def _predicted_solution(
     base_from_gripper: Poses,
     systematic: Float[ndarray, "s s"],
 ) -> Solution:
-    """Return the predicted solution of a problem with images of a simulated scene."""
+    """Return the predicted solution for images of a simulated scene; `systematic` is that of `predict`."""
     # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
     straight = parameters(camera.camera.intrinsics)
     straight[4:] = 0.0
@@ -257,11 +260,11 @@ UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
 def choose_poses(
     count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]
 ) -> list[int]:
-    """Return the rows of `count` candidates, chosen greedily, best first.
+    """Return the rows of the best `count` of `candidates` poses, best first, by greedy selection.
 
-    `uncertainty_of` returns the uncertainty after the poses of some rows are added; each choice reduces it most. Gains
-    fall as poses are added, so only candidates with the largest earlier gains are evaluated again (accelerated greedy
-    selection: Minoux, Optimization Techniques, 1978).
+    `uncertainty_of(rows)` returns the uncertainty if the poses of these rows are added; each choice reduces it most.
+    Gains fall as poses are added, so only candidates with the largest earlier gains are evaluated again (accelerated
+    greedy selection: Minoux, Optimization Techniques, 1978).
     """
     chosen, gain = list[int](), np.full(candidates, np.inf)
     last = uncertainty_of(np.zeros(0, dtype=int))
@@ -276,9 +279,10 @@ def choose_poses(
 
 
 def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "3"] | None = None) -> float:
-    """Return the sum of the variances of X and scale, each divided by its UNIT squared.
+    """Return the sum of the variances of X and log scale, each divided by the square of its UNIT.
 
-    With a `point` (m, from the camera in gripper axes), the variances of its position and of the rotation are summed.
+    With a `point` (m, from the camera in gripper axes), the variances of the point's position and of the rotation are
+    summed.
     """
     counted = np.eye(7) / UNIT[:, None]
     if point is not None:
@@ -289,7 +293,10 @@ def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "
 def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:
-    """Return the Fisher information of each gripper pose about the 13 unknowns, for random errors (m, rad)."""
+    """Return the information matrix of X, log scale and Z (13 unknowns) by each of n gripper poses.
+
+    `noise` (m, rad) are the standard deviations of the random errors of a pose.
+    """
     # The frame of the reconstruction is arbitrary; here it is the base frame, in metres.
     camera = base_from_gripper @ gripper_from_camera
     _, j = pose_residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
@@ -298,7 +305,7 @@ def pose_information(
 
 
 def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
-    """Return for each pose the row of the nearest existing pose."""
+    """Return for each of c poses the row of the nearest existing pose, by translation plus ARM times angle."""
     return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
@@ -307,7 +314,8 @@ def candidate_poses(
 ) -> Float[ndarray, "k 4 4"]:
     """Return random gripper poses with the camera looking at the scene, at distances similar to those of the capture.
 
-    `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the capture, enlarged by a quarter.
+    `x` is gripper_from_camera. `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the
+    capture, enlarged by a quarter.
     """
     camera = base_from_gripper @ x
     center = camera[:, :3, 3]
@@ -344,7 +352,10 @@ def candidate_poses(
 
 
 def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
-    """Return the scene centre, the point nearest to all optical axes, and each camera's distance from it (m)."""
+    """Return the scene centre, the point nearest to all optical axes, and the distance (m) of each camera from it.
+
+    `camera` are poses in the base frame.
+    """
     axis, center = camera[:, :3, 2], camera[:, :3, 3]
     scene = nearest_to_lines(center, axis)
     distance = np.linalg.norm(center - scene, axis=1)
@@ -361,7 +372,7 @@ def median_distance(camera: Poses) -> float:
 
 
 def assumed_camera(base_from_gripper: Poses) -> Transform:
-    """Return an assumed gripper_from_camera: a camera at the gripper's origin that looks along one of its axes.
+    """Return an assumed gripper_from_camera: a camera at the gripper's origin that looks along one of its six axes.
 
     All views look at one scene, so the axis is chosen whose lines over all poses pass nearest to a common point,
     relative to the distance of the point.

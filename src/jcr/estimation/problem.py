@@ -42,14 +42,17 @@ UNKNOWNS = 13
 
 
 def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
-    """Return the 12 columns of an arm's X and Z (by its number) among the unknowns; the scale is column 6."""
+    """Return the 12 columns of the X and Z of arm number `arm` among the unknowns; the common log scale is column 6."""
     first = 12 * arm
     return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Observations of points: rig and camera of each of n images; image, point and pixel of each of k observations."""
+    """Observations of points: rig and camera of each of n images; image, point and pixel of each of k observations.
+
+    A rig is a set of cameras that move together.
+    """
 
     rig: Int[ndarray, " n"]
     """Rig of each image."""
@@ -78,7 +81,7 @@ shutter); offset in x and in y, in image widths. s1 to s4 are those of OpenCV.""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportedPoses:
-    """Reported gripper poses of one arm, and the rigs that it moves."""
+    """Reported gripper poses of one arm, and the rigs (camera poses) that it moves."""
 
     rigs: Int[ndarray, " n"]
     """Rig of each pose."""
@@ -106,12 +109,15 @@ def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
 
 
 def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> LinearPrior:
-    """Return the prior that the camera is at `metres` ± `std` (m) along a unit `axis` of the gripper frame."""
+    """Return the prior that the camera is at `metres` ± `std` (m) from the gripper's origin along a unit `axis`.
+
+    The axis is in the gripper frame.
+    """
     return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
 
 
 class RigGaussian(NamedTuple):
-    """Normal distribution of the first m rigs: poses, and covariance (6m,6m) of their steps; None: exact poses."""
+    """Normal distribution of the poses of the first m rigs: mean, and covariance (6m,6m) of steps (None: exact)."""
 
     world_from_rig: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"] | None = None
@@ -119,7 +125,10 @@ class RigGaussian(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """Layout of the columns of the image equations: cameras, model errors, boards, mounts, then six for each rig."""
+    """Layout of the unknowns of the image equations: cameras, model errors, boards, mounts, then six for each rig.
+
+    Model errors are polynomials of distortion; a mount is a camera's pose on its rig.
+    """
 
     cameras: slice
     """Columns of the steps along `Problem.directions`."""
@@ -188,7 +197,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> Columns:
-        """Layout of the columns (unknowns) of the image equations."""
+        """Layout of the unknowns of the image equations, which are steps of cameras, boards and rigs."""
         boards = 0 if self.boards is None else len(self.boards.shape_std)
         mounts = [6 * camera.mount_free for camera in self.cameras]
         counts = [self.directions.shape[1], *self.model_error_counts, boards, *mounts]
@@ -206,9 +215,10 @@ class Problem:
 
     @cached_property
     def directions(self) -> Float[ndarray, "r l"]:
-        """Directions (columns) in which cameras and images may differ from the middle of their priors.
+        """Directions (columns) in which the parameters of cameras and images may differ from the means of their priors.
 
-        Rows: intrinsics of each camera; focal of all images, then shear, x and y (OF_IMAGE); s1 to s4 of the prism.
+        Rows: intrinsics of each camera; focal lengths of all images, then shears, x and y offsets (OF_IMAGE); s1 to s4
+        of the thin prism.
         """
         own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
         own = np.pad(own, ((0, OF_IMAGE * self.n_images + PRISM), (0, 0)))
@@ -221,14 +231,14 @@ class Problem:
 
     @cached_property
     def model_error_counts(self) -> list[int]:
-        """Number of model-error columns of each camera; 0 for exact intrinsics or too few observations."""
+        """Number of distortion polynomials of each camera; 0 for exact intrinsics or too few observations."""
         counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
         seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
         return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
 
     @cached_property
     def layout(self) -> Layout:
-        """Groups and image cells of the observations, from which the pixel noise is estimated."""
+        """Groups, image cells and stated variances of the observations, from which the pixel noise is estimated."""
         assert self.observations is not None
         observations, cameras = self.observations, len(self.cameras)
         camera, rig = observations.camera[observations.image], observations.rig[observations.image]
@@ -252,16 +262,17 @@ class Problem:
 
     @cached_property
     def seen(self) -> Sightings:
-        """Observations sorted by point, with the rig of each."""
+        """Index of the observations, sorted by point, with the rig of each (a rig: cameras that move together)."""
         assert self.observations is not None
         rig = self.observations.rig[self.observations.image]
         return Sightings.of(self.observations.point, rig, self.n_rigs)
 
     @cached_property
     def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
-        """Order that sorts the rows of the image equations by point and rig, and the sorted points, rigs and sightings.
+        """Four results about the rows of the image equations: sorting order, sorted points, sorted rigs, their index.
 
-        Before sorting, the rows are the observations, then two rows for each board corner.
+        Before sorting, the rows are the observations, then two rows for each board corner; the order is by point, then
+        rig.
         """
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
@@ -275,7 +286,7 @@ class Problem:
 
     @cached_property
     def displacements(self) -> Float[ndarray, "k 2 e"]:
-        """Derivatives (px) of each observation by the e model-error columns, which are in image widths."""
+        """Derivatives (px) of each observation by the e coefficients of distortion polynomials (image widths)."""
         assert self.observations is not None
         each = zip(self.cameras, self.parameters_of, self.model_error_counts, self.camera_rows, strict=True)
         x_px, columns = self.observations.x_px, [np.zeros((len(self.observations.x_px), 2, 0))]
@@ -287,7 +298,7 @@ class Problem:
 
     @cached_property
     def camera_rows(self) -> list[Int[ndarray, "..."]]:
-        """Rows of the observations of each camera."""
+        """Numbers of the observations of each camera."""
         return [np.flatnonzero(self.layout.camera == c) for c in range(len(self.cameras))]
 
     @cached_property
@@ -310,18 +321,18 @@ class Problem:
 
     @property
     def arm_unknowns(self) -> int:
-        """Number of unknowns of the arms: X and Z of each, and one scale."""
+        """Number of unknowns of the arms: 12 of X and Z for each arm, and one scale."""
         return 12 * len(self.arms) + 1
 
     @cached_property
     def by_arm(self) -> Int[ndarray, " s"]:
-        """Columns of the rigs that arms move, six for each reported pose, in the order of the poses."""
+        """Columns (of `columns`) of the rigs that arms move: six for each reported pose, in the order of the poses."""
         moving = np.concatenate([arm.rigs for arm in self.arms])
         return (self.columns.first_rig + 6 * moving[:, None] + np.arange(6)).ravel()
 
     @cached_property
     def free(self) -> Int[ndarray, " e"]:
-        """Columns that the unknowns include: cameras, model errors, boards, mounts, and rigs that no arm moves."""
+        """Columns that are unknowns: cameras, model errors, boards, mounts, and rigs that no arm moves."""
         return np.setdiff1d(np.arange(self.columns.count), self.by_arm)
 
     @property
@@ -349,7 +360,7 @@ class Problem:
         )
 
     def coordinates(self, state: State) -> Float[ndarray, " p"]:
-        """Return the values for linear priors: translation of the first X (m), log scale, camera steps; 0 for others."""
+        """Return the p values of linear priors: translation of the first X (m), log scale, camera steps; else 0."""
         out = np.zeros(self.unknowns)
         out[:3], out[SCALE] = state.x[0][:3, 3], np.log(state.scale)
         steps = self.free[self.free < self.columns.boards.stop]
@@ -361,7 +372,7 @@ def with_observations(problem: Problem, state: State, observations: Observations
     """Return the problem with the observations of all points that have two or more, and its initial state.
 
     Observations are sorted by point and rig. Only the first observation of a point in an image is kept, and points are
-    numbered anew. The cameras start at the middle of their priors.
+    numbered anew. Intrinsics start at the means of their priors.
     """
     rig = observations.rig[observations.image]
     order = np.lexsort((observations.image, rig, observations.point))
@@ -400,9 +411,10 @@ WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
 def rows_of(
     problem: Problem, camera: int, images: Int[ndarray, " m"], n_images: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return rows of `Problem.directions` for a camera, its images and the prism; their units; their weak prior std.
+    """Return three vectors for the e parameters of a camera, its m images and the prism: rows, units, weak prior std.
 
-    Units: fx and fy for the focal lengths, the image width for the principal point, else 1. The std is in these units.
+    Rows are those of `Problem.directions`. Units are fx and fy for the focal lengths, the image width for the principal
+    point, else 1. The standard deviations are in these units. `images` are the camera's images among `n_images`.
     """
     intrinsics, own, end = (
         problem.cameras[camera].intrinsics,
@@ -427,8 +439,8 @@ def freed(
 ) -> Problem:
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
-    `combinations` (e,p) has one column per direction; the e parameters are those of `hypotheses.Alternatives`. `images`
-    are the camera's images among all `n_images`.
+    `combinations` (e,p) has one direction per column; the e parameters are those of `hypotheses.Alternatives`. `images`
+    are the camera's m images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -454,9 +466,9 @@ OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacement
 
 
 def with_free(problem: Problem, **changes: Any) -> Problem:
-    """Return the problem with other priors or other free directions of the cameras (`freed`, `freed_std`).
+    """Return the problem with other priors or other free directions of the cameras (`freed`, `freed_std`) as `changes`.
 
-    Cached properties of the observations are kept, `displacements` too, which would change a little with the directions.
+    The cached properties OF_OBSERVATIONS are kept, although `displacements` would change a little with the directions.
     """
     other = replace(problem, **changes)
     if problem.observations is not None:
@@ -465,7 +477,7 @@ def with_free(problem: Problem, **changes: Any) -> Problem:
 
 
 def transferred(problem: Problem, state: State, other: Problem) -> State:
-    """Return the state as a state of `other`: the same rigs, other free camera directions, the same points or fewer.
+    """Return the state converted to the problem `other`, which has the same rigs and the same points or fewer.
 
     Camera parameters keep their values as far as the free directions of `other` allow.
     """
@@ -493,9 +505,9 @@ def stepped(
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
 ) -> State:
-    """Return the state after a step of the arms' unknowns and of the d `Problem.columns`; points do not move.
+    """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of the d `Problem.columns`.
 
-    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms; None: no step.
+    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms. None: no step. Points do not move.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -516,7 +528,10 @@ def stepped(
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step of all unknowns: those of the arms, then `Problem.free`."""
+    """Return the state after a step of all p unknowns: X, log scale and Z of the arms, then the columns `Problem.free`.
+
+    Points and the rigs that arms move stay.
+    """
     columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
     columns[problem.free] = step[arms:]
     return stepped(problem, state, step[:arms], columns if columns.any() else None)
@@ -525,7 +540,7 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
 def step_to(
     problem: Problem, state: State, other: State
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
-    """Return the steps of the arms' unknowns and of `Problem.columns` that lead from `state` to `other`."""
+    """Return the steps of the arms' unknowns and of `Problem.columns` by which `stepped` turns `state` into `other`."""
     own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
     arms = np.zeros(problem.arm_unknowns)
     arms[SCALE] = np.log(other.scale / state.scale)
@@ -541,7 +556,7 @@ def step_to(
 
 
 def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
-    """Return the derivative of `Problem.columns` by a similarity of the world: log scale, translation, rotation.
+    """Return the derivative of the d `Problem.columns` by a similarity of the world: log scale, translation, rotation.
 
     Images do not determine these seven directions.
     """
@@ -572,7 +587,10 @@ NO_ARM: Start = np.eye(4), 1.0, np.eye(4)
 def wrist_arm(
     base_from_gripper: Poses, error_covariance: Float[ndarray, "s s"] | None = None
 ) -> ReportedPoses:
-    """Return the reported poses of an arm whose pose i moves rig i; `error_covariance` None: `smooth_errors`."""
+    """Return the reported poses of an arm with a wrist camera: pose i belongs to image (rig) i.
+
+    `error_covariance` (6n,6n) is the covariance of the systematic errors for a size of 1 rad; None: `smooth_errors`.
+    """
     if error_covariance is None:
         error_covariance = smooth_errors(base_from_gripper)
     rigs = np.arange(len(base_from_gripper))
@@ -591,7 +609,9 @@ def pose_problem(
 ) -> tuple[Problem, State]:
     """Return the problem of reported gripper poses and given camera poses, without images, and its initial state.
 
-    `camera_covariance` (6n,6n) is of the steps of the camera poses; None: exact camera poses.
+    `start` is the initial (gripper_from_camera, scale, base_from_recon). `camera_covariance` (6n,6n) is of the steps of
+    the camera poses; None: exact. `error_covariance` is that of `wrist_arm`, `noise_floor` a lower bound (m, rad) on
+    the random errors.
     """
     x, scale, z = start
     problem = Problem(
@@ -616,8 +636,9 @@ def wrist_problem(
 ) -> tuple[Problem, State]:
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
-    `arm` moves rig i at image i; None: images alone, without boards. `noise` is a lower bound on the random errors of
-    the poses (m, rad). `combinations` are additional free parameters of the camera, as in `freed`.
+    `arm` has one pose per image; None: images alone, without boards. `start` is the initial (gripper_from_camera,
+    scale, base_from_recon). `noise` is a lower bound on the random errors of the poses (m, rad). `combinations` are
+    additional free parameters of the camera, as in `freed`.
     """
     x, scale, z = start
     arms, n = () if arm is None else (arm,), len(recon_from_camera)

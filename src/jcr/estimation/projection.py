@@ -47,7 +47,7 @@ class ProjectedObservations:
 
 
 def view_of(problem: Problem, state: State) -> ProjectedObservations:
-    """Return the projection of all observed points for a state."""
+    """Return the projection of all k observations' points by a state, with residuals (predicted minus observed, px)."""
     observations = problem.observations
     assert observations is not None
     cameras, k = problem.intrinsics(state), len(observations.image)
@@ -87,7 +87,10 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
 def derivatives(
     problem: Problem, state: State, view: ProjectedObservations, weight: Float[ndarray, " k"]
 ) -> Derivatives:
-    """Return residuals of observations and board corners with their derivatives, times the roots of the weights."""
+    """Return residuals of observations and board corners with their derivatives, times the roots of the weights.
+
+    `weight` (1/px²) is that of each of k observations; the rows are in the order of `Problem.rows`.
+    """
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
     shared = np.zeros((len(weight), 2, columns.first_rig))
@@ -132,7 +135,7 @@ def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
 
 
 def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative (px per unit) of each observation by its point, in world axes."""
+    """Return the derivative (px per unit of the world) of each of k observations by its point, in world axes."""
     out = _by_rig(problem, state, view)
     for pose, rows in zip(state.world_from_rig, problem.seen.rows, strict=True):
         out[rows] = _rotated(out[rows], pose[:3, :3])
@@ -140,7 +143,7 @@ def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Fl
 
 
 def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative (px per unit) of each observation by its point, in rig axes."""
+    """Return the derivative (px per unit of the world) of each of k observations by its point, in axes of its rig."""
     out = np.empty((len(view.in_camera), 2, 3))
     for camera, mount, rows in zip(view.cameras, state.rig_from_camera, problem.camera_rows, strict=True):
         out[rows] = _rotated(by_point(camera, view.in_camera[rows]), mount[:3, :3])
@@ -148,7 +151,7 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
-    """Return the derivative (px) of each observation by the l columns of `Problem.directions`."""
+    """Return the derivative (px) of each of k observations by steps along the l columns of `Problem.directions`."""
     directions, own_map = problem.directions, view.own_map
     out = np.zeros((len(view.in_camera), 2, directions.shape[1]))
     for camera, own, rows in zip(view.cameras, problem.parameters_of, problem.camera_rows, strict=True):
@@ -183,13 +186,13 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
 
 
 def _slice(directions: Float[ndarray, "r l"]) -> slice:
-    """Return the slice from the first to the last column that is not zero."""
+    """Return the slice of columns from the first to the last that is not zero."""
     columns = np.flatnonzero(directions.any(0))
     return slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)
 
 
 def _mapped(own_map: Float[ndarray, "k 2"], v: Float[ndarray, "k 2 p"]) -> Float[ndarray, "k 2 p"]:
-    """Return A v for each observation, A = [[e^l, a], [0, e^l]] with (e^l, a) in `own_map`."""
+    """Return A v for each observation, A = [[m, a], [0, m]]; focal factor m and shear a are its row of `own_map`."""
     out = own_map[:, :1, None] * v
     out[:, 0] += own_map[:, 1:] * v[:, 1]
     return out
@@ -201,5 +204,5 @@ def _of_camera(problem: Problem, values: list[float] | list[int]) -> Float[ndarr
 
 
 def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:
-    """Return derivatives by a point in b axes, from those in a axes; `rotation` is b_from_a."""
+    """Return derivatives (k,2,3) by points in axes of b, from derivatives `by` in axes of a; `rotation` is b_from_a."""
     return (by.reshape(-1, 3) @ rotation.T).reshape(by.shape)

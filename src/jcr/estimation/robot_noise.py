@@ -31,10 +31,10 @@ LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of steps of n poses whose errors vary smoothly from pose to pose.
+    """Return the covariance (6n,6n) of the errors (m, rad; base axes) of n poses that vary smoothly from pose to pose.
 
-    Standard deviations are 1 rad and REACH metres per axis. Half of an error is constant in base axes, half in gripper
-    axes.
+    Standard deviations are 1 rad and REACH metres per axis. Half of the variance is constant in base axes, half in
+    gripper axes.
     """
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
@@ -48,7 +48,7 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
 
 
 def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of steps of n poses from errors of the arm's joint offsets and links.
+    """Return the covariance (6n,6n) of pose errors (m, rad; base axes) by errors of an arm's joint offsets and links.
 
     Joint offsets have 1 rad standard deviation, link errors LINK_PER_JOINT metres; `joints` (n,dof) are angles in rad.
     """
@@ -93,7 +93,7 @@ Information = Float[ndarray, "c c"]
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Linearised equations r + J θ = noise of n gripper poses: s = 6n residuals, p unknowns θ with a normal prior."""
+    """Linearised equations r + J θ = noise of n gripper poses: s = 6n residuals r, p unknowns θ with a normal prior."""
 
     residual: Float[ndarray, " s"]
     """r: step from the reported to the predicted pose, pose by pose: m, then rad; both in base axes."""
@@ -116,12 +116,15 @@ class Equations:
 
     @property
     def least(self) -> Float[ndarray, "2"]:
-        """Lower bounds of the random errors (m, rad), given or NOISE_FLOOR; estimated variances add to their squares."""
+        """Lower bounds of the random errors (m, rad): the user's, else NOISE_FLOOR.
+
+        The squares of these bounds add to the estimated variances.
+        """
         return np.array(self.given or NOISE_FLOOR)
 
     @cached_property
     def prior(self) -> tuple[Float[ndarray, "r c"], Float[ndarray, " r"], Float[ndarray, " c"]]:
-        """Weak prior on the log sizes x: A and b of its whitened residuals A x − b, and the standard deviations of x.
+        """Weak prior on the c log sizes x, as whitened residuals A x − b: A, b, and the standard deviation of each x.
 
         The last residual is that of log(σ_t / (REACH · σ_r)).
         """
@@ -135,11 +138,11 @@ class Equations:
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
-        """Mask of the s residuals: 1 for position, 0 for rotation."""
+        """Mask of the s residuals: 1.0 for a position component (m), 0.0 for a rotation component (rad)."""
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
-        """Return the equations of k of the poses, by their rows."""
+        """Return the equations of k of the n poses, by their numbers."""
         rows = (6 * poses[:, None] + np.arange(6)).ravel()
 
         def part(of: Covariance | None) -> Any:
@@ -156,24 +159,30 @@ class Equations:
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """Return σ_t² and σ_r² plus the squares of `least`, σ_s², and the squared growths of camera pose errors."""
+        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), growths of camera errors.
+
+        The random variances are σ_t² and σ_r² plus the squares of `least`.
+        """
         variances = np.exp(2 * log_sizes)
         variances[..., :2] += self.least**2
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
-        """Return log σ_t, σ_r and σ_s of a noise record: the inverse of `noise`, at least LEAST_BESIDE of `least`."""
+        """Return log σ_t, log σ_r and log σ_s of a noise record: the inverse of `noise`.
+
+        Each σ is at least LEAST_BESIDE times the bound `least`.
+        """
         squared = np.square([noise.translation, noise.rotation]) - self.least**2
         beside = np.sqrt(np.maximum(squared, (LEAST_BESIDE * self.least) ** 2))
         return np.log(np.r_[beside, max(noise.systematic, LEAST_BESIDE * float(self.least[1]))])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
-        """Return the variance of the random part of each residual: σ_t² for position (m²), σ_r² for rotation (rad²)."""
+        """Return the variance of the random part of each of s residuals: m² for position, rad² for rotation."""
         variances = self.variances(log_sizes)
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
     def noise(self, log_sizes: LogSizes) -> RobotNoise:
-        """Return the noise record for these log sizes (robot random and systematic errors)."""
+        """Return the record of robot errors (random and systematic; m, rad) for these log sizes."""
         metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
         left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
@@ -200,7 +209,7 @@ class Equations:
 
 @dataclass(frozen=True, kw_only=True)
 class LinearSolution:
-    """Generalised least-squares solution of `Equations` for given error sizes, or for each of k values of them."""
+    """Generalised least-squares solution of `Equations` for given error sizes, or for each of k choices of the sizes."""
 
     log_posterior: Each
     """Restricted log likelihood of the sizes plus their log prior, up to a constant that the residuals' number sets."""
@@ -244,7 +253,7 @@ Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
-    """Return the generalised least-squares solution for given log sizes of the errors."""
+    """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions."""
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
     jacobian, residual = whitened[..., :-1], whitened[..., -1:]
@@ -269,9 +278,10 @@ def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution
 def left_out(
     solution: LinearSolution, noise: tuple[float, float]
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
-    """Return the residual of each of m poses from a fit without that pose, P_ii⁻¹ (P r)_i, and its covariance P_ii⁻¹.
+    """Return the residual of each of m poses from a fit without that pose, and its covariance.
 
-    P is `solution.projection`, i a pose. `noise` (m, rad) scales the matrices before they are inverted.
+    They are P_ii⁻¹ (P r)_i and P_ii⁻¹ for the block i of a pose, with P = `solution.projection` and the residuals r.
+    `noise` (m, rad) scales the matrices before they are inverted.
     """
     sigma, m = np.repeat(noise, 3), len(solution.root) // 6
     own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
@@ -285,11 +295,12 @@ def most_likely(
     start: LogSizes | None = None,
     settled: float = SETTLED,
 ) -> tuple[LogSizes, Information]:
-    """Return the log sizes at the mode of their posterior, and their expected information (c,c) there.
+    """Return the c log sizes of the errors at the mode of their posterior, and their expected information (c,c) there.
 
-    The search ends with a step below `settled`. Of more than TOO_MANY poses, that many are used, evenly spaced. Fisher
-    scoring is corrected by the curvature along the last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006,
-    eq. 6.19), because steps oscillate where the expected information is half of the curvature.
+    The search begins at `start` (None: mode of the prior) and ends with a step below `settled`. If there are more than
+    TOO_MANY poses, TOO_MANY of them are used, evenly spaced. Fisher scoring is corrected by the curvature along the
+    last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006, eq. 6.19), because steps oscillate where the
+    expected information is half of the curvature.
     """
     if (poses := len(equations.residual) // 6) > TOO_MANY:
         some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
@@ -336,10 +347,11 @@ def over_sizes(
     information: Information,
     density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
 ) -> Weighed:
-    """Return a grid of log sizes about their mode with posterior weights and solutions.
+    """Return a grid of log sizes about their mode with posterior weights and solutions, in groups.
 
-    `density` is the log posterior of the sizes, up to a constant. Grid axes are eigenvectors of the information, with
-    one step length for each direction, because the posterior is skewed: sizes have longer tails on one side.
+    `density` returns the log posterior of the sizes of a solution, up to a constant; `information` is that of
+    `most_likely`. Grid axes are eigenvectors of the information, with a step length for each direction, because the
+    posterior is skewed: sizes have longer tails on one side.
     """
     poses = len(equations.residual) // 6
     sizes, log_volumes = mode[None], np.zeros(1)
@@ -364,7 +376,7 @@ def over_sizes(
 
 
 def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
-    """Return the log posterior of the log sizes, its gradient (c,), and the expected information (c,c)."""
+    """Return the log posterior of the c log sizes of the errors, its gradient (c,), and expected information (c,c)."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])

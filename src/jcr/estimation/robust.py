@@ -44,10 +44,11 @@ def robust_fit(
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
 ) -> Solution:
-    """Solve for the images that agree with each other; the mask `problem.used` of the solution has them.
+    """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
-    Fewer than five images are all used. Arguments are those of pose_problem. The problem is solved in a frame at the
-    centre of the cameras with their extent as unit, for numerical reasons; the solution is in the given frame.
+    The mask `problem.used` of the solution has these images; fewer than five are all used. Arguments are those of
+    pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The problem is solved in a frame at the centre
+    of the cameras with their extent as unit, for numerical reasons; the solution is in the given frame.
     """
     n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)
@@ -96,9 +97,9 @@ def _improved(
     used: Images,
     changes: Callable[[Solution, Images], Iterator[Images]],
 ) -> tuple[Images, float]:
-    """Return the mask of images with the largest log evidence, by a greedy search, and that evidence.
+    """Return the mask of used images with the largest log evidence, by a greedy search from `used`, and that evidence.
 
-    `changes` yields the masks to try next, from a fit and its mask.
+    `fitted` returns the fit for a mask; `changes` yields the masks to try next, from a fit and its mask.
     """
     fit = fitted(used)
     best = _evidence(fit, used)
@@ -114,7 +115,7 @@ def _improved(
 
 
 def _more(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield masks with more images: all that are more likely right than wrong, then the most likely one."""
+    """Yield masks with more images: with all that are more likely right than wrong, then with the likeliest one only."""
     _, spread = np.linalg.slogdet(fit.leave_one_out[1])
     likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
     if not used.all():
@@ -122,7 +123,7 @@ def _more(fit: Solution, used: Images) -> Iterator[Images]:
 
 
 def _fewer(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield the mask without the used image of the largest leave-one-out error; at least four images stay."""
+    """Yield one mask, without the used image of the largest leave-one-out error; none if only four images are used."""
     if used.sum() > 4:
         yield used & (np.arange(len(used)) != np.where(used, _distance(fit), -np.inf).argmax())
 
@@ -140,7 +141,7 @@ def _distance(fit: Solution) -> Float[ndarray, " n"]:
 
 
 def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
-    """Return log((2π)^3 · w · d) for each pose: d density of its leave-one-out error if wrong, w odds of a wrong pose.
+    """Return log((2π)³ · w · d) of each pose: w odds of a wrong pose, d density of its leave-one-out error if wrong.
 
     The errors of wrong poses have a uniform direction and a log-uniform size.
     """
@@ -152,7 +153,10 @@ def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
 
 
 def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
-    """Return the mask of images with the least trimmed squared error over candidate triples, and the rms error (m)."""
+    """Return the mask of images with the least trimmed squared error over fits to image triples, and the rms error (m).
+
+    Rotation errors count as ARM times the angle.
+    """
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
     triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
@@ -185,7 +189,10 @@ def _squared_error(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
 ) -> Float[ndarray, "*batch n"]:
-    """Return the squared error (m²) of each reported gripper pose from its prediction; angles count times ARM."""
+    """Return the squared error (m²) of each reported gripper pose from its prediction; an angle counts as ARM times rad.
+
+    `x` is gripper_from_camera, `z` is base_from_recon.
+    """
     gap = predicted_gripper_poses(x, scale, z, recon_from_camera) - base_from_gripper
     return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
 

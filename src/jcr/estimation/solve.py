@@ -91,7 +91,7 @@ TINY_STEP = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """Solution of a problem: state averaged over the sizes of the robot's errors, covariance, and equations."""
+    """Solution of a problem: estimate averaged over sizes of the robot's errors, covariance, linearised equations."""
 
     problem: Problem
     state: State
@@ -141,12 +141,12 @@ class Solution:
 
     @cached_property
     def log_evidence(self) -> float:
-        """Log of (2π)^(3m) times the density of the m used poses' residuals, unknowns and sizes integrated out."""
+        """Log evidence of m used poses: density of the residuals times (2π)^(3m), unknowns and sizes integrated out."""
         return log_evidence(self.equations, self.at_mode, self.size_information)
 
     @cached_property
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-        """Leave-one-out residual of each of n poses (m, rad; base axes), and its covariance."""
+        """Residual of each of n poses from the fit to the others (m, rad; base axes), and its covariance."""
         used, every, noise, solution = self.poses.used, self.poses.every, self.noise, self.at_mode
         random, n = (noise.translation, noise.rotation), len(used)
         found, covariance = every.residual.reshape(n, 6).copy(), np.empty((n, 6, 6))
@@ -166,7 +166,7 @@ class Solution:
         return found, covariance
 
     def camera_unknowns(self, columns: slice) -> slice:
-        """Return the slice of the p unknowns for a slice of the columns of cameras, model errors or boards."""
+        """Return the slice of the p unknowns for a slice of `Problem.columns` (cameras, model errors or boards)."""
         first = self.problem.arm_unknowns
         return slice(first + columns.start, first + columns.stop)
 
@@ -177,12 +177,12 @@ class Solution:
         return directions @ self.covariance[own, own] @ directions.T
 
     def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
-        """Return `of(state)`, a transform that depends on the state, and the covariance of its step."""
+        """Return the transform `of(state)` at the estimate, and the covariance (6,6) of its step (geometry.retract)."""
         j = self.derivative(of)
         return of(self.state), j @ self.covariance @ j.T
 
     def derivative(self, of: Callable[[State], Transform]) -> Float[ndarray, "6 p"]:
-        """Return the derivative of the step of the transform `of(state)` by the p unknowns, by differences."""
+        """Return the derivative of the step of the transform `of(state)` by the p unknowns, by numerical differences."""
         found, cameras = of(self.state), self.problem.arm_unknowns
         size = TINY_STEP * np.ones(len(self.covariance))
         std = np.sqrt(np.diag(self.covariance))
@@ -202,11 +202,11 @@ def solve(
     averaged: bool = True,
     start_noise: tuple[float, float] = START_NOISE,
 ) -> Solution:
-    """Solve a problem from an initial state.
+    """Solve a problem from an initial state; return the estimate with its covariance.
 
     If `start` has an estimate of the pixel noise already, it is taken as near the solution. `averaged`: average over
-    the sizes of the robot's errors, else use their most likely values, which is faster and understates the
-    uncertainty. `start_noise` is the initial size of the random errors of the poses (m, rad).
+    the sizes of the robot's errors, else use their most likely values, which is faster and understates the uncertainty.
+    `start_noise` is the initial size of the random errors of the poses (m, rad).
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)
@@ -232,11 +232,11 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
     near: Solution | None = None,
     start_noise: tuple[float, float] = START_NOISE,
 ) -> Solution:
-    """Solve for images and reported poses of a wrist camera together, from the initial estimate of a fit to poses.
+    """Return the bundle adjustment of a wrist camera's images together with the reported poses.
 
     Arguments are those of `wrist_problem` and `solve`. `arm` may be poses, with the systematic errors `smooth_errors`;
-    `camera` may be intrinsics, which are then exact. The adjustment starts from the solution `near`, of the same poses
-    and of these or more points, if it is given.
+    `camera` may be intrinsics, which are then exact. The iteration begins at `near`, a solution for the same poses and
+    the same or more points; None: at `start`.
     """
     arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
     if isinstance(camera, Intrinsics):
@@ -250,7 +250,7 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
 
 
 def uncertainty_of(found: Solution) -> Uncertainty:
-    """Return the uncertainty of the first arm's X, of the scale, and of the first camera's intrinsics."""
+    """Return the uncertainty of the first arm's X (gripper_from_camera), the scale and the first camera's intrinsics."""
     problem, observations, model_error = found.problem, found.problem.observations, None
     known, directions = problem.intrinsics(found.state)[0], problem.directions[problem.parameters_of[0]]
     own, cameras = problem.columns.model_error[0], found.camera_unknowns(problem.columns.cameras)
@@ -269,9 +269,10 @@ def uncertainty_of(found: Solution) -> Uncertainty:
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
-    """Return scale (metres per unit) and base_from_recon of the reconstruction to which `tracks` belong.
+    """Return scale (metres per unit) and base_from_recon (metres) of the reconstruction that `tracks` belong to.
 
-    They are the robust least-squares similarity from the reconstruction's points to the adjusted points.
+    They are the robust least-squares similarity from the reconstruction's points to the adjusted points in the base
+    frame.
     """
     state, observations = solution.state, solution.problem.observations
     assert observations is not None and observations.point_rows is not None
@@ -287,13 +288,13 @@ def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
 
 
 def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
-    """Return the solution of the same problem with other linear priors; the images are not adjusted again."""
+    """Return the solution with `priors` in place of its linear priors; the images are not adjusted again."""
     problem = with_free(solution.problem, priors=tuple(priors))
     return with_covariance(problem, solution.most_likely, solution.evidence, True)
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
-    """Return log(estimated size / stated size) of the boards, and its derivative by the p unknowns."""
+    """Return log(estimated size / stated size) of the boards, and its derivative by the p unknowns of the solution."""
     problem, column = solution.problem, solution.problem.columns.boards.start
     assert problem.boards is not None
     by_unknown = np.zeros(problem.unknowns)
@@ -355,7 +356,10 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 def _joint_step(
     images: ImageEvidence, equations: Equations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton steps of the u arms' unknowns and of `Problem.columns`, and the std of all unknowns."""
+    """Return the Gauss-Newton steps of the arms' u unknowns and of the d `Problem.columns`, and the std of p unknowns.
+
+    The p unknowns are those of the arms, then the columns `Problem.free`.
+    """
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
     step = solution.step
@@ -373,8 +377,8 @@ def _accelerated(
 ) -> Float[ndarray, " n"]:
     """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
 
-    `ends` and `steps` are coordinates at the end of each round and its step. Coefficients minimise the combined step of
-    the coordinates `judged`, in units of their `std`; the others follow.
+    `ends` and `steps` hold for each round the coordinates at its end and its step, n numbers. The combination of rounds
+    minimises the step of the p coordinates `judged` (their numbers), in units of their `std`; the others follow.
     """
     if len(steps) == 1:
         return ends[-1]
@@ -393,9 +397,10 @@ def with_covariance(
     averaged: bool = True,
     expected: RobotNoise | None = None,
 ) -> Solution:
-    """Return the solution, with its covariance, from a state near it and the evidence of the images.
+    """Return the solution with its covariance, from a state near the solution and the evidence of the images.
 
-    `expected` is the assumed robot noise of a predicted solution, whose residuals are 0.
+    `images` None: camera poses are given. `averaged` is that of `solve`. `expected` is the assumed robot noise of a
+    predicted solution, whose residuals are 0; None: the noise is estimated.
     """
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
@@ -426,9 +431,9 @@ def with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Return the state with the likeliest arms' unknowns and error sizes; the images' evidence is constant.
+    """Return the state with the likeliest arms' unknowns (X, scale, Z) and error sizes, for constant image evidence.
 
-    The iteration ends with a step below `settled` squared standard deviations.
+    The iteration ends when the squared step in units of standard deviations is below `settled`.
     """
     arms = problem.arm_unknowns
     for _ in range(STEPS):
@@ -443,9 +448,9 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
 
 
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
-    """Return the information of the reported poses about the rigs, with X, scale and Z eliminated.
+    """Return the information of the reported poses about the rigs (camera poses), with X, scale and Z eliminated.
 
-    `root` is the lower Cholesky factor of the covariance of the errors of the poses.
+    `root` is the lower Cholesky factor of the covariance of the pose errors.
     """
     residual, jacobian, by_rig = reported_poses(problem, state)
     jacobian = jacobian.reshape(len(root), -1)
@@ -463,13 +468,16 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return the steps from `start` to a state: arms, `Problem.columns`, points; then its log sizes of model errors."""
+    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`."""
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 
 
 def _state_at(problem: Problem, start: State, like: State, coordinates: Float[ndarray, " n"]) -> State:
-    """Return the state with these `_coordinates`; pixel noise and robot error sizes are those of `like`."""
+    """Return the state at `coordinates`, the inverse of `_coordinates`.
+
+    Pixel noise and robot error sizes are those of the state `like`.
+    """
     ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
     arms, columns, points, sizes = np.split(coordinates, ends)
     return replace(
