@@ -40,7 +40,7 @@ WELL_SEEN = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Capture, reconstruction, and the state of their calibration; pose arrays are in the reconstruction's order."""
+    """State of a calibration between its steps; pose arrays have the m registered images in reconstruction order."""
 
     capture: Capture
     reconstruction: Reconstruction
@@ -54,7 +54,7 @@ class Case:
     fit: Calibration | None = None
     """Fit to camera poses that the adjustment started from; None while `hand_eye` is itself that fit."""
     carries: Literal["camera", "scene"] = "camera"
-    """Load of the gripper; the camera is fixed where the gripper carries the scene."""
+    """Object that the gripper carries: "camera", or "scene" if the camera is fixed and observes the carried object."""
     chosen_tracks: Tracks | None = None
     """Observations to adjust, a subset of those in the used images; None: the default subset (`tracks`)."""
     adjusted: Solution | None = None

@@ -64,10 +64,10 @@ def drift(
 ) -> Drift:
     """Estimate and test the motion of the camera on the gripper between a calibration and new images.
 
-    `old` holds base_from_gripper and recon_from_camera of the calibration. `new` holds both for the new images, and
-    the covariances of their camera poses (steps of geometry.retract, recon axes). `systematic` is the covariance of
-    the systematic errors of old, then new gripper poses for a size of 1 rad. `alpha` is the probability of a false
-    alarm.
+    `calibrated` is the fit to the old poses. `old` holds base_from_gripper and recon_from_camera of the calibration.
+    `new` holds both for the k new images, and the covariances of their camera poses (steps of geometry.retract, recon
+    axes). `systematic` is the covariance of the systematic errors of old, then new gripper poses, if their size is
+    1 rad. `alpha` is the probability of a false alarm.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
     first, state = len(old[0]), calibrated.state

@@ -92,7 +92,7 @@ def derived(findings: Sequence[Finding]) -> dict[str, Any]:
 
 
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
-    """Raise ValueError if the `verdict` or `converged` that a file states is not that of its findings."""
+    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file."""
     if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 

@@ -63,7 +63,7 @@ def better_poses(
     systematic, poses = robot.with_poses(now, possible), np.concatenate([now, possible])
 
     def uncertainty_of(rows: Int[ndarray, " c"]) -> float:
-        """Return the predicted total uncertainty with the candidates of these indices added."""
+        """Return the predicted total uncertainty (no unit) with the candidate poses of these indices added."""
         together = np.r_[existing, len(now) + rows]
         errors = of_poses(systematic, together)
         covariance = predict_covariance(assumptions, poses[together], errors, averaged=False)

@@ -29,7 +29,7 @@ class TouchTest:
     error: Float[ndarray, "k 3"]
     """Position of the tip minus position of the surface point (m, base axes), one row per point."""
     std: Float[ndarray, "k 3"]
-    """Standard deviations (m) that the errors of calibration and robot let expect."""
+    """Standard deviations (m) of `error`, predicted from the covariance of the calibration and the robot's noise."""
     p_value: float
     """Probability of errors as large as these or larger, tested for all points together."""
 
@@ -40,7 +40,7 @@ class TouchTest:
 
     @property
     def expected(self) -> float:
-        """Root mean square length (m) of the errors that `std` predicts."""
+        """Root mean square length (m) of the errors that is predicted by `std`."""
         return float(np.sqrt((self.std**2).sum(1).mean()))
 
     @property

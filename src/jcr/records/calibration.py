@@ -60,7 +60,7 @@ class Observability:
     @computed_field
     @property
     def observable(self) -> bool:
-        """Whether every direction is observable; directions with a large uncertainty count as observable."""
+        """Whether every direction is observable; a direction that is nearly unobservable counts as observable."""
         return all("nearly" in finding.details for finding in self.findings)
 
     @computed_field
@@ -195,7 +195,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Mean leave-one-out error: each image's gripper pose is predicted from the other images."""
+    """Mean leave-one-out error: difference of each reported gripper pose from its prediction by the other images."""
 
     translation_mm: float
     """Mean distance between predicted and reported gripper position."""
@@ -480,7 +480,7 @@ class BoardFound:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """One attempt to reconstruct and calibrate a capture with one back end: its success and its times."""
+    """One attempt to reconstruct and calibrate a capture with one back end: registered images, failure and times."""
 
     backend: str
     images_registered: int | None

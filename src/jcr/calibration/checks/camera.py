@@ -104,7 +104,7 @@ class CameraEffect:
     """Nuisance parameters, which are free with and without the effect."""
     _: KW_ONLY
     unit: float = 1.0
-    """Factor from the estimated parameters to the reported size."""
+    """Factor by which the estimated parameters are multiplied for the reported size."""
     places: int = 1
     """Number of change points that were tested, by which the p-value is multiplied."""
     after: int = 0
@@ -168,7 +168,7 @@ class CameraAdjustment:
     def log_p_of_given(self) -> float:
         """Logarithm of the p-value of Wald's test that the given focal lengths and principal point are exact.
 
-        It is 0 (p = 1) for differences below OFF, and for intrinsics that were not given.
+        It is 0 (p = 1) for differences below OFF (1 to 1.5 % of the focal length), and without given intrinsics.
         """
         given = self.prior.intrinsics
         by = (parameters(self.intrinsics) - parameters(given))[:4]

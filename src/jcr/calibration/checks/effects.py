@@ -369,7 +369,7 @@ def effects_of_fit(
     names: Sequence[str],
     **known: Any,
 ) -> tuple[Finding, ...]:
-    """Return the most significant effect of the image order on a fit to camera poses, as no or one finding.
+    """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
     `names` are the images of the poses; `known` are keyword arguments of `pose_problem`.
     """
