@@ -64,7 +64,7 @@ def undistorted(
 
 
 def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
-    """Return the tracks with every point of the board a second time, raised by RISE towards the mean camera centre."""
+    """Return the tracks with a copy of every point, moved from the board to the mean camera centre by share RISE."""
     on_board = tracks.points_in_recon
     middle = recon_from_camera[:, :3, 3].mean(0)
     raised = on_board + RISE * (middle - on_board)

@@ -52,12 +52,13 @@ def fused_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return inverse depth, confidence, reason and relative standard deviation (m,h,w) of depths on which views agree.
+    """Return maps (m,h,w) of inverse depth, confidence, reason (origin of the depth) and relative standard deviation.
 
-    With `priors`, pixels without a match get the depth of a plane where no view contradicts it. A matched depth needs
-    two other images that agree (one, with fewer than three neighbours), and more than twice as many as see through it;
-    in `changing` scenes, sight through it does not count. Only pixels with enough agreeing images count as seeing
-    through. Confidence and standard deviation are 0 without depth.
+    A matched depth needs two other images that agree (one, with fewer than three neighbours), and more than twice as
+    many as see through the point; in `changing` scenes, sight through it does not count. Only pixels with enough
+    agreeing images count as seeing through. With `priors`, pixels without a match get the depth of a fitted plane where
+    no image contradicts it. `score` is the correlation of the matches. Confidence and standard deviation are 0 without
+    depth.
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]

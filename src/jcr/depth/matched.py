@@ -54,7 +54,7 @@ def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
 
 
 class _Level:
-    """All images at one resolution: RGB colours, greys (sum of the three colours), and greys packed by `quads`."""
+    """All images at one resolution: RGB colours, greys (sum of the three colours), greys packed for interpolation."""
 
     def __init__(self, colors: UInt8[ndarray, "m _ _ 3"], pinhole: Intrinsics) -> None:
         size, self.pinhole = (pinhole.width, pinhole.height), pinhole

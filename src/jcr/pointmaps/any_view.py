@@ -51,10 +51,10 @@ def reconstruct_any_view(
     backend: str,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Predict all images with a network and refine the prediction by matches; the unit is the network's own.
+    """Reconstruct a capture by a network that predicts all images at once, and refine it by matches.
 
-    `load` returns the network of a folder of weights on a device. Raises InputError for weights that are missing or
-    damaged.
+    `load` returns the network of a folder of weights on a device. The unit is that of the prediction. Raises InputError
+    for weights that are missing or damaged.
     """
     report = progress or silent
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
@@ -103,7 +103,10 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
-    """Return the output `name` of a network as float32 of this shape; raise InputError if absent or of another size."""
+    """Return the entry `name` of a network's outputs (`answer`) as float32 of this shape.
+
+    Raises InputError, naming the `model`, if it is absent or of another size.
+    """
     tensor = answer.get(name) if hasattr(answer, "get") else None
     if not isinstance(tensor, torch.Tensor) or tensor.numel() != np.prod(shape):
         raise InputError(

@@ -46,7 +46,7 @@ def reconstruct_da3(
 
 
 def load(weights: Path, device: str) -> Predict:
-    """Load the network from a folder with config.json and model.safetensors.
+    """Return the function that predicts views with the network of a folder with config.json and model.safetensors.
 
     Raises InputError for files that are missing, damaged or of another network.
     """
@@ -98,7 +98,10 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
 
 
 def rays_of_edges(matrices: Float[ndarray, "n 3 3"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
-    """Return the rays with z = 1 through the pixels' centres, by matrices whose origin is the image's corner."""
+    """Return the rays with z = 1 through the centres of all pixels, by each image's intrinsics (`matrices`).
+
+    In these intrinsics, pixel coordinates are 0 at the image's corner, and 0.5 at the first pixel's centre.
+    """
     pixel = np.stack(
         [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1
     )

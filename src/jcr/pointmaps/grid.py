@@ -93,7 +93,7 @@ def image_grid(
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedImages:
-    """Images of a capture on the grid of a network."""
+    """Images of a capture, resized and cropped to the pixel grid of a network, with their intrinsics."""
 
     colors: UInt8[ndarray, "n h w 3"]
     grid: ImageGrid

@@ -50,7 +50,7 @@ class PairPredictions:
 
     @property
     def image_count(self) -> int:
-        """Number of images, named or else joined by the edges."""
+        """Number of images: that of the names, or without names the largest index in `edges` plus 1."""
         return len(self.images) or int(self.edges.max()) + 1
 
     @property
@@ -115,7 +115,10 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 
 
 def _check_edges(edges: ndarray, names: int, source: str) -> int:
-    """Return the number of images, `names` or else by the largest edge index; raise InputError for wrong edges."""
+    """Return the number of images: `names`, or the largest index in `edges` plus 1 if there are no names.
+
+    Raises InputError for wrong edges.
+    """
     if len(edges) == 0:
         raise InputError(f"{source}: no pair in it; predict at least one")
     if edges.dtype.kind not in "iu":
@@ -154,7 +157,7 @@ def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: 
 def camera_of_arrays(
     arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> tuple[Intrinsics | None, ImageGrid | None]:
-    """Return `intrinsics` and `grid` from the arrays of a file, for pointmaps of `size` (width, height).
+    """Return the intrinsics and the crop (`grid`) from the arrays of a file, for pointmaps of `size` (width, height).
 
     Each is None if absent. Raises InputError for wrong ones.
     """

@@ -56,7 +56,10 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
 def _posed_pointmaps(
     arrays: dict[str, ndarray], order: Int[ndarray, " m"], grid: ImageGrid, source: str
 ) -> PosedPointmaps:
-    """Return the pointmaps of a file, images in this order; raise InputError where points miss their pixels."""
+    """Return the pointmaps of a file, with its images in the given order, on the pixel grid `grid`.
+
+    Raises InputError where most points are not projected to their pixels.
+    """
     poses = arrays["recon_from_camera"].astype(np.float64)
     poses = np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order])
     points, confidence = arrays["points_in_recon"][order], arrays["confidence"][order].astype(np.float32)
@@ -106,7 +109,7 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
 def _images(
     capture: Capture, rows: Int[ndarray, " m"], arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> PreparedImages:
-    """Return the images on the file's grid, in ascending order of `rows`.
+    """Return the images on the file's grid, in ascending order of `rows`, their rows in the capture.
 
     Intrinsics in the file are those of undistorted images, as in predictions made by this package. Without them, the
     pixels are taken to be those of the capture's images, and a known distortion cannot be accounted for.
@@ -145,9 +148,9 @@ def _images(
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
-    """Return the published resize and crop if it gives `size`, else a plain resize if the aspect ratios agree.
+    """Return DUSt3R's resize and crop if it gives `size`, else a plain resize of `original` to `size`.
 
-    Raises InputError where they do not.
+    Sizes are (width, height). Raises InputError where the aspect ratios do not agree.
     """
     for published in (image_grid(original), image_grid(original, 224)):
         if published.size == size:

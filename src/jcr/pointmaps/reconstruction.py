@@ -59,9 +59,9 @@ def reconstruct_pointmaps(
     progress: Progress | None = None,
     image_index: Int[ndarray, " m"] | None = None,
 ) -> Reconstruction:
-    """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps.
+    """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps and matches.
 
-    `images` has colours on the grid of `maps`. Raises InputError where the points lie on no pinhole's rays.
+    `images` has colours on the grid of `maps`. Raises InputError where the points fit no pinhole camera.
     """
     report = progress or silent
     rows = np.arange(len(capture)) if image_index is None else image_index

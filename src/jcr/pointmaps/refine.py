@@ -29,10 +29,10 @@ def refine(
     pinhole: Intrinsics,
     report: Progress = silent,
 ) -> tuple[Reconstruction, PosedPointmaps] | None:
-    """Adjust the predicted cameras to matches of SIFT, or else of learned features, and the depth to their points.
+    """Adjust the predicted cameras to matches of SIFT, or else of learned features, and the depth maps to the points.
 
-    Returns the reconstruction from the matches, and the pointmaps with its cameras, both in the unit of the prediction;
-    None where an image has too few matches. `pinhole` belongs to the undistorted images and is the initial estimate of
+    Returns the reconstruction from the matches and the adjusted pointmaps, both in the unit of the prediction; None
+    where an image has too few matches. `pinhole` belongs to the undistorted images and is the initial estimate of
     unknown intrinsics.
     """
     given = images.intrinsics_of_capture
@@ -66,11 +66,11 @@ def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray
 def _depth_changes(
     made: Reconstruction, maps: PosedPointmaps, x_px: Float[ndarray, "k 2"]
 ) -> tuple[Float[ndarray, "n 6"], float]:
-    """Fit the log of a factor that corrects each image's depth, as a quadratic in the image coordinates.
+    """Return the log of the factor that corrects each image's depth map, as quadratic coefficients, and a unit.
 
-    Returns the coefficients in the order of `_basis`, and the unit of the reconstruction in units of the prediction.
-    `x_px` are the pixels of the tracks on the pointmaps' grid. The fit is robust, with a prior on all coefficients but
-    the constant, so that five points in a corner do not change the depth elsewhere.
+    The coefficients are in the order of `_basis`. The unit is that of the reconstruction `made`, in units of the
+    prediction. `x_px` are the pixels of the tracks on the pointmaps' grid. The fit is robust, with a prior on all
+    coefficients but the constant, so that five points in a corner do not change the depth elsewhere.
     """
     tracks, size = made.tracks, maps.grid.size
     camera_from_recon = inverse(made.recon_from_camera)[tracks.image]

@@ -31,7 +31,7 @@ def reconstruct_dust3r(
     backend: str,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Return camera poses and pointmaps of a capture, up to one similarity, or in metres with MASt3R.
+    """Return camera poses and pointmaps of a capture, in metres with MASt3R and in an arbitrary unit with DUSt3R.
 
     Raises InputError for images or weights that cannot be used.
     """
@@ -57,10 +57,10 @@ def predict_pairs(
     edges: Int[ndarray, "e 2"],
     progress: Progress | None = None,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
-    """Predict the pointmaps of the image pairs `edges`; return them with notes for the user.
+    """Predict the pointmaps of the ordered image pairs `edges`; return them with notes for the user.
 
-    The encoder runs once per image, and the decoder once per ordered pair. The batch is halved when CUDA runs out of
-    memory; InputError is raised when one pair does not fit.
+    The encoder runs once per image, and the decoder once per pair. The batch is halved when CUDA runs out of memory;
+    InputError is raised when one pair does not fit.
     """
     report = progress or silent
     features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
@@ -108,7 +108,10 @@ def _in_batches(
     sizes: list[int],
     report: Callable[[float], None],
 ) -> None:
-    """Call `work` on all rows in batches of the last size in `sizes`; half of it is appended when memory runs out."""
+    """Call `work` on the row numbers below `count`, in batches of the last size in `sizes`.
+
+    When memory runs out, half of this size is appended to `sizes`, and the batch is repeated.
+    """
     done = 0
     while done < count:
         rows = np.arange(done, min(done + sizes[-1], count))

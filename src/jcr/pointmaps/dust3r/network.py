@@ -40,7 +40,7 @@ class Pointmap(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Fields of a published configuration; a value that this network does not support raises ValueError."""
+    """Configuration of a published DUSt3R or MASt3R network; an unsupported value raises ValueError."""
 
     enc_embed_dim: int = 768
     enc_depth: int = 12
@@ -164,7 +164,10 @@ class Dust3r(nn.Module):
 
 
 def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: torch.device) -> Rotary:
-    """Return cosines and sines of position · base^(−2k/D) for frequency k, D = head_dim/2 (RoPE, Su et al. 2021)."""
+    """Return cosines and sines of the angle position · base^(−2k/D) of each position on the grid and frequency k.
+
+    D = head_dim/2 (RoPE, Su et al. 2021).
+    """
     position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
     exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)
     angle = position[..., None] * base**-exponent
@@ -340,7 +343,7 @@ class Dpt(nn.Module):
 
 
 class Scratch(nn.Module):
-    """Fusion of four feature maps, finest first, after their channels are brought to one number."""
+    """Fusion of four feature maps, finest first, after convolutions to a common number of channels."""
 
     def __init__(self, pyramid: Sequence[int], width: int) -> None:
         super().__init__()

@@ -63,11 +63,11 @@ class AlignmentSolution:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageEquations:
-    """Gauss-Newton equations of one image after elimination of its depths and pair errors, and the terms of their steps.
+    """Gauss-Newton equations of one image, without its pixel depths and pair errors, and the matrices that give these.
 
-    The c local unknowns are one twist for each of n second views (camera relative to observer), the log scales of the
-    pairs, and the log focal length. The t = 6n pair errors and the m log depths are eliminated. Twists are those of
-    geometry.twist_from_step; only the difference of those of camera and observer changes a residual.
+    The c local unknowns are one twist for each of n second views (relative motion of the image's camera and the
+    observer, in whose frame the view is), the log scales of the pairs, and the log focal length. The t = 6n pair errors
+    and the m log depths are eliminated. Twists are those of geometry.twist_from_step.
     """
 
     hessian: Float[ndarray, "c c"]
@@ -104,9 +104,10 @@ def gauss_newton(
 ) -> AlignmentSolution:
     """Solve for cameras, focal length, pair scales and depths by Gauss-Newton until no step exceeds `tolerance`.
 
-    The tolerance is in rad, or relative. Each iteration measures the weights and the spread of the pairs' errors again
-    and eliminates depths and pair errors, which least_squares.py does not support. The first camera and the product of
-    the pair scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
+    The tolerance is in rad for rotations and relative for the rest. Each iteration estimates the weights and
+    `pair_spread`, the standard deviations of the pairs' errors, again. It eliminates depths and pair errors, which
+    least_squares.py does not support. The first camera and the product of the pair scales are fixed. Raises
+    RejectedError where the pointmaps do not determine the unknowns.
     """
     focal = 6 * len(images)
     for iteration in range(1, ITERATIONS + 1):
@@ -156,7 +157,11 @@ def _after_step(
     equations: list[ImageEquations],
     step: Float[ndarray, " p"],
 ) -> tuple[AlignmentState, Float[ndarray, "e 6"]]:
-    """Return the state after a step of the unknowns that were not eliminated, and the variances of the pairs' errors."""
+    """Return the state after `step`, and the variances (e,6) of the pairs' errors.
+
+    The step has six numbers per camera, the log focal length and the log pair scales; depths and pair errors follow
+    from it.
+    """
     log_depth, pair_error = [], state.pair_error.copy()
     variance = np.zeros_like(pair_error)
     for o, before, e in zip(images, state.log_depth, equations, strict=True):
@@ -184,11 +189,11 @@ def _after_step(
 def _spread(
     error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
 ) -> Float[ndarray, "6"]:
-    """Estimate the standard deviations of the pairs' errors from these errors and their variances.
+    """Return the standard deviations of the pairs' errors: three of translation, three of rotation.
 
-    `before` are the standard deviations under which the errors were estimated. The update is the evidence fixed point σ²
-    = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians in place of the sums, so
-    that entirely wrong pairs do not count.
+    `error` are the estimated errors, `variance` their variances, and `before` the standard deviations assumed in the
+    estimate. The update is σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians
+    in place of the sums, so that entirely wrong pairs do not count.
     """
     determined = 1.0 - np.median((variance / before**2).reshape(-1, 2, 3), axis=(0, 2))
     squared = np.median((error**2).reshape(-1, 2, 3), axis=(0, 2)) / NORMAL_SQUARE_MEDIAN
@@ -202,10 +207,11 @@ def image_equations(
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> ImageEquations:
-    """Return the Gauss-Newton equations of one image's pointmaps, with residuals `r` and their spread `noise`.
+    """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their spread `noise`.
 
-    If v is the change of a modelled point, the weighted squared change of (across, along) is vᵀ (α I + β x̂ x̂ᵀ) v, with
-    α = w_across/|x|² and β = w_along/|x|² − α. Raises LinAlgError where the pairs' errors cannot be eliminated.
+    A change v of a modelled point at distance |x| along the unit vector x̂ changes the weighted squared residuals by vᵀ
+    (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights of the residuals across and
+    along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
     # The confidence weights are scaled to mean 1, so that the hessian is the information of the pointmaps.
@@ -258,9 +264,10 @@ def _eliminated(
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> dict[str, ndarray]:
-    """Return the equations after elimination of the pairs' errors, and the terms that give the steps of these errors.
+    """Return the fields of ImageEquations after elimination of the pairs' errors: equations, gains and variances.
 
-    The twists of the second views come first in the rows and columns of `hessian`.
+    The twists of the second views come first in the rows and columns of `hessian`. `pair_spread` are the prior standard
+    deviations of the errors.
     """
     n, count = o.second_count, 6 * o.second_count
     axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))
@@ -282,7 +289,7 @@ def _eliminated(
 
 
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
-    """Return the matrix from a step of all unknowns to a step of the local unknowns of an image's equations."""
+    """Return the matrix from a step of all unknowns to a step of the local unknowns of ImageEquations of one image."""
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)

@@ -12,10 +12,10 @@ from jcr.pointmaps.global_alignment.residuals import AlignmentState
 
 
 def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> AlignmentState:
-    """Return an initial state, accurate to a few per cent.
+    """Return an initial estimate of all unknowns, accurate to a few per cent.
 
-    Depths come from each image's first views, cameras from the pairs that agree best. `edges` are the images (first,
-    second) of each pair.
+    Depths come from the pairs that have the image first, cameras from the pairs that agree best. `edges` are the images
+    (first, second) of each pair.
     """
     focal = _focal(images)
     depth, unit = [], np.zeros(len(edges))
@@ -48,9 +48,10 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
 
 
 def _focal(images: list[ImageObservations]) -> float:
-    """Estimate fx as the median, over the first views, of pixel radius / tangent of the angle off the optical axis.
+    """Estimate fx as the median of pixel radius / tangent of the angle off the optical axis.
 
-    Raises RejectedError where no first view has points in front of its camera.
+    The median is over all pixels of pointmaps in their own camera's frame. Raises RejectedError where none of these has
+    points in front of its camera.
     """
     ratios = []
     for o in images:
@@ -66,10 +67,10 @@ def _focal(images: list[ImageObservations]) -> float:
 
 
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:
-    """Return the depth of each pixel in the image's own unit, and the log scale of each pair that has the image first.
+    """Return an image's m pixel depths, in a unit of the image, and the log scales of the f pairs that have it first.
 
-    The depth is the median over these pairs. Without such a pair, it comes from resection by the second view with most
-    inliers.
+    The depth is the median over these pairs. Without such a pair, it comes from resection: the camera's pose in the
+    other pointmap with most inliers.
     """
     if len(o.pair) > o.second_count:
         forward = np.maximum(o.direction[o.second_count :, 2], 1e-6).astype(np.float64)
@@ -94,10 +95,10 @@ def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"]
 def _similarities(
     o: ImageObservations, focal: float, depth: Float[ndarray, " m"], unit: Float[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"], Float[ndarray, " n"]]:
-    """Register an image's own points to its second views (Umeyama 1991, with Geman-McClure weights).
+    """Register an image's own points to the pointmaps of its n pairs as second image (Umeyama 1991, robust).
 
-    Returns first_from_second, the log ratio of the second image's unit to the first's, and the median residual relative
-    to the distance of the points. `unit` are the log units of the pairs.
+    Returns per pair first_from_second, the log ratio of the second image's unit to the first's, and the median residual
+    relative to the distance of the points. `depth` is that of the image's pixels, and `unit` the log unit of each pair.
     """
     n = o.second_count
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth
@@ -116,10 +117,11 @@ def _similarities(
 def _contradiction(
     edges: Int[ndarray, "e 2"], first_from_second: Float[ndarray, "e 3 3"], images: int
 ) -> Float[ndarray, " e"]:
-    """Return the angle (rad) of each pair's rotation from compositions over a third image; 0 without a third image.
+    """Return for each pair the angle (rad) between its rotation and its composition over a third image.
 
     It detects a pair whose two pointmaps fit each other but not the scene. The result is the first quartile over the
-    third images: if a third of the pairs are wrong, so are most compositions around a correct pair.
+    third images, because with a third of the pairs wrong, most compositions around a correct pair are wrong, too. It is
+    0 without a third image.
     """
     rotation = np.full((images, images, 3, 3), np.nan)
     first, second = edges.T
@@ -139,9 +141,9 @@ def _chain(
     log_ratio: Float[ndarray, " e"],
     cost: Float[ndarray, " e"],
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"]]:
-    """Return recon_from_camera and log unit of each image, chained along the minimum spanning tree (Prim) from image 0.
+    """Return recon_from_camera and log unit of each image, chained from image 0 along the minimum spanning tree (Prim).
 
-    `log_ratio` is the log of the second image's unit over the first's; `cost` is the weight of a pair in the tree.
+    `log_ratio` is the log of the second image's unit over the first's, and `cost` the weight of each pair in the tree.
     """
     count = int(edges.max()) + 1
     recon_from_camera, log_scale = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count)

@@ -18,7 +18,7 @@ POOR = 0.2
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Pairwise predictions with the fixed parameters of their alignment."""
+    """Pairwise predictions to align, with the fixed principal point and fy / fx and the rule of the weights."""
 
     predictions: PairPredictions
     principal_point_px: tuple[float, float]
@@ -38,7 +38,7 @@ class AlignmentProblem:
         return cls(predictions, middle, given.fy / given.fx if given else 1.0, largest > 1.0)
 
     def weigh(self, confidence: Float[ndarray, "*k"]) -> Float[ndarray, "*k"]:
-        """Return the weights of confidences, at least 0."""
+        """Return the weights of confidences C: log C, at least 0, for DUSt3R's confidences, otherwise C itself."""
         return np.log(np.maximum(confidence, 1.0)) if self.log_weight else confidence
 
     def observe_all(self, count: int) -> "list[ImageObservations]":
@@ -48,9 +48,10 @@ class AlignmentProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageObservations:
-    """Pointmaps of one image at m pixels, in k pairs: predicted in other cameras' frames (`second` views) or its own.
+    """Pointmaps of one image at m chosen pixels, from k pairs, as float32 arrays with pixels as the last axis.
 
-    The second views come first among the k pointmaps. Arrays are float32 with pixels as the last axis, for speed.
+    The first of the k are second views: pointmaps in the frame of another camera. The others are in the image's own
+    camera frame.
     """
 
     image: int

@@ -42,7 +42,7 @@ class AlignmentState:
 
 @dataclass(frozen=True)
 class ResidualSpread:
-    """Standard deviations of the residuals of k pointmaps, across (rad per axis) and along (relative) the sight."""
+    """Standard deviations of the residuals of k pointmaps, across the line of sight (rad) and along it (relative)."""
 
     across: Float[ndarray, " k"]
     along: Float[ndarray, " k"]
@@ -53,7 +53,7 @@ class ResidualSpread:
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Residuals of one image's pointmaps, across and along the line of sight, and their geometry in recon axes."""
+    """Residuals of one image's m points in k pointmaps, across and along the line of sight, and their derivatives."""
 
     x_in_recon: Float[ndarray, "3 m"]
     depth_arm: Float[ndarray, "3 m"]
@@ -72,7 +72,7 @@ class Residuals:
 def depth_residuals(
     o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]
 ) -> Residuals:
-    """Return the residuals of one image's points at `log_depth` in all pointmaps that contain the image."""
+    """Return the residuals of one image's points in all pointmaps that contain the image, for given log depths."""
     camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
     error = state.pair_error[o.pair]
     error[o.second_count :] = 0
@@ -103,16 +103,17 @@ def depth_residuals(
 
 
 def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray, "k m"]:
-    """Return the Geman-McClure weights of the residuals, in (0, 1]."""
+    """Return the Geman-McClure weight, in (0, 1], of each point in each pointmap; `noise` is the residuals' spread."""
     u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
 
 
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[ResidualSpread]:
-    """Estimate the spread of the residuals of every pointmap of each image.
+    """Estimate the spread of the residuals (`misfit`) of every pointmap of each image.
 
-    The standard deviations are the pointmap's own, but at least a third of the median of its kind of view (first or
-    second), so that no pair dominates by a lucky fit. The inflations are the median of the kind of view.
+    Pointmaps are of two kinds: of the first image of a pair, or of the second. The standard deviations are the
+    pointmap's own, but at least a third of the median of its kind, so that no pair dominates by a lucky fit. The
+    inflations are the median of the kind.
     """
     own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
     is_second = [np.arange(len(o.pair)) < o.second_count for o in images]
@@ -126,7 +127,10 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
 
 
 def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
-    """Return standard deviations of each pointmap by medians, inflations by cell means; rows as in ResidualSpread."""
+    """Return for each of k pointmaps: standard deviation across and along, then variance inflation across and along.
+
+    Standard deviations come from medians, inflations from the means of coarse cells.
+    """
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
     weight = o.weight * geman_mcclure_weights(r, ResidualSpread(across, along, across, along))
@@ -136,7 +140,11 @@ def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
 def _inflation(
     o: ImageObservations, weight: Float[ndarray, "k m"], parts: Float[ndarray, "k c m"]
 ) -> Float[ndarray, " k"]:
-    """Return the variance of the residuals' cell means over that of independent residuals (the design effect)."""
+    """Return the variance of the mean residuals of coarse cells, over their variance if residuals were independent.
+
+    The result (design effect) is at least 1, for each of k pointmaps. `parts` are the c components of the residuals,
+    and `weight` their weights.
+    """
     total = np.maximum(weight.sum(axis=1), 1e-12)
     cell_total = weight @ o.cell
     weighted = weight[:, None] * parts
@@ -148,7 +156,7 @@ def _inflation(
 
 
 def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray, " m"]:
-    """Return the median of the predicted depth over the image's first views, or over all views if it has none."""
+    """Return each pixel's median depth over the pointmaps in the image's own frame, or over all if there is none."""
     n, camera = o.second_count, state.recon_from_camera[o.image]
     scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
     if n < len(o.pair):
@@ -163,9 +171,9 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
 def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Estimate the depth of the observed pixels by Gauss-Newton from `initial_depth`; return it with their mean weight.
+    """Estimate the depth of the m observed pixels by Gauss-Newton with fixed cameras; return it with mean weights.
 
-    The pointmaps count as independent, weighted by agreement and noise.
+    The pointmaps count as independent, weighted by confidence, agreement and noise.
     """
     log_depth, weight = np.log(initial_depth(o, state)), o.weight
     for _ in range(DEPTH_ITERATIONS):
