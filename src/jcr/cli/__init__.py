@@ -94,7 +94,7 @@ LONGEST_LINE = 2000
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run one command and exit with its status at once; Python's own clean-up of modules would take a second."""
+    """Run the command line `arguments` and exit with its status, without Python's clean-up, which takes a second."""
     # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_closed_streams() -> None:
-    """Open closed standard streams on the null device; the next opened file would otherwise take their numbers."""
+    """Open closed standard streams on the null device; the next opened file would otherwise become such a stream."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -195,13 +195,13 @@ def dispatch(arguments: Sequence[str]) -> int:
 
 
 def _write_no_more() -> None:
-    """Discard standard output from now on, also at exit."""
+    """Discard all later standard output, because its reader has closed it."""
     with contextlib.suppress(OSError):  # in tests stdout is no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Test whether Ctrl-C caused an error; libraries that are interrupted while loading raise errors of their own."""
+    """Test whether Ctrl-C caused `error`, directly or as the cause of another library's error."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

@@ -146,7 +146,11 @@ def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
 def _conclude(
     arguments: CaptureCommand, facts: dict[str, Any], result: "RunResult | None", requirement_met: bool
 ) -> int:
-    """Print the result and the next command; return 3 if the calibration is rejected or misses `--until-accurate`."""
+    """Print the result of a capture and the next command; return the exit status.
+
+    The status is 3 if the calibration is rejected or does not meet `--until-accurate`, else 0. `facts` is the content
+    of --json; `result` None: there is no calibration.
+    """
     from jcr.calibration.words import summary
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
@@ -176,7 +180,10 @@ def _print(text: str) -> None:
 def _source(
     arguments: CaptureCommand, session: LiveSession, states: States | None, server: "LiveServer"
 ) -> Callable[[], None]:
-    """Return the function that takes images at the poses of `--poses`, and start a reader of typed commands."""
+    """Return a function that takes images at the gripper poses of `--poses`, and start to read typed commands.
+
+    `states` reads the states of an arm (None: poses are typed or posted); `server` receives posted poses.
+    """
     lines = without_commands(sys.stdin, session.press)
     if sys.stdin.isatty():
         _print(HELP)

@@ -88,7 +88,7 @@ class CheckCommand:
 
 
 def read_arguments(read: ReadOptions) -> list[str]:
-    """Return the command-line arguments for those options of reading a capture that are not the default."""
+    """Return the options of reading a capture that are not at their default as command-line arguments."""
     given = list[str]()
     for option in fields(read):
         value = getattr(read, option.name)
@@ -134,7 +134,10 @@ def _check_lines(
 
 
 def _expected(images: int, found: "Examination") -> list[str]:
-    """Return lines on the accuracy that a calibration is expected to reach, and on how poses and images agree."""
+    """Return lines with the expected accuracy of a calibration, and with the agreement of poses and images.
+
+    `images` is the number of images.
+    """
     from jcr.pipeline.check import QUICK
 
     lines, fitted = list[str](), found.hand_eye
@@ -289,7 +292,7 @@ class VerifyCommand:
 
 
 def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
-    """Return the lines on one camera: verdict, remedy, drift with its standard deviation, warnings."""
+    """Return the lines of `jcr verify` on one camera: verdict, remedy, motion with its standard deviation, warnings."""
     drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
     mm, mm_std = (numbers(1e3 * part[:3], 2) for part in (found.offset, found.std))
     deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
@@ -309,7 +312,7 @@ def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
 
 
 def _drift_facts(found: "Verification") -> dict[str, object]:
-    """Return the result for one camera as the content of --json."""
+    """Return the result of `jcr verify` for one camera as the content of --json."""
     same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes", "how")}
     return same | {
         "cause": found.cause if found.moved else None,

@@ -33,7 +33,7 @@ class VerboseOutput(Output):
 
 
 class Quiet(io.TextIOWrapper):
-    """Stderr with --quiet: text is discarded, except warnings, which `warn` writes to the stream `before`."""
+    """Stream that replaces stderr with --quiet and discards text; `warn` writes warnings to stderr (`before`)."""
 
     def __init__(self, nowhere: io.BufferedWriter, before: Any) -> None:
         super().__init__(nowhere, encoding="utf-8")
@@ -47,5 +47,5 @@ def warn(text: str) -> None:
 
 
 def numbers(values: Iterable[float], digits: int, sign: str = "") -> str:
-    """Return numbers with this many decimals in one line; `sign` "+" writes the sign of positive numbers too."""
+    """Return numbers as one line of text with `digits` decimals; `sign` "+" writes the sign of positive ones, too."""
     return " ".join(f"{value:{sign}.{digits}f}" for value in values)

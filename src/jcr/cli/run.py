@@ -189,7 +189,10 @@ class AddCameraCommand:
 
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
-    """Return the options of a run's stages from a command's arguments; options in `chosen` replace them."""
+    """Return the options of a run (RunOptions) from the fields of a command that have the same names.
+
+    Options in `chosen` replace them.
+    """
     from jcr.result import RunOptions
 
     given = {
@@ -199,7 +202,10 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
 
 
 def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progress) -> Any:
-    """Return the capture of a command, as `read` returns it; frames of a recording are put into the run folder."""
+    """Return the capture of a command, read by the function `read`, such as read_capture.
+
+    Frames of a recording are extracted into the run folder.
+    """
     from jcr.files import locked
     from jcr.result import CAPTURE
 
@@ -211,7 +217,10 @@ def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progr
 def looked_at(
     path: Path, options: ReadOptions, read: Callable[..., Any], progress: Progress, **more: Any
 ) -> Iterator[Any]:
-    """Yield the capture at a path, as `read` returns it; extracted frames of a recording are deleted afterwards."""
+    """Yield the capture at a path, read by the function `read` (such as read_capture) with the arguments `more`.
+
+    Frames of a recording are extracted to a temporary folder, which is deleted afterwards.
+    """
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
         yield read(path, options, into=scratch, progress=progress, **more)
 
@@ -219,9 +228,9 @@ def looked_at(
 def _run(
     command: CalibrateCommand, capture: Capture, options: "RunOptions", progress: Progress
 ) -> "RunResult":
-    """Run a capture, and print the calibration as soon as it is finished, before depth and map.
+    """Run all stages for a capture and return the result; print the calibration before depth and map are computed.
 
-    If no back end found a reconstruction, the returned run's calibration.json states the reason.
+    If no back end found a reconstruction, the result's calibration.json contains the reason.
     """
     from jcr.pipeline.run import run
     from jcr.pipeline.selection import NothingFoundError
@@ -263,10 +272,10 @@ def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: 
 
 
 def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
-    """Print the lines after the summary; return the exit status: 3 if the calibration or a further camera is rejected.
+    """Print the rest of a run's result; return the exit status: 3 if the calibration or a camera is rejected, else 0.
 
-    The lines are further cameras, `more`, the report and the next command, and with --verbose the details. With --json
-    the whole result is printed as one object.
+    Printed are other cameras, the lines `more`, the path of the report, the next command, and with --verbose the
+    details. With --json the whole result is printed as one object.
     """
     from jcr.calibration.words import details
 
@@ -287,7 +296,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
 
 
 def _camera_in_words(camera: "CameraPlacement") -> str:
-    """Return one line on a further camera: its verdict, and its uncertainty or the reason of its rejection."""
+    """Return one line on a camera other than the calibrated one: verdict, and uncertainty or reason of the rejection."""
     if camera.doubt is not None or camera.uncertainty is None:
         return f"{camera.name}: REJECTED: {camera.doubt}"
     stds = camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg
@@ -299,7 +308,7 @@ def _camera_in_words(camera: "CameraPlacement") -> str:
 
 
 def _line(rank: int, row: "BatchRow") -> str:
-    """Return the line of one capture in the table of a batch."""
+    """Return the line of one capture in the table of a batch: rank, name, status, used images, uncertainty, reason."""
     std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
     used = f"{row.used:3d}/{row.images:<3d}"
     return f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}".rstrip()

@@ -33,7 +33,10 @@ SHELLS = ("bash", "zsh", "tcsh", "fish")
 
 
 def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
-    """Parse the arguments of a command into its record; raise InputError with a one-line message if they are wrong."""
+    """Parse the command-line `arguments` of a command, whose class is `record`, and return an instance of the class.
+
+    `program` is the name in the help text. Raises InputError with a one-line message for wrong arguments.
+    """
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
         raise InputError(f"{_complaint(event, record, program, arguments)} ({program} --help)")
@@ -60,7 +63,9 @@ def _wrapped_paragraphs() -> Iterator[None]:
 
 
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:
-    """Write the script that completes all commands: `--tyro-write-completion SHELL FILE`.
+    """Write a shell script that completes all commands and options, as `--tyro-write-completion SHELL FILE` requests.
+
+    `records` are the classes of the commands by name.
 
     Raises InputError for another shell, or without a file.
     """
@@ -104,7 +109,7 @@ def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, argum
 
 
 def _flags(record: Any) -> Iterator[str]:
-    """Yield the options (--NAME) of a record of arguments, also those of nested records."""
+    """Yield the names (--NAME) of all options of a command's class, also those of nested classes of options."""
     if is_dataclass(record):
         hints = get_type_hints(record)
         for field in fields(record):

@@ -165,7 +165,7 @@ class QueryCommand:
 
 
 def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
-    """Write the answers of a query as .npy or .csv, by the ending of the path."""
+    """Write the rows of a query's result as .npy or .csv, depending on the ending of the path."""
     if path.suffix == ".npy":
         buffer = io.BytesIO()
         np.save(buffer, np.asarray(rows))
@@ -209,7 +209,7 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
 
 def _finite(column: ndarray) -> list:
-    """Return a column as a list for JSON, in which None replaces NaN."""
+    """Return the column of a query's result as a list for JSON, in which None replaces NaN."""
     if column.dtype.kind != "f":
         return column.tolist()
     return [None if np.isnan(value) else round(float(value), 6) for value in column]

@@ -142,7 +142,7 @@ class LiveCalibration:
 
     @one_blas_thread
     def update(self) -> Progress:
-        """Calibrate the images of the folder again, after `live` was changed, and return the new state."""
+        """Calibrate the images that the folder (`live`) has now, and return the new state of the calibration."""
         with self._lock:
             capture, before = self.live.capture(), self._mapped
             self._mapped = () if capture is None else capture.images
@@ -164,7 +164,7 @@ class LiveCalibration:
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with a new proposed pose, distant from a gripper pose at which no image could be kept."""
+        """Return the state with a new proposed pose, distant from `base_from_gripper`, where no image could be kept."""
         with self._lock:
             self._refused.append(base_from_gripper)
             self.progress = replace(self.progress, **self._propose())
@@ -177,7 +177,10 @@ class LiveCalibration:
             self._opened.close()
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
-        """Return the state of the images in the map, with a calibration if three or more of them are registered."""
+        """Return the state of the calibration; without a result if fewer than three images are registered.
+
+        `capture` has all images (None: there are none); `added` is the name of the image added last, None if none was.
+        """
         names, self._propose = self._mapped, dict
         state = Progress(images=names, added=added)
         if capture is None or self._map is None:
@@ -200,7 +203,7 @@ class LiveCalibration:
         found = None if case is None else case.hand_eye
 
         def propose_next() -> dict[str, Any]:
-            """Return the next pose, distant from all gripper poses in `_refused`, as fields of Progress."""
+            """Return the fields `next_pose` and `next_joints` of Progress, distant from the poses without an image."""
             return propose(capture, rows, found, case, arm=arm, box=self._box, refused=self._refused)
 
         self._propose = propose_next
@@ -229,10 +232,10 @@ class LiveCalibration:
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
-    """Return the tracks of all points on a board and of the points with the most observations, up to `most` in sum.
+    """Return the observations of board points, and of the points that most images observe, up to `most` observations.
 
-    Points with equally many observations are ordered by the fractional part of a pixel coordinate: this is as good as a
-    random order, and does not depend on the order of the images.
+    Among points with equally many observations, the fractional part of a pixel coordinate decides: this is as good as a
+    random choice, and does not depend on the order of the images.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     fraction = np.ones(len(count))
@@ -244,7 +247,7 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
 
 
 def _points(case: Case) -> Float[ndarray, "p 3"]:
-    """Return points (p,3) of the scene that three or more images observe, at most about MOST_POINTS (m, base frame)."""
+    """Return up to about MOST_POINTS points (m, base frame) of the reconstruction that three or more images observe."""
     tracks, hand_eye = case.reconstruction.tracks, case.hand_eye
     seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
     some = seen[:: max(1, len(seen) // MOST_POINTS)]

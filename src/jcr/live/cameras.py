@@ -72,7 +72,7 @@ class Camera:
 
 
 class Frames:
-    """Iterator of frames. A thread reads devices and streams, so that their buffers stay empty; recordings need none."""
+    """Iterator over the frames of a camera or recording; a thread reads cameras, so that no old frames are buffered."""
 
     def __init__(self, read: Callable[[], Frame | None], name: str | None) -> None:
         """Start the thread of a device or stream called `name`; None: a recording, which is read without a thread.
@@ -90,7 +90,10 @@ class Frames:
         return self._frame
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames taken after each request; raise InputError if a device or stream gives none for TIMEOUT_S."""
+        """Yield, for each request, a frame taken after it; of a recording, the next frame.
+
+        Raises InputError if a camera gives no frame for 10 s.
+        """
         if self._name is None:
             for frame in iter(self._read, None):
                 self._frame = frame
@@ -315,10 +318,11 @@ def _apply_realsense_options(rs: ModuleType, profile: Any, options: CameraOption
 
 
 def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None:
-    """Return the stored intrinsics for capture.json; None if OpenCV's distortion model misses them by FITTED_PX or more.
+    """Return the intrinsics that a RealSense stores, as an entry of capture.json with OpenCV's distortion model.
 
-    librealsense has distortion models of its own ("Projection in Intel RealSense SDK 2.0"). OpenCV's coefficients
-    k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for a grid of pixels.
+    OpenCV's coefficients k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for
+    a grid of pixels, because its distortion models differ ("Projection in Intel RealSense SDK 2.0"). None: the fit
+    deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its intrinsics of the camera.
     """
     intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):
@@ -350,7 +354,7 @@ GRID_PX = 160
 
 @dataclass(frozen=True, eq=False)
 class ImageSummary:
-    """Coarse grey levels and sharpness of an image, with which later images are compared."""
+    """Grey levels at low resolution and sharpness of an image, to compare later images with it."""
 
     grid: Float32[ndarray, "gh gw"]
     """Grey levels of the image reduced to GRID_PX, minus their mean."""
@@ -366,7 +370,7 @@ class ImageSummary:
         return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images have the same size and differ by noise only."""
+        """Test whether two images are the same view: equal size, and grey levels that differ by noise only."""
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 
@@ -394,7 +398,10 @@ def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patienc
 
 
 def _fault(earlier: Frame, frame: Frame, kept: Sequence[ImageSummary]) -> str | None:
-    """Return the reason why a frame cannot be kept; None if it can. `earlier` is a frame REST_S or more before it."""
+    """Return the reason why a frame cannot be kept, such as motion or blur; None if it can be kept.
+
+    `earlier` is a frame taken at least 0.2 s before `frame`; `kept` are the images at other gripper poses.
+    """
     if earlier.image.shape != frame.image.shape:
         return "the size of the camera's images changes; fix it with --camera-size"
     now = ImageSummary.of(frame.image)

@@ -159,7 +159,10 @@ class LiveFolder:
         return None if not images or self.size is None else self._capture_of(images, self.size)
 
     def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
-        """Raise InputError if a new image looks like an image of the folder; `number` is its name in the message."""
+        """Raise InputError if the image `new` shows the same view as an image of the folder.
+
+        `base_from_gripper` is the pose of the new image, `number` its name in the message.
+        """
         for one in self.images:
             if not new.is_like(self.summary(one.image)):
                 continue
@@ -174,7 +177,10 @@ class LiveFolder:
             )
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
-        """Return a capture of images of `size` (width, height) px; raise InputError if capture.json contradicts them."""
+        """Return the capture with these entries of images of `size` (width, height) px.
+
+        Raises InputError if other entries of capture.json, such as the intrinsics, do not fit the images.
+        """
         return Capture(
             folder=self.folder,
             images=tuple(one.image for one in images),

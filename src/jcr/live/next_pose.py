@@ -41,12 +41,12 @@ def propose(
     box: Float[ndarray, "2 3"] | None = None,
     refused: Sequence[Float[ndarray, "4 4"]] = (),
 ) -> dict[str, Any]:
-    """Return the fields `next_pose` and, with an arm, `next_joints` of Progress; empty for fewer than two images.
+    """Return the gripper pose that improves the calibration most: the fields `next_pose` and `next_joints` of Progress.
 
-    `registered` are the rows of the capture whose images registered; with fewer than two, all rows are used. The errors
-    expected of robot and images are those of a sound calibration `case`, else typical ones. `hand_eye` is the last
-    calibration, which may be rejected. The pose is within the joint limits of `arm` and in the `box` (m, base frame),
-    and distant from the gripper poses `refused`, at which no image could be kept.
+    `registered` are the indices of the images with a camera pose. The expected errors of robot and images are those of
+    `case`, the last calibration if accepted, else typical ones; `hand_eye` may be a rejected calibration. The pose is
+    within the joint limits of `arm` and in the `box` (lower, upper corner; m, base frame), and distant from the gripper
+    poses `refused`, at which no image could be kept. The result is empty for fewer than two images.
     """
     if len(capture) < 2:
         return {}
@@ -63,11 +63,11 @@ def propose(
     failed = np.concatenate([poses[~has_camera], np.reshape(refused, (-1, 4, 4))])
 
     def wanted(added: Poses, *, or_likely: bool = False) -> Bool[ndarray, " k"]:
-        """Test, for each added pose, whether its image is likely to register and it is rotated enough to be useful.
+        """Return True for each of k gripper poses `added` whose image will likely register and is rotated enough.
 
-        An image is likely to register if its optical axis is within ALIKE of a registered image's, and its camera not
-        near a failed one. If the last image failed, `x` may be wrong, and rotations of the gripper are compared instead
-        of axes. `or_likely`: if no pose passes both tests, return the result of the first one.
+        An image will likely register if its optical axis is within 25° of a registered image's axis, and its camera
+        is not near that of an image that failed. After a failure, gripper rotations are compared instead of axes.
+        Rotated enough: by 15° from all images. `or_likely`: if no pose passes both tests, apply only the first one.
         """
         cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
         angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
@@ -94,10 +94,10 @@ def propose(
 
 
 def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibration | None) -> Assumptions:
-    """Return a typical robot and camera at `poses`, the gripper poses of the registered images.
+    """Return the assumptions for the prediction of uncertainties without an accepted calibration: typical errors.
 
-    gripper_from_camera is that of a rejected calibration if its standard deviations are below AIMED, else a guess from
-    the gripper poses.
+    `poses` are the m gripper poses of the registered images. gripper_from_camera is that of `hand_eye` if its standard
+    deviations are below 0.1 m and 5°, else a guess from the gripper poses.
     """
     camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
     assumptions = assumed(poses, camera)
@@ -109,7 +109,7 @@ def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibra
 
 
 def _least_rotation(added: Poses, known: Float[ndarray, "n 4 4"]) -> Float[ndarray, " k"]:
-    """Return for each added pose (k,4,4) the angle (rad) to the known pose of the most similar rotation."""
+    """Return for each of k poses `added` the angle (rad) between its rotation and the most similar one in `known`."""
     relative = np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3]
     return np.asarray(rotation_angle(relative)).min(1)
 
@@ -120,10 +120,10 @@ def joints_at(
     joints: Float[ndarray, "n dof"] | None,
     goal: Float[ndarray, "4 4"],
 ) -> Float[ndarray, " dof"] | None:
-    """Return joint angles (rad) within the limits that move the gripper to `goal`; None if there are none.
+    """Return joint angles (rad) within the limits of `arm` that move the gripper to the pose `goal`; None if impossible.
 
-    `base_from_gripper` (n,4,4) and `joints` (n,dof) rad are those of the images; None: not recorded. From recorded
-    angles the tool is computed, and the result keeps the arm's present configuration (elbow up or down, and so on).
+    `base_from_gripper` and `joints` (rad) are those of the n images; `joints` None: not recorded. Recorded joints
+    determine the pose of the tool on the flange, and the result keeps the arm's configuration (elbow up or down, …).
     """
     if joints is not None:
         now = joints[-1:]

@@ -50,7 +50,7 @@ FEW_FEATURES = 150
 
 
 def whole_page(session: LiveSession) -> str:
-    """Return the HTML page that a browser loads first; its script then requests `page_parts` again and again."""
+    """Return the HTML of the live page, without its changing parts, which its script requests from `page_parts`."""
     checks = [(name, label, True) for name, label in LAYERS.items()]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
     content = {"folder": str(session.folder.folder), "scene": view}
@@ -58,9 +58,9 @@ def whole_page(session: LiveSession) -> str:
 
 
 def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> dict[str, Any]:
-    """Return the parts of the page as HTML, the data of the 3D view, and the flags that the page's script needs.
+    """Return the changing parts of the live page for a state: HTML by name, data of the 3D view, flags of the script.
 
-    `has_report`: the report of the final calibration can be opened.
+    `has_report`: the report of the final calibration exists and can be opened.
     """
     required = session.options.require or GRASPING
     content = page_content(state, required, session.notation, has_report)
@@ -78,7 +78,7 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 def page_content(
     state: SessionState, required: tuple[float, float], notation: Notation, has_report: bool = False
 ) -> dict[str, Any]:
-    """Return the values of a state that the templates show; `required` is the required accuracy (mm, degrees).
+    """Return the values that the page's templates show for a state; `required` is the required accuracy (mm, degrees).
 
     "kind" selects the colour of the headline ("good", "fair", "bad" or empty). "images" are the cards of the list, the
     newest first.
@@ -121,7 +121,7 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
 
 
 def _verdict(state: SessionState) -> list[str]:
-    """Return the kind of the headline (see `page_content`), the headline, and the lines below it."""
+    """Return a list: colour of the headline ("good", "fair", "bad" or empty), headline, and the lines below it."""
     progress, result, count = state.progress, state.result, len(state.images)
     wrong = faults(progress)
     if result is not None:

@@ -57,7 +57,7 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Bounds of 95 % of the errors (mm, degrees), at the point that `Requirement.at` names; None without one."""
+        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors, of what `Requirement.at` names; None if unknown."""
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
@@ -114,7 +114,7 @@ class Progress:
 
 
 def faults(state: Progress) -> list[Finding]:
-    """Return the findings that reject or warn, those on the added image first.
+    """Return the findings that reject the calibration or warn, first those about the image added last.
 
     Findings that only state that more images are needed are left out.
     """

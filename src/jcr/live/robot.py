@@ -250,7 +250,10 @@ def command_of(line: str) -> tuple[Action, int | None] | None:
 
 
 def without_commands(lines: Iterable[str], press: Callable[[Action, int | None], None]) -> Iterator[str]:
-    """Yield the lines that are no commands; call `press` with action and image number of each command."""
+    """Yield the typed lines that are no commands; for each command, call `press` with action and image number.
+
+    The number is None if the command has none.
+    """
     for line in lines:
         command = command_of(line)
         if command is None:

@@ -60,7 +60,7 @@ class _Command(BaseModel):
 
 
 class LiveServer(ThreadingHTTPServer):
-    """HTTP server of a session, which serves inside its `with` statement; leaving waits for requests in progress."""
+    """HTTP server of a live capture's page; it serves inside its `with` statement, whose end waits for open requests."""
 
     daemon_threads = False
 
@@ -72,10 +72,10 @@ class LiveServer(ThreadingHTTPServer):
         token: str | None = None,
         takes_samples: bool = False,
     ) -> None:
-        """Bind the address; raise InputError if that fails, or if another machine could connect without a token.
+        """Bind the address `host`:`port`; raise InputError if that fails, or if `host` is not loopback without a token.
 
-        `host` is loopback, or the one host name that requests may use; that needs a `token`. `token` is the key of the
-        session; None: a random key. `port` 0: any free port. `takes_samples`: programs may post gripper poses.
+        `token` is the key that the addresses of all requests contain; None: a random key. `port` 0: any free port.
+        `takes_samples`: other programs may post gripper poses, at which images are then taken.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError(
@@ -123,7 +123,7 @@ class LiveServer(ThreadingHTTPServer):
             time.sleep(0.1)
 
     def page_has(self, version: int) -> None:
-        """Record that the page requested its state now, and the version of the state that it shows."""
+        """Record that a page requested the state just now, and that it shows the state of this `version`."""
         self._page_version, self._page_s = max(self._page_version, version), time.monotonic()
 
     def __enter__(self) -> "LiveServer":

@@ -109,7 +109,10 @@ class LiveSession:
         notation: Notation | None = None,
         gripper: Callable[[], RobotState] | None = None,
     ) -> None:
-        """Prepare a session that adds images to `calibration`; `run` starts the session."""
+        """Prepare a session that adds images of `camera` to `calibration`; `run` starts it.
+
+        `tell` and `gripper`: see the class. `notation` is that of proposed poses.
+        """
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
         self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)
         self._tell, self._gripper = tell, gripper
@@ -206,7 +209,10 @@ class LiveSession:
         return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
-        """Execute a command of a person; `number` is the image, counted from 1; None: the last one."""
+        """Execute a command of a person, such as "take" or "remove".
+
+        `number` is the number of the image that it concerns, counted from 1; None: the last image.
+        """
         with self._lock:
             names = self.folder.names
             number = len(names) if number is None else number
@@ -272,11 +278,11 @@ class LiveSession:
         return found
 
     def _refuse(self, event: str) -> None:
-        """Publish an event as a refusal: the reason why a request or command was not executed."""
+        """Publish `event`, the reason why a request or command was not executed, on the page and through `tell`."""
         self._say(event, {"accepted": False, "reason": event.removeprefix("refused: ")})
 
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
-        """Request `_calibrate` from the worker thread; `refused` is a gripper pose at which no image could be kept."""
+        """Call `_calibrate` in the worker thread; `refused` is a gripper pose without a usable image, or None."""
         with suppress(RuntimeError):  # After the end of the session the worker accepts no requests.
             self._following = self._worker.submit(self._calibrate, refused)
 
@@ -313,12 +319,18 @@ class LiveSession:
         self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
-        """Publish an event, on the page and through `tell`; `changes` are other fields of SessionState."""
+        """Publish an event (text) on the page, and with `answer` (JSON) through `tell`.
+
+        `changes` are new values of fields of SessionState.
+        """
         self._show(event, is_refusal=not answer.get("accepted", True), **changes)
         self._tell(answer, [event])
 
     def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
-        """Replace `state` by one with this event and these fields, and notify waiting threads."""
+        """Replace `state` by a copy with this event and the fields `changes`, and notify waiting threads.
+
+        `is_refusal`: the event is the reason why a request was refused.
+        """
         with self._changed:
             changes["is_over"] = self.state.is_over or changes.get("is_over", False)
             self.state = replace(
