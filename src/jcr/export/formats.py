@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One export format: a row of the table of formats."""
+    """One export format of `jcr export`: its name, default file, and the function that writes it."""
 
     name: str
     file: str
@@ -74,8 +74,9 @@ def export_run(
 ) -> Path:
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line. Raises InputError for a run, format, option or path that cannot be used,
-    and RejectedError if the calibration is rejected; with `force` it is exported, and the file contains the reason.
+    `path` None: the format's default file in `out`/export. `options` are those of the command line. Raises InputError
+    for a run, format, option or path that cannot be used, and RejectedError if the calibration is rejected; with
+    `force` it is exported, and the file contains the reason.
     """
     file = None if path is None else Path(path)
     return write_run(Path(out), format, file, checked_options(options, ExportOptions))[2]
@@ -84,7 +85,7 @@ def export_run(
 def write_run(
     out: Path, format: ExportName, path: Path | None, options: ExportOptions
 ) -> "tuple[ExportedRun, ExportFormat, Path]":
-    """Write a run in an export format; return the exported run, the row of the format and the written path.
+    """Write a run in an export format; return the exported run, the description of the format and the written path.
 
     Raises InputError for an unknown format, for options that do not fit, for a run that lacks the data of the format,
     and for a path with other content unless `options.overwrite` is set. Raises RejectedError if the calibration is
@@ -127,7 +128,7 @@ def write_run(
 
 
 class ExportedRun:
-    """Run folder with export options; the properties read only the data that a format needs."""
+    """Contents of a run folder for export; each property reads its data from the folder when it is used."""
 
     def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:
         self.options, self.run, self.path = options, RunResult(out), path
@@ -144,13 +145,13 @@ class ExportedRun:
 
     @property
     def notes(self) -> dict[str, str]:
-        """Notes for files with data in the base frame: frame, unit, version, reason of a rejection."""
+        """Notes to store in files with data in the base frame, by key: frame, unit, version, reason of a rejection."""
         ros.require_frame_name(self.options.base_frame)
         return provenance(self.options.base_frame, self.doubt)
 
     @property
     def mount(self) -> ros.CameraMount:
-        """Mount of the exported camera, with the frame names that the options give."""
+        """Transform of the exported camera to its parent frame, with the frame names from the options."""
         options, found = self.options, self.calibration
         if self.camera is not None:
             mount = self._mount_of(self.camera, options.child_frame)
@@ -181,7 +182,7 @@ class ExportedRun:
 
     @property
     def others(self) -> list[ros.CameraMount]:
-        """Mounts of the run's further cameras and arms; empty if the options choose one camera.
+        """Transforms of the run's other cameras and arms to their parent frames; empty if the options choose one camera.
 
         Rejected cameras are included only with `options.force`.
         """
@@ -209,7 +210,7 @@ class ExportedRun:
         return load_map(self.run.out)
 
     def _camera(self, name: str) -> "CameraPlacement":
-        """Return a further camera of the run by its name; raise InputError if the run has no pose of it."""
+        """Return the run's other camera of this name; raise InputError if the run has no pose of such a camera."""
         cameras = self.run.cameras
         for camera in () if cameras is None else cameras.cameras:
             if camera.name == name and camera.parent_from_camera is not None:
@@ -219,7 +220,7 @@ class ExportedRun:
         )
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
-        """Return the mount of a further camera; `child` is the name of its camera frame."""
+        """Return the frame `child` of a camera other than the calibrated one, with its transform to its parent frame."""
         intrinsics = camera.intrinsics
         matrix = np.array(camera.parent_from_camera)
         return self._named(camera.mount, child, matrix, camera.doubt, intrinsics, camera.arm)
@@ -233,9 +234,10 @@ class ExportedRun:
         intrinsics: "Intrinsics | None" = None,
         arm: str | None = None,
     ) -> ros.CameraMount:
-        """Return the mount of frame `child` on the base or the gripper.
+        """Return the frame `child` with its transform to the base (`on` is "base") or else to the gripper.
 
-        `arm` is the name of another arm, which is put before the names of its frames.
+        `doubt` is the reason if the transform is rejected. `arm` is the name of another arm (None: the calibrated arm),
+        which is put before the names of its frames.
         """
         of_arm = "" if arm is None else f"{arm}_"
         base, effector = of_arm + self.options.base_frame, of_arm + self.options.parent_frame

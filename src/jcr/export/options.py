@@ -54,6 +54,9 @@ class ExportOptions:
 
 
 def provenance(frame: str, doubt: str | None = None) -> dict[str, str]:
-    """Return notes for a file, one line each: frame, unit, version, and the reason if the calibration is rejected."""
+    """Return notes to store in an exported file, by key: frame, unit, version, and a warning with the reason `doubt`.
+
+    `doubt` None: the calibration is not rejected.
+    """
     about = {"frame": frame, "unit": "m", "made_by": f"jcr {__version__}"}
     return about if doubt is None else about | {"warning": f"REJECTED: {' '.join(doubt.split())}"}

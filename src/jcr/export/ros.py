@@ -76,10 +76,10 @@ def require_frame_name(name: str) -> None:
 def on_root(
     mount: CameraMount, root: str, root_from_optical: Float[ndarray, "4 4"] = ROOT_FROM_OPTICAL
 ) -> CameraMount:
-    """Return the mount of the root link of a camera driver's frames instead of the optical frame.
+    """Return the mount with the camera driver's root link `root` as child instead of the optical frame.
 
-    The driver already publishes a parent of the optical frame, and a frame can have only one. The result is
-    parent_from_root = parent_from_optical · inverse(root_from_optical).
+    The driver already publishes a parent of the optical frame, and a frame can have only one. The result has the
+    transform parent_from_root = parent_from_optical · inverse(root_from_optical).
     """
     if root in (mount.parent, mount.child):
         raise InputError(f"root frame {root!r}: is the name of another frame; name the camera's root link")
@@ -99,7 +99,7 @@ def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
 
 
 def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
-    """Return a ROS 2 launch file (XML) that publishes the transforms of the mount and of further cameras and arms."""
+    """Return a ROS 2 launch file (XML) that publishes the transforms of the camera (`mount`) and of `others`."""
     nodes = []
     for k, one in enumerate((mount, *others)):
         arguments = " ".join(_publisher_arguments(one.parent, one.child, one.parent_from_child))
@@ -141,7 +141,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
-    """Return a URDF with a fixed joint for each camera and further arm, and with a single root link.
+    """Return a URDF with a fixed joint for each camera and each other arm, and with a single root link.
 
     If there are cameras on a gripper and fixed cameras, a floating joint stands for the arm between base and gripper.
     """
@@ -230,7 +230,7 @@ def camera_info(mount: CameraMount) -> str:
 
 
 def notes(mount: CameraMount) -> list[str]:
-    """Return the comment lines at the start of every file: frames, units, intrinsics, and the reason of a rejection."""
+    """Return the comments for the start of an exported file, one text a line: frames, units, intrinsics, rejection."""
     lines = [f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"]
     if (given := mount.intrinsics) is not None:
         coefficients = zip(COEFFICIENTS[given.model], given.distortion, strict=True)
@@ -243,7 +243,7 @@ def notes(mount: CameraMount) -> list[str]:
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
-    """Return the arguments of static_transform_publisher as a list."""
+    """Return the command-line arguments of tf2_ros static_transform_publisher for a transform, as a list."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
     numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]
@@ -261,7 +261,7 @@ def _number(value: float) -> str:
 
 
 def _comments(mount: CameraMount, *more: str) -> str:
-    """Return the notes of a mount and the lines `more` as comments of YAML or Python."""
+    """Return the result of `notes` and the lines `more` as one text of comments for YAML or Python (#)."""
     return "\n".join(f"# {' '.join(line.split())}" for line in [*notes(mount), *more])
 
 
@@ -272,6 +272,9 @@ def _xml_comment(*lines: str) -> str:
 
 
 def _yaml(mount: CameraMount, content: Mapping[str, Any], *more: str, flow: bool | None = None) -> str:
-    """Return YAML text: the notes of a mount and `more` as comments, then the content (`flow` as in yaml.safe_dump)."""
+    """Return YAML text: the result of `notes` and the lines `more` as comments, then the content.
+
+    `flow` is the default_flow_style of yaml.safe_dump.
+    """
     body = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=flow, width=110)
     return f"{_comments(mount, *more)}\n{body}"

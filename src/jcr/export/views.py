@@ -107,7 +107,10 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
 
 
 def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) -> pycolmap.Reconstruction:
-    """Return a COLMAP model with the camera poses in the base frame, the given names and intrinsics, and all tracks."""
+    """Return a COLMAP model in the base frame (m) with all images and tracks.
+
+    `names` and `intrinsics` are those of the exported image files. Raises InputError if COLMAP lacks the distortion.
+    """
     if intrinsics.model == "thin_prism":
         raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
     model = pycolmap.Reconstruction()
@@ -136,7 +139,7 @@ def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) 
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:
-    """Copy, link or undistort the images into a new folder; return their new names and intrinsics."""
+    """Copy, link or undistort the images into a new folder; return their file names in it and their intrinsics."""
     folder.mkdir()
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):

@@ -85,10 +85,10 @@ def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
 
 
 def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write spheres (`centers` (n,3), `radii` (n,)) as .npz that cover solid space with at most `excess` m beyond it.
+    """Write spheres that cover solid space as .npz: `centers` (n,3) m in the base frame, and `radii` (n,) m.
 
-    Unseen space counts as free by default. The default excess is two cells of the map; space is sampled in steps of a
-    quarter of the excess.
+    Spheres exceed solid space by at most `options.excess`, by default two cells of the map. Unseen space counts as free
+    by default. Space is sampled in steps of a quarter of the excess.
     """
     unknown = options.unknown or "free"
     excess = 2 * scene.cell if options.excess is None else options.excess
@@ -115,13 +115,16 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the voxel centres (m) of a grid; `lower` is its lower corner, `count` the number of voxels per axis."""
+    """Return the centres (m) of `count` voxels along x, y, z with side `voxel` (m), from the corner `lower` (m) on."""
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """Return a voxel's side (m), by default the map's cell; raise InputError if it is invalid or there are too many."""
+    """Return the side (m) of voxels: `side` or, if None, the map's cell.
+
+    Raises InputError if it does not fit the workspace, or if there would be too many voxels.
+    """
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():

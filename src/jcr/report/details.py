@@ -26,7 +26,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Content:
-    """Return tables of names and values: facts of the calibration, history of the map, options, and versions."""
+    """Return tables of names and values: calibration, map (`map_history`), options of each stage, and versions."""
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {
@@ -55,7 +55,7 @@ def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Cont
 
 
 def cameras_section(cameras: CamerasFile) -> Content:
-    """Return a card for each camera of the cell, with transform and images, and one for each other arm."""
+    """Return the section on the other cameras: a card for each camera and each other arm, with its transform."""
     cards = []
     for camera in cameras.cameras:
         arm = "" if camera.arm is None else f" of arm {camera.arm}"
@@ -82,7 +82,10 @@ def cameras_section(cameras: CamerasFile) -> Content:
 def _matrix(
     matrix: Float[ndarray, "4 4"] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, str | None]:
-    """Return a transform as text to read and to copy, and its standard deviations; "matrix" is None if there is none."""
+    """Return texts of a transform (m): "matrix" to read, "copied" to copy, and "std" with its standard deviations.
+
+    Without a transform or its uncertainty, "matrix" is None and the only entry.
+    """
     if matrix is None or uncertainty is None:
         return {"matrix": None}
     return {

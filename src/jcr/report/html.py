@@ -79,7 +79,10 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
 
 
 def _page(about: str, source: Path, calibration: AnyCalibration, sections: Mapping[str, Content]) -> str:
-    """Return the whole page; `about` is a line on the capture, `source` the path of the capture that the user gave."""
+    """Return the report as one HTML page; `sections` maps the name of each section to the content of its template.
+
+    `about` is a line on the capture, `source` the path of the capture that the user gave.
+    """
     # Files with a usual name, such as capture.json, do not name the capture; their folder does.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

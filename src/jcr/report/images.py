@@ -69,10 +69,10 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
 
 
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:
-    """Return pixel coordinates x and y in the image file, as rows of GRID by GRID points of the displayed image.
+    """Return for GRID x GRID points of a displayed image their pixels in the image file: {"x": rows, "y": rows}.
 
-    The displayed image has `size` (width, height) and no distortion. The page uses the grid to show the pixel of the
-    file under the pointer.
+    The displayed image has `size` (width, height) and no distortion; the file has the distortion of `intrinsics`. The
+    page uses the grid to show the pixel under the pointer.
     """
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
     shown = np.stack(np.meshgrid(u, v), axis=-1)
@@ -83,9 +83,10 @@ def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:
-    """Return an SVG path by row of the capture: lines from up to MARKS features to the projections of their 3D points.
+    """Return the reprojection errors of each registered image as an SVG path, by the index of the image in the capture.
 
-    The lines are magnified by MAGNIFIED.
+    Each path has lines for up to 120 features, from the feature towards the projection of its 3D point, 20 times as
+    long as the error (px).
     """
     found, tracks = result.reconstruction, result.reconstruction.tracks
     straight = without_distortion(result.intrinsics or found.intrinsics)

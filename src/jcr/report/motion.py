@@ -30,7 +30,10 @@ Bar = tuple[str, float, float, str]
 
 
 def motion_section(result: RunResult) -> Content:
-    """Return bars of the excitation of seven directions and of the standard deviations, and the gripper poses to add."""
+    """Return the section on motion: bars of excitation and of standard deviations, and the gripper poses to add.
+
+    Excitation is how strongly the motions determine gripper_from_camera and scale (seven parameters), by direction.
+    """
     calibration, spreads, seen = result.calibration, list[list[Bar]](), list[str]()
     observed, uncertainty = calibration.observability, calibration.uncertainty
     if uncertainty is not None:
@@ -59,7 +62,10 @@ def motion_section(result: RunResult) -> Content:
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
-    """Yield (CSS class, name, length in percent, number) of a bar for each principal direction, least excited first."""
+    """Yield a bar (CSS class, name, length in percent, number) for each direction of the seven parameters.
+
+    The parameters are gripper_from_camera and scale. The direction that the motions determine least comes first.
+    """
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
         name = ", ".join(parts) or PARTS[int(direction.argmax())]
@@ -68,7 +74,10 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 
 
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
-    """Yield a bar for each axis x, y, z: its width is ± one standard deviation, relative to the largest of the three."""
+    """Yield a bar for each axis x, y, z, as wide as ± its standard deviation in `std` relative to the largest of them.
+
+    `name` and `unit` are written beside the bars.
+    """
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"

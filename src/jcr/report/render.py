@@ -26,7 +26,7 @@ Content = Mapping[str, Any]
 
 
 def render(template: str, content: Mapping[str, Any], package: str = REPORT) -> str:
-    """Fill a template, a file in `templates/` of a package, with its content; return the HTML page or part of a page."""
+    """Return the HTML of a template, a file in `templates/` of the Python package `package`, filled with `content`."""
     return _environment(package).get_template(template).render(content)
 
 

@@ -88,7 +88,7 @@ def scene_section(result: RunResult) -> Content:
 
 
 def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:
-    """Return a layer of points (m, base frame) in the colour and size of tracked features."""
+    """Return a layer of the 3D view called `name`: points (m, base frame), with colour and size of tracked features."""
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(points_in_base), 1))
     return name, points_in_base, red, TRACK_SIZE
 
@@ -101,9 +101,10 @@ def scene_data(
     intrinsics: Intrinsics,
     shown_in_base: Float[ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """Return the data of scene3d.js: layers of points, images (`scene_view`), gripper poses to add, and intrinsics.
+    """Return the data of the 3D view for scene3d.js: layers of points, images, gripper poses to add, and intrinsics.
 
-    Coordinates of points are 16-bit fractions of a box, which encloses most points and `shown_in_base` (m, base frame).
+    `views` are results of `scene_view`, `next_poses` the gripper poses to add. Coordinates of points are 16-bit
+    fractions of a box (m, base frame), which encloses most points of the layers and of `shown_in_base`.
     """
     everything = np.vstack([points for _, points, *_ in layers] + [shown_in_base])
     # A few distant outliers must not enlarge the box, which sets the resolution and the view.
@@ -136,7 +137,7 @@ def scene_view(
     base_from_gripper: Float[ndarray, "4 4"],
     base_from_camera: Float[ndarray, "4 4"] | None,
 ) -> dict[str, Any]:
-    """Return an image of the 3D view: name, caption, whether it is used, gripper pose, camera pose (None: unknown)."""
+    """Return the JSON entry of an image in the 3D view; base_from_camera is None for an image without a camera pose."""
     camera = None if base_from_camera is None else _rows(base_from_camera)
     return {
         "name": name,

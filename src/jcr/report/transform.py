@@ -35,7 +35,10 @@ FLANGE_M = 0.0315
 
 
 def transform_section(hand_eye: Calibration) -> Content:
-    """Return gripper_from_camera, or base_from_camera of a fixed camera in all notations, with covariance and sketch."""
+    """Return the section on the result: the transform in all notations, with covariance and a sketch of the camera.
+
+    The transform is gripper_from_camera or, for a fixed camera, base_from_camera.
+    """
     x, mount, std = hand_eye.parent_from_camera, hand_eye.mount, hand_eye.uncertainty.std
     parent = PARENT if mount == "gripper" else BASE
     rotation = Rotation.from_matrix(x[:3, :3])
@@ -105,12 +108,12 @@ def sketch(
     shapes = list[tuple[str, dict[str, str], str]]()
 
     def draw(tag: str, ends: Sequence[ndarray] | ndarray, kind: str) -> None:
-        """Add an SVG polyline or polygon (`tag`) through points (px), with the CSS class `kind`."""
+        """Add an SVG polyline or polygon (`tag`) through the points `ends` (px), with the CSS class `kind`."""
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)
         shapes.append((tag, {"class": kind, "points": points}, ""))
 
     def write(x: float, y: float, words: str, kind: str) -> None:
-        """Add a text at x, y (px) with the CSS class `kind`: left end of its baseline, or its centre with "middle"."""
+        """Add the text `words` with its left end, or with CSS class `kind` "middle" its centre, at x, y (px)."""
         shapes.append(("text", {"x": f"{x:.1f}", "y": f"{y:.1f}", "class": kind}, words))
 
     if down:

@@ -14,7 +14,7 @@ Tile = tuple[str, str, str, bool]
 
 
 def head(calibration: AnyCalibration) -> dict[str, Content]:
-    """Return the sections "verdict", "tiles" (main numbers) and, if there are any, "warnings"."""
+    """Return the first sections of the report by name: "verdict", "tiles" (main numbers) and, if any, "warnings"."""
     sections: dict[str, Content] = {"verdict": _verdict(calibration)}
     sections["tiles"] = {"tiles": list(_tiles(calibration))}
     return sections | ({"warnings": {"remarks": calibration.remarks}} if calibration.remarks else {})
@@ -74,7 +74,7 @@ def _leave_one_out(calibration: AnyCalibration) -> str:
 
 
 def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
-    """Yield tiles of the accuracy of a point at the image centre and in a corner, used images, and scale.
+    """Yield tiles (a number in a box) of the accuracy of a point at the image centre and corner, used images, and scale.
 
     Tiles whose numbers the calibration does not have are left out or replaced by the rotation of the camera.
     """

@@ -257,7 +257,7 @@ class Viewer:
         self.move_sphere()
 
     def _add_click(self) -> None:
-        """Add the text and the mark that answer a click on a point."""
+        """Add the text and the mark that show the values at a clicked point, and handle clicks."""
         with self.server.gui.add_folder("Click a point", expand_by_default=False):
             self.clicked = self.server.gui.add_markdown("Click a point to see its values.")
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
@@ -285,7 +285,10 @@ class Viewer:
                 self.robot.update_cfg(self._configurations[row])
 
     def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
-        """Select the image of a registered camera, by its row, and move the view of a client to the camera's pose."""
+        """Select the image of registered camera number `camera`, and move the view of a client (browser) to its pose.
+
+        `client` None: only select the image.
+        """
         self.image.value = int(self.image_index[camera])
         if client is None:
             return
@@ -349,7 +352,10 @@ class Viewer:
             self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
-        """Show and return the values at the first drawn point along the ray of a click; `direction` is a unit vector."""
+        """Show the values at the first drawn point along the ray of a click, and return them as Markdown.
+
+        `origin_in_base` (m) is the origin of the ray, `direction` a unit vector in the base frame.
+        """
         with self._lock:
             x = self.points
             along = (x - origin_in_base) @ direction
@@ -365,7 +371,7 @@ class Viewer:
             return self.clicked.content
 
     def _values(self, point: Value) -> str:
-        """Return a Markdown table with the map's values at a point (m), and with the nearest measured point."""
+        """Return a Markdown table with the map's values at a point (m, base frame) and the nearest measured point."""
         rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
         if self.scene is not None:
             at = self.scene.query(point[None])
@@ -383,7 +389,7 @@ class Viewer:
         return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
 
     def _support(self) -> float:
-        """Return the height (m) of the support: the most frequent z of the surface, limited to the workspace."""
+        """Return the height (m) of the table: the most frequent z of surface points, limited to the workspace."""
         assert self.scene is not None
         counts, edges = np.histogram(self._solid[:, 2], bins=100)
         low, high = self.scene.box[:, 2]
@@ -399,12 +405,15 @@ class Viewer:
 
 
 def _middle(points: Float[ndarray, "n 3"]) -> Value:
-    """Return the median of points (n,3) along each axis; the origin if there are none."""
+    """Return the median of the n points along each axis, shape (3,); zeros if there are no points."""
     return np.median(points, axis=0) if len(points) else np.zeros(3)
 
 
 def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:
-    """Return vertices (v,3) m and triangles (f,3) of the surface of unknown space; none if all or no space was seen."""
+    """Return vertices (v,3) m, base frame, and triangles (f,3) of the surface between seen and unknown space.
+
+    Both are empty if all space or none was seen.
+    """
     low, high = scene.box
     pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
     axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
@@ -417,9 +426,10 @@ def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndar
 
 
 def slice_image(scene: SceneMap, height: float, unknown: Unknown, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
-    """Return an RGBA image of a property of the map at z = `height` (m), in the colours of SLICE_LEGENDS.
+    """Return an RGBA image of `of`, "occupancy" or "distance", at z = `height` (m), in the colours of SLICE_LEGENDS.
 
-    Columns follow the x axis of the base; rows follow y from the largest value to the smallest.
+    `unknown` selects how unseen space counts. Columns follow the x axis of the base; rows follow y from the largest
+    value to the smallest.
     """
     low, high = scene.box
     pitch = float((high - low)[:2].max() / SLICE_PIXELS)
