@@ -75,7 +75,7 @@ class _Reference(BaseModel):
 
 
 def compare(calibration: Comparable, other: Comparable) -> Difference:
-    """Return the step from `calibration` to `other`, and the χ² test that their stated errors explain it.
+    """Return the step from `calibration` to `other`, and a χ² test whether their covariances explain the step.
 
     Each is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or
     a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.

@@ -467,7 +467,10 @@ def failed_calibration(
     timings_s: dict[str, float],
     attempts: Sequence[Attempt] = (),
 ) -> FailedCalibration:
-    """Return the result for a capture that could not be reconstructed; `findings` are the reasons."""
+    """Return the result for a capture that could not be reconstructed; `findings` are the reasons.
+
+    `backend` is the name of the last back end, `timings_s` the seconds of each stage.
+    """
     unregistered = (ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images)
     return FailedCalibration(
         mount=capture.mount,

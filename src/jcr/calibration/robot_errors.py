@@ -33,7 +33,7 @@ class RobotErrorPrior:
     """Finding that the poses do not fit the arm that the capture names; None if they fit or no arm is named."""
 
     def of(self, poses: Int[ndarray, " m"]) -> "RobotErrorPrior":
-        """Return the prior of a subset of the poses, given by their indices."""
+        """Return the prior of the errors of some poses, given by their indices."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
@@ -54,7 +54,7 @@ class RobotErrorPrior:
 def robot_errors(
     capture: Capture, options: CalibrateOptions, later: Capture | None = None
 ) -> RobotErrorPrior:
-    """Return the error prior of the capture's gripper poses, followed by those of a `later` capture of the same robot.
+    """Return the prior covariance of systematic errors of a capture's gripper poses, then of a `later` capture's.
 
     Raises InputError if the poses do not fit the arm of the option `robot`, and for any arm if all poses are too long
     by one factor for their joint angles (LengthError). An arm that only the capture names and that the poses do not fit
@@ -76,10 +76,10 @@ def robot_errors(
 
 
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
-    """Return the error prior of gripper poses of an arm at joint angles (rad), or of an unknown robot.
+    """Return the prior covariance of systematic errors of gripper poses, for an arm or (None) an unknown robot.
 
-    If only the arm is given, inverse kinematics computes the angles. Raises InputError if the poses do not fit the arm
-    and the angles.
+    `joints` are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the poses do not
+    fit the arm and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))

@@ -20,7 +20,7 @@ MOVED = 4.0
 
 
 def check_boards(case: Case) -> Case:
-    """Add findings for boards that were not found, moved, or stretched in print, and for an estimated board size."""
+    """Return the case with findings on boards: not found, moved, stretched in print, or of a size that was estimated."""
     boards = case.reconstruction.tracks.boards
     if boards is None:
         return case

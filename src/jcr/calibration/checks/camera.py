@@ -293,7 +293,7 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
 
 
 def is_material(found: Finding, after: CameraAdjustment) -> bool:
-    """Return whether the effect `found`, which `after` estimates, is large and moves the camera by more than MATERIAL.
+    """Return whether the effect `found`, estimated in `after`, is large and moves the camera by over half a std.
 
     Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
@@ -354,9 +354,9 @@ def _freed(state: CameraAdjustment) -> tuple[str, ...]:
 
 
 def camera_finding(after: CameraAdjustment, before: CameraAdjustment) -> Finding:
-    """Return the last confirmed camera effect as a finding; `before` is the adjustment without that effect.
+    """Return the finding of the last camera effect in `after`; `before` is the adjustment without that effect.
 
-    Its shift is the change of camera pose and scale between both adjustments.
+    The shift of the finding is the change of camera pose and scale from `before` to `after`.
     """
     best, place = after.found[-1], after.place
     alone = before.test(best.both, best.both[:, :0])

@@ -39,7 +39,7 @@ MANY = 1 / 4
 
 
 def check_registered(case: Case) -> Case:
-    """Report that too few images are used: all motions together would be observable, those of the used images are not.
+    """Return the case with a finding if only the motions of all images, not those of the used ones, are observable.
 
     The remedy is then a better reconstruction and not other motions. If the poses of all registered images would be
     observable but few of them agree, the used images agree by chance; their unobservable directions are not reported.
@@ -62,7 +62,7 @@ def check_registered(case: Case) -> Case:
 
 
 def check_pieces(case: Case) -> Case:
-    """Report a reconstruction in pieces: groups of images that are consistent within, but not with each other.
+    """Return the case with a finding if the reconstruction is in pieces: groups of images that contradict each other.
 
     With the hand-eye transform of the largest group, each image gives a value of base_from_recon. The values agree
     within a piece; wrong gripper poses give scattered values instead.
@@ -93,7 +93,7 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Report an unused arm model, images that were rotated on reading, and the warnings of the back end."""
+    """Return the case with findings on an unused arm model, images rotated on reading, and the back end's warnings."""
     first = (case.robot.unused, how_rotated(case.capture))
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
@@ -101,7 +101,7 @@ def check_remarks(case: Case) -> Case:
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
-    """Return the findings of the images themselves: static although the gripper moves, blurred, or repetitive."""
+    """Return findings on the images alone: static although the gripper moves, blurred, or with repetitive texture."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
     is_still = metres > STILL[0] or radians > STILL[1]

@@ -68,10 +68,10 @@ class PoseConvention:
 
 
 def check_convention(case: Case) -> Case:
-    """Report a pose convention in which the gripper poses fit, if fit and adjustment were rejected.
+    """Return the case with a finding if its calibration is rejected and the gripper poses fit in another convention.
 
-    It only warns for degenerate motions, which may fit another convention by chance. A wrong board size explains the
-    rejection too; no convention is searched then.
+    The finding only warns if the motions are degenerate, because such motions may fit another convention by chance. No
+    convention is searched if a wrong board size explains the rejection.
     """
     fit, capture = case.pose_fit, case.capture
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
@@ -152,7 +152,7 @@ def _solved(
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
-    """Return the error (m) of a candidate by a closed-form calibration from the images that agree best.
+    """Return the misfit (m) of a candidate convention in a closed-form calibration from the images that agree best.
 
     It is infinite if the scale is negative, as for mirrored poses. A fit takes 100 times as long.
     """
@@ -163,7 +163,7 @@ def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
 
 
 def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
-    """Return the rotation angle (rad) between each two poses, from the trace, which is imprecise near 0 and π."""
+    """Return the rotation angles (rad) between all pairs of n poses; the formula is imprecise near 0 and π."""
     flat = a_from_b[:, :3, :3].reshape(-1, 9)
     return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
 

@@ -66,7 +66,7 @@ uncertainty."""
 
 
 def check_effects(case: Case) -> Case:
-    """Report effects on the camera and on the gripper poses that the model of a rigid camera and arm lacks.
+    """Return the case with findings on effects that the model lacks, such as rolling shutter, camera slip or arm sag.
 
     With adjusted images, the calibration then includes the effects as parameters. A fit to camera poses is tested only
     for effects that depend on the image order.
@@ -205,9 +205,10 @@ def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Te
 def pose_finding(
     test: Test, poses: ArmEquations, names: Sequence[str], std: Float[ndarray, "6"]
 ) -> Finding | None:
-    """Return a significant effect on the poses as a finding; None if it moves the camera by less than MATERIAL.
+    """Return the finding of a significant effect on the poses; None if it moves the camera by less than 0.5 `std`.
 
-    `names` are those of the images in their order, `std` are the standard deviations of the camera's pose (m, rad).
+    `test` was made with the equations `poses`. `names` are the image names in order, `std` the standard deviations of
+    the camera's pose (m, rad).
     """
     own, moved = test.shift[poses.columns[:6]], test.estimate
     kind, place, p = test.row.kind, test.row.place, float(np.exp(max(test.log_p, -700)))
@@ -261,7 +262,7 @@ def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...])
     """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
     The effects were found with a subset of the points, and are now estimated from all points that memory permits.
-    Camera effects that then change the calibration by at most MATERIAL are dropped.
+    Camera effects that then change the calibration by at most half a standard deviation (MATERIAL) are dropped.
     """
     free = state.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
@@ -336,7 +337,8 @@ def straight_shift(
 ) -> Float[ndarray, " p"]:
     """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    `columns` (s,b) are the confirmed error patterns of the poses, one standard deviation each.
+    `log_sizes` are the logarithms of the sizes of the robot errors. `columns` (s,b) are the b confirmed error patterns
+    of the poses, one standard deviation each.
     """
     straight = replace(equations, confirmed=columns @ columns.T)
     return solve_equations(straight, log_sizes).step - solve_equations(equations, log_sizes).step

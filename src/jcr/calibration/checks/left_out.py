@@ -21,7 +21,7 @@ which the other pose belongs to the image."""
 
 
 def check_pairing(case: Case) -> Case:
-    """Report unused images whose gripper poses are exchanged with each other, if the poses of the used images agree.
+    """Return the case with findings on unused images whose gripper poses are exchanged, if those of used images agree.
 
     The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted.
     """

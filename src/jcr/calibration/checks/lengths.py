@@ -71,7 +71,7 @@ class Length:
 
 
 def check_lengths(case: Case) -> Case:
-    """Compare known lengths with the robot's scale: use agreeing lengths as priors, or report two that contradict."""
+    """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict."""
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
 
@@ -200,7 +200,10 @@ def _fused(
 
 
 def check_predicted_focal(case: Case) -> Case:
-    """Report that a network's focal length contradicts the given one; the difference is added to the covariance."""
+    """Return the case with a finding if a network's focal length contradicts the given one.
+
+    The difference is added to the covariance of the intrinsics.
+    """
     given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
     if given is None or predicted is None:
         return case

@@ -18,7 +18,7 @@ SURE = 2.5
 
 
 def check_robot(case: Case) -> Case:
-    """Estimate the joint offsets of a known arm from the fit to camera poses, and report the significant ones.
+    """Return the case with estimated joint offsets of a known arm, and a finding on the significant ones.
 
     No joint is reported if there are findings about the camera, whose effects also change the camera poses.
     """
