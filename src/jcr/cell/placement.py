@@ -196,7 +196,7 @@ class ArmPlacement(Part):
 
 
 class CamerasFile(Part):
-    """Content of the file cameras.json: placements of all further cameras and arms."""
+    """Content of the file cameras.json: placements of other arms and of all cameras but the capture's own."""
 
     format: Literal["jcr.cameras/1"] = FORMAT
     cameras: list[CameraPlacement]
@@ -232,7 +232,7 @@ class CamerasFile(Part):
 
 @dataclass(frozen=True)
 class CellPlacement:
-    """Placement of all further cameras and arms, with the underlying solution."""
+    """Placement of all cameras other than the capture's own, and of other arms, with the underlying solution."""
 
     cameras: tuple[CameraPlacement, ...]
     arms: tuple[ArmPlacement, ...] = ()
@@ -242,7 +242,7 @@ class CellPlacement:
     """Function for each placed camera, by name, that returns parent_from_camera from a state."""
 
     def file(self, version: str) -> CamerasFile:
-        """Return the content of cameras.json."""
+        """Return the content of cameras.json; `version` is written to the file."""
         return CamerasFile(cameras=list(self.cameras), arms=list(self.arms), version=version)
 
 

@@ -73,7 +73,7 @@ def _count(found: Registration | int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraViews:
-    """Images of one camera other than the own: registrations and rigs of the k used images, reasons for unused ones."""
+    """Images of one camera other than the own: registrations and rigs of k used images, reasons for unused ones."""
 
     camera: CellCamera
     points: Sequence[int]
@@ -119,7 +119,7 @@ class CameraViews:
         return given or max(self.used.values(), key=_count).pose.camera
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":
-        """Return the views without the images whose numbers are the keys of `reasons`; the values say why."""
+        """Return the views without some images; `reasons` maps the number of a removed image to the reason."""
         used = {k: one for k, one in self.used.items() if k not in reasons}
         return replace(self, used=used, reasons={**self.reasons, **reasons})
 

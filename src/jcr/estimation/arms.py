@@ -54,7 +54,7 @@ def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> Float[ndarray, "n 6"]:
 
 
 def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Arm:
-    """Return an arm of the Universal Robots e-Series, by standard Denavit-Hartenberg parameters.
+    """Return an arm of the Universal Robots e-Series, by standard Denavit-Hartenberg parameters d and a (m).
 
     Source: Universal Robots, "DH Parameters for calculations of kinematics and dynamics"; the same numbers are in
     ur_description/config/*/default_kinematics.yaml of ros-industrial/universal_robot. The base is that of the
@@ -78,7 +78,7 @@ def _franka(name: str, limits: Limits) -> Arm:
 
 
 def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
-    """Return a KUKA LBR iiwa 7 R800 or 14 R820, by standard parameters; the gripper is the media flange "basic".
+    """Return a KUKA LBR iiwa 7 R800 or 14 R820, by its lengths (m); the gripper is the media flange "basic".
 
     Source: KUKA, "LBR iiwa: Specification" (lengths and limits); iiwa_description/urdf/iiwa7.xacro and iiwa14.xacro of
     IFL-CAMP/iiwa_stack (signs and the 126 mm from wrist to flange).

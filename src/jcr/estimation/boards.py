@@ -59,7 +59,7 @@ class BoardShapes:
 
     @property
     def rig(self) -> Int[ndarray, " c"]:
-        """Rig of each corner's body."""
+        """Rig number of each corner's body (board or tag)."""
         return self.first_rig + self.body
 
     def of_points(self, kept: Int[ndarray, " p"]) -> "BoardShapes":

@@ -87,7 +87,7 @@ def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Regi
 def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
     """Return E[e eᵀ] of each of m poses' systematic errors e, given the residuals of all poses.
 
-    `part` is the covariance (s,s) of the errors before, s = 6m; both may have an axis of k error sizes in front.
+    `part` is the prior covariance (s,s) of the errors, s = 6m, for each of k error sizes.
     """
     expected = (part @ solution.weighed_left[..., None])[..., 0]
     own = _blocks_of_poses(part)
@@ -145,7 +145,7 @@ def _widening(
 
 
 def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
-    """Return the covariance of X and scale as a sum over causes: robot random, robot systematic, intrinsics, images.
+    """Return the covariance of X (hand-eye) and scale by cause: robot random, robot systematic, intrinsics, images.
 
     `elsewhere` is the covariance that systematic errors add for other poses of the workspace, at `log_sizes`. The part
     of the intrinsics is the covariance that exact intrinsics would remove. The parts are scaled so that they add up to

@@ -267,7 +267,8 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
     """Return each joint's offset (rad), true minus reported angle, with its standard deviation.
 
     The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the most likely
-    error sizes. Unobservable offsets, as of the first joint, keep their prior standard deviation, the size σ_s.
+    error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation: the size σ_s of
+    the systematic errors.
     """
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
@@ -355,8 +356,8 @@ def alternatives(
 ) -> Alternatives:
     """Return the normal equations of all parameters of one camera that may be freed, or were freed, about a solution.
 
-    `place` returns the pose of the camera on its parent (gripper or base). `model_error_std` is the size of the
-    remaining distortion of all cameras, in image widths; None: as estimated.
+    `place` returns the pose of the camera on its parent (gripper or base). `model_error_std` is the size (image widths)
+    of the distortion that no camera model expresses; None: as estimated.
     """
     problem, images = solution.problem, solution.images
     state, observations = images.state, problem.observations
@@ -435,9 +436,9 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return directions (columns) in the e parameters of `Alternatives` that free the focal length of each of p images.
+    """Return directions (columns) in the e parameters of `Alternatives` that give each of p images its own focal length.
 
-    The first column is the camera's focal length, the others are differences between its images.
+    The first column is the common focal length, the others are differences between images; `images` is p.
     """
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))

@@ -185,9 +185,10 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
 
 
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
-    """Return the evidence with a new estimate of the size of each camera's remaining distortion.
+    """Return the evidence with a new estimate of the size of each camera's model error.
 
-    The second result is the largest absolute change of the logarithm of a size.
+    The model error is the distortion that the camera model cannot express. The second result is the largest absolute
+    change of the logarithm of a size.
     """
     state, columns = images.state, [c for c in images.problem.columns.model_error if c.stop > c.start]
     if not columns:
@@ -255,7 +256,7 @@ def _cost(
 
 
 def _known_rigs(problem: Problem) -> list[RigInformation]:
-    """Return the information of `Problem.known_rigs`, as a list of one element or none."""
+    """Return the normal distribution `Problem.known_rigs` as a list with one quadratic cost; an empty list if None."""
     if problem.known_rigs is None:
         return []
     poses, covariance = problem.known_rigs
@@ -271,9 +272,9 @@ def _normal_equations(
     known: Sequence[RigInformation],
     damping: float,
 ) -> Normal:
-    """Return the normal equations of all d `Problem.columns`, with the points eliminated.
+    """Return the normal equations of the d unknowns in the order of `Problem.columns` (cameras, boards, rigs).
 
-    `known` is information about rigs; `damping` is that of `without_points`.
+    The points are eliminated. `known` is information about rigs; `damping` is that of `without_points`.
     """
     first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
     weighted = derivatives(problem, state, view, weight)

@@ -95,10 +95,10 @@ def camera_with_prior(
 
 
 def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> CameraPrior:
-    """Return the prior of a camera with mean `found`; `given` tells the source of these intrinsics.
+    """Return the prior of a camera with mean `found`.
 
-    Given intrinsics have the standard deviations `std`; None: MEASURED. Intrinsics estimated by a reconstruction have
-    the standard deviations ESTIMATED.
+    If the intrinsics were `given`, `std` are their standard deviations; None: MEASURED. If a reconstruction estimated
+    them, the standard deviations are ESTIMATED.
     """
     if not given:
         return camera_with_prior(found, ESTIMATED)
@@ -106,12 +106,12 @@ def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | Non
 
 
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
-    """Return the steps of X, log scale and intrinsics (r = 7 + q rows) that images confuse with a thin prism.
+    """Return the steps of gripper_from_camera, log scale and q intrinsics that images confuse with a thin prism.
 
-    Column 0 is for a prism that displaces along x, column 1 along y. To second order, a prism that displaces x by s ·
-    r² equals p2 = s, the principal point moved by 2 · s · fx and the camera rotated by 2 · s about its y axis. s is one
-    standard deviation: DECENTRING, or the estimated tangential distortion if larger, because one defect of the optics
-    causes both.
+    `x` is gripper_from_camera. Column 0 is for a prism that displaces along x, column 1 along y; the rows are 7 + q. To
+    second order, a prism that displaces x by s · r² (r: radius) equals p2 = s, the principal point moved by 2 · s · fx
+    and the camera rotated by 2 · s about its y axis. s is one standard deviation: DECENTRING, or the estimated
+    tangential distortion if larger, because one defect of the optics causes both.
     """
     names = parameter_names(camera)
     out = np.zeros((7 + len(names), 2))
@@ -138,7 +138,7 @@ WORTH = 2.0
 def displacements(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
 ) -> Float[ndarray, "k 2 e"]:
-    """Return the displacement (px) of k observations by each of e polynomials of the remaining distortion.
+    """Return the displacement (px) of k observations by each of e polynomials of the distortion outside the model.
 
     The polynomials have a coefficient of one image width. The part that a change of the q intrinsics along `directions`
     (columns) can produce is removed.
@@ -150,9 +150,10 @@ def displacements(
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
-    """Return the likeliest size (image widths) of one camera's remaining distortion, by MacKay's fixed-point iteration.
+    """Return the likeliest size (image widths) of the distortion that one camera's model cannot express.
 
-    `likeliest` and `covariance` of the e polynomial coefficients were estimated under a prior of size `std`.
+    The method is MacKay's fixed-point iteration. `likeliest` and `covariance` of the e polynomial coefficients were
+    estimated under a prior of size `std`.
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
@@ -175,7 +176,7 @@ def expressed(
 ) -> Float[ndarray, "q e"]:
     """Return the change of q intrinsics along `directions` that best fits each of e polynomials at the pixels `x_px`.
 
-    The polynomials are those of the remaining distortion, with a coefficient of one image width.
+    The polynomials describe distortion outside the camera model and have a coefficient of one image width.
     """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
@@ -187,9 +188,9 @@ def expressed(
 def second_moment_px2(
     left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
 ) -> Float[ndarray, "*points 2 2"]:
-    """Return the second moment (px²) of the remaining distortion `left` at pixels: squared mean plus covariance.
+    """Return the second moment (px²) at pixels of the distortion `left` that the model cannot express.
 
-    This is the expected squared error of a projection that uses the intrinsics alone.
+    This squared mean plus covariance is the expected squared error of a projection that uses the intrinsics alone.
     """
     flat = x_px.reshape(-1, 2)
     by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed

@@ -254,8 +254,8 @@ class LengthError(InputError):
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """Return the arm with the base and tool whose forward kinematics fits the reported poses best.
 
-    Directions of base and tool that the motions do not determine stay as in `arm`. Raise InputError if angles and poses
-    disagree, LengthError if the positions differ by a common factor.
+    Directions of base and tool that the motions do not determine stay as in `arm`. Raise LengthError if reported
+    positions are those of the arm times a factor, InputError if angles and poses disagree otherwise.
     """
     nominal = forward_kinematics(arm, joints)
     half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))

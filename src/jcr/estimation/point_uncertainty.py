@@ -51,7 +51,7 @@ def point_covariance(
 ) -> Covariances:
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
-    `x` is gripper_from_camera; `uncertainty` is the joint one of X, scale and `intrinsics`. `x_px` (...,2) are pixels
+    `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
     of the distorted image. `distance_m` (...) is the distance along the ray; its error is that of the scale.
     """
     return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
@@ -219,9 +219,9 @@ def scene_points(solution: Solution) -> ScenePoints:
 def _triangulation(
     solution: Solution, some: Int[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of n points by the d `Problem.columns`, and the points' covariance if the columns are exact.
+    """Return the derivative of n points by d columns (cameras, boards, rigs), and their covariance for exact columns.
 
-    `some` are the ascending numbers of the points.
+    `some` are the ascending numbers of the points; the order is that of `Problem.columns`.
     """
     images, problem = solution.images, solution.problem
     _, rows_point, rows_rig, _ = problem.rows
@@ -241,9 +241,10 @@ def _triangulation(
 
 
 def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
-    """Return the derivative of `Problem.columns` by the p unknowns, and their covariance if the unknowns are exact.
+    """Return the derivative of the d `Problem.columns` by the p unknowns, and their covariance for exact unknowns.
 
-    The covariance is nonzero for the rigs that arms move only; the other columns are unknowns.
+    The columns are cameras, boards and rigs. Only the covariance of the rigs that arms move is not zero; the other
+    columns are unknowns.
     """
     problem, equations, (follow, _, rig_covariance) = (
         solution.problem,
@@ -280,10 +281,10 @@ def _covariance(
 def _derivatives(
     x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"], Float[ndarray, "*points 2 2"]]:
-    """Return derivatives of points relative to the gripper, in camera axes: by j unknowns, and by pixels.
+    """Return derivatives of points relative to the gripper, in camera axes, by j unknowns and by pixels; a covariance.
 
-    The unknowns are X (6), log scale and the intrinsics, if estimated. The third result is the pixels' covariance by the
-    remaining distortion.
+    The unknowns are gripper_from_camera `x` (6), log scale and the intrinsics, if estimated. The covariance (px²) is
+    that of the pixels by the distortion that the model cannot express.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)

@@ -52,7 +52,8 @@ LEAST_FREE = 0.4
 class Region:
     """Linear fit of the effective hand-eye transform to n pose errors (s = 6n numbers).
 
-    The effective transform is X and Z that fit best if the robot has systematic errors; the scale is not fitted.
+    The effective transform is the gripper_from_camera X and base_from_recon Z that fit best in spite of systematic
+    robot errors; the scale is not fitted.
     """
 
     by_unknown: Float[ndarray, "s u"]
@@ -73,9 +74,10 @@ class Region:
         return Region(by_unknown, fit, unknowns)
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
-        """Return the covariance of e' = (I − J A) e, the part of a systematic error e that X and Z do not absorb.
+        """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
 
-        `systematic` (s,s) is the covariance of e.
+        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error, J the derivative
+        `by_unknown`.
         """
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
         half = systematic - self.by_unknown @ (self.fit @ systematic)
@@ -180,7 +182,8 @@ def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"])
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
     """Return the diagonal information matrix of a weak prior (PRIOR_STD) on each arm's X and on log scale; zero for Z.
 
-    The u = 12 · arms + 1 unknowns are X (6), log scale and Z (6) of the first arm, then X and Z of further arms.
+    X is gripper_from_camera, Z base_from_recon. The u = 12 · arms + 1 unknowns are X (6), log scale and Z (6) of the
+    first arm, then X and Z of further arms.
     """
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
@@ -200,9 +203,9 @@ def share_within_limits(step: Float[ndarray, " u"]) -> float:
 
 
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Return the covariance (7,7) of X and log scale with the weak prior.
+    """Return the covariance (7,7) of gripper_from_camera X and log scale with the weak prior.
 
-    `hessian` (13,13) is the information matrix of X, log scale and Z without a prior.
+    `hessian` (13,13) is the information matrix of X, log scale and base_from_recon without a prior.
     """
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
 

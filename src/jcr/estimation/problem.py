@@ -96,7 +96,7 @@ class ReportedPoses:
 
 
 class LinearPrior(NamedTuple):
-    """Linear prior `row · Problem.coordinates(state) = value ± std` (one standard deviation)."""
+    """Linear prior `row · Problem.coordinates(state) = value ± std` on p unknowns; `std` is one standard deviation."""
 
     row: Float[ndarray, " p"]
     value: float
@@ -505,9 +505,10 @@ def stepped(
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
 ) -> State:
-    """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of the d `Problem.columns`.
+    """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
 
-    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms. None: no step. Points do not move.
+    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms; `columns` (d,) has the order of
+    `Problem.columns`. None: no step. Points do not move.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -558,7 +559,7 @@ def step_to(
 def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
     """Return the derivative of the d `Problem.columns` by a similarity of the world: log scale, translation, rotation.
 
-    Images do not determine these seven directions.
+    The d columns are cameras, boards and rigs. Images do not determine these seven directions.
     """
     out = np.zeros((problem.columns.count, 7))
     out[problem.columns.first_rig :] = similarities_of_rigs(state.world_from_rig)

@@ -142,7 +142,7 @@ class Equations:
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
-        """Return the equations of k of the n poses, by their numbers."""
+        """Return the equations of k of the n poses; `poses` are their numbers."""
         rows = (6 * poses[:, None] + np.arange(6)).ravel()
 
         def part(of: Covariance | None) -> Any:
@@ -239,12 +239,15 @@ class LinearSolution:
 
     @cached_property
     def weight(self) -> Covariance:
-        """Inverse V⁻¹ of the covariance of the residuals; for one value of the sizes only."""
+        """Inverse V⁻¹ of the covariance V of the s residuals; only for a solution for one value of the error sizes."""
         return inverse_of(self.root)
 
     @property
     def projection(self) -> Covariance:
-        """Matrix P = V⁻¹ − V⁻¹J C JᵀV⁻¹ of the residuals; for one value of the sizes only."""
+        """Matrix P = V⁻¹ − V⁻¹J C JᵀV⁻¹ of the s residuals; only for a solution for one value of the error sizes.
+
+        V is the covariance of the residuals, J the Jacobian and C the covariance of the unknowns.
+        """
         return self.weight - self.weighed @ self.gain
 
 
@@ -253,7 +256,10 @@ Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
-    """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions."""
+    """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions.
+
+    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and growths of camera errors.
+    """
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
     jacobian, residual = whitened[..., :-1], whitened[..., -1:]
@@ -295,7 +301,7 @@ def most_likely(
     start: LogSizes | None = None,
     settled: float = SETTLED,
 ) -> tuple[LogSizes, Information]:
-    """Return the c log sizes of the errors at the mode of their posterior, and their expected information (c,c) there.
+    """Return the logarithms of the c error sizes at the mode of their posterior, and expected information (c,c) there.
 
     The search begins at `start` (None: mode of the prior) and ends with a step below `settled`. If there are more than
     TOO_MANY poses, TOO_MANY of them are used, evenly spaced. Fisher scoring is corrected by the curvature along the
@@ -376,7 +382,7 @@ def over_sizes(
 
 
 def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
-    """Return the log posterior of the c log sizes of the errors, its gradient (c,), and expected information (c,c)."""
+    """Return the log posterior of the logarithms of c error sizes, its gradient (c,), and expected information (c,c)."""
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])

@@ -356,9 +356,10 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 def _joint_step(
     images: ImageEvidence, equations: Equations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton steps of the arms' u unknowns and of the d `Problem.columns`, and the std of p unknowns.
+    """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
 
-    The p unknowns are those of the arms, then the columns `Problem.free`.
+    The columns (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the
+    columns `Problem.free`.
     """
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
