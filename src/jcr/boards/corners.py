@@ -42,7 +42,7 @@ class _Seen:
 
     @property
     def images(self) -> Int[ndarray, " i"]:
-        """Rows of the images that show at least FEWEST_POINTS of the body's corners."""
+        """Rows of the images that show at least FEWEST_POINTS corners of the board or tag."""
         return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
 
 

@@ -267,6 +267,6 @@ def most_seen(
 
 
 def _without_ink(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w"]:
-    """Return the grey image with strongly coloured pixels, such as a detector's drawing, filled in from around them."""
+    """Return an image in grey; strongly coloured pixels, such as drawn detections, are filled in from around them."""
     ink = (np.ptp(image, axis=2) > INK).astype(np.uint8)
     return cv2.cvtColor(cv2.inpaint(image, ink, 3, cv2.INPAINT_TELEA), cv2.COLOR_RGB2GRAY)

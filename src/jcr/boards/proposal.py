@@ -57,7 +57,7 @@ def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 
 
 def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
-    """Return the value of --board for the chessboard that is found most often; None without one."""
+    """Return the value of --board for the chessboard that most grey images show; None if fewer than two show it."""
     sizes = []
     for image in grey:
         found, _, meta = cv2.findChessboardCornersSBWithMeta(

@@ -31,7 +31,7 @@ def as_pdf(page: Image.Image, px_per_mm: float) -> bytes:
 
 
 def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
-    """Return the black-and-white page of the ChArUco board or chessboard that `spec` names, and its pixels per mm.
+    """Return the black-and-white page of the ChArUco board or chessboard that `spec` names, and its resolution, px/mm.
 
     A square is a whole number of pixels wide. Raises InputError for a name that means no such board, and for a board
     that does not fit on the paper.

@@ -29,7 +29,7 @@ def densify(
     options: DepthOptions | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Return the reconstruction with pointmaps of its images, or unchanged where it has pointmaps.
+    """Return the reconstruction with a depth for the pixels of its images (pointmaps), or unchanged where it has them.
 
     Only cameras, intrinsics and tracks are used, so that the stage may run before or after the calibration. Raises
     InputError for an image that cannot be read.

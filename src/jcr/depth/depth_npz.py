@@ -23,7 +23,7 @@ GREY = 128
 
 
 class DepthHeader(BaseModel):
-    """Header of depth.npz, in JSON: version, origin and intrinsics of the pointmaps."""
+    """Header of the file depth.npz, in JSON: version, fingerprint of what it was made from, and intrinsics."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     format: str
@@ -33,7 +33,10 @@ class DepthHeader(BaseModel):
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write the estimated pointmaps of a reconstruction to a file; an interrupted call leaves no partial file."""
+    """Write the pointmaps of a reconstruction to a file; `made_from` is a fingerprint of what they were made from.
+
+    An interrupted call leaves no partial file.
+    """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
     about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}
@@ -52,7 +55,10 @@ def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> N
 
 
 def is_made_from(path: Path, made_from: str) -> bool:
-    """Test whether the file exists and has the fingerprint `made_from`; raise InputError for a damaged file."""
+    """Test whether the file exists and was made from the input with the fingerprint `made_from`.
+
+    Raises InputError for a damaged file.
+    """
     if not path.is_file():
         return False
     with read_npz(path, FORMAT) as (text, _):

@@ -172,7 +172,7 @@ def _support(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "4"]:
-    """Return the plane (unit normal n, d with n·x + d = 0) in the recon frame on which most matched points lie."""
+    """Return the plane in the recon frame on which most matched points lie: unit normal n and d, with n·x + d = 0."""
     direction = rays(pinhole).reshape(-1, 3)
     x_in_recon = []
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):

@@ -18,7 +18,7 @@ class Lanes:
 
     @classmethod
     def constant(cls, builder: Any, numbers: Any, kind: Any = FLOAT) -> "Lanes":
-        """Return a vector of constants, one number per lane."""
+        """Return a vector of constants, one of the `numbers` per lane, of LLVM type `kind`."""
         return cls(builder, ir.Constant(ir.VectorType(kind, len(numbers)), [kind(n) for n in numbers]))
 
     @classmethod
@@ -43,7 +43,7 @@ class Lanes:
         return Lanes(b, found)
 
     def _same(self, other: Any) -> Any:
-        """Return the other operand as a vector; a plain number is repeated in every lane."""
+        """Return `other` as a vector like this one; a plain number is repeated in every lane."""
         kind = self.value.type.element
         return other if isinstance(other, Lanes) else Lanes.constant(self.builder, [other] * self.count, kind)
 
@@ -69,7 +69,7 @@ class Lanes:
         return (self < 0.0).choose(self * -1.0, self)
 
     def choose(self, yes: Any, no: Any) -> "Lanes":
-        """Return `yes` in lanes where this condition holds, else `no`; plain numbers are repeated as floats."""
+        """Return per lane `yes` where this vector of conditions is true, else `no`; numbers are repeated as floats."""
         zero = Lanes.constant(self.builder, [0.0] * self.count)
         return Lanes(
             self.builder, self.builder.select(self.value, zero._same(yes).value, zero._same(no).value)

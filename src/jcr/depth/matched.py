@@ -49,7 +49,7 @@ def relative(
 
 
 def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
-    """Return fx, fy, cx, cy as float32 for the compiled loops."""
+    """Return fx, fy, cx, cy of a pinhole camera as a float32 array, which the compiled loops take as `k`."""
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 

@@ -48,9 +48,10 @@ _PAIRS = 600
 
 
 def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
-    """Return the plane (unit normal n, d with n·x + d = 0) on which most points lie, by RANSAC and total least squares.
+    """Return the plane on which most points lie, as unit normal n and d with n·x + d = 0.
 
-    `tolerance` is the largest distance of a point on the plane, recon units.
+    The method is RANSAC, then total least squares. `tolerance` is the largest distance of a point on the plane, recon
+    units.
     """
     draw = np.random.default_rng(seed)
     some = x_in_recon[draw.choice(len(x_in_recon), min(_POINTS, len(x_in_recon)), replace=False)]

@@ -203,7 +203,10 @@ def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], we
 
 
 def _interpolated(image: Any, start: Lanes, width: Lanes, x: Lanes, y: Lanes) -> Lanes:
-    """Return the bilinear grey at (x, y) of the image that begins at index `start` of the packed images."""
+    """Return per lane the bilinear grey at (x, y) of the packed image that begins at index `start`.
+
+    `width` is the number of columns of the packed images.
+    """
     left, top = x.as_ints(), y.as_ints()
     upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
     fx, fy = x - left.as_floats(), y - top.as_floats()

@@ -255,7 +255,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
 
 
 def by_quarters(roll: float) -> float:
-    """Return the nearest multiple of 90° if the angle is near one, else the angle rounded to 1°; rad in [0, 2π)."""
+    """Return an angle in [0, 2π) rad, rounded to a multiple of 90° if this is within UPRIGHT_ENOUGH, else to 1°."""
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)

@@ -105,13 +105,13 @@ class Matcher:
 
     @property
     def x_px(self) -> list[Float[ndarray, "_ 2"]]:
-        """Keypoints of every image at the working size, px; a network adds more for every angle of rotation."""
+        """Keypoints of every image in pixels of the size of matching; XFeat adds some for every image rotation."""
         return [(x + 0.5) * self._scale - 0.5 for x in self.features.x_px]
 
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], repeats: Bool[ndarray, "n n"]
     ) -> Geometries:
-        """Return the verified two-view geometries of pairs, whose images are rotated by `rolls` (rad) before matching.
+        """Return the two-view geometries of those `pairs` that match; images are first rotated by `rolls` (rad).
 
         `repeats` marks pairs of images between which the gripper did not move.
         """
@@ -166,7 +166,7 @@ class Matcher:
         """Remove all matches of image `row`, which the features no longer have; later rows decrease by one."""
 
         def after(key: Key) -> Key:
-            """Return the rows of a pair after the removal of the image."""
+            """Return the image rows of a pair as they are counted after the removal of the image."""
             return key[0] - (key[0] > row), key[1] - (key[1] > row)
 
         self._pairs.clear()
@@ -243,7 +243,7 @@ def still_cells(
 
 
 def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
-    """Test which keypoints lie in the `still` cells of the image."""
+    """Test for each keypoint whether it lies in a cell of the image that `still` marks (cells that never move)."""
     return still[tuple(_cells(x_px, still.shape).T)]
 
 

@@ -29,10 +29,9 @@ FARTHEST = 0.7
 
 
 def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
-    """Return an image in grey, resized to `size` (width, height).
+    """Return an image in grey, resized to `size` (width, height) by OpenCV's area interpolation.
 
-    Area interpolation shares the pixels at the borders of an area; Pillow's BOX assigns each to one area, which moves
-    2400 px images by 0.25 px.
+    Pillow's BOX filter, which does not divide a pixel between two areas, moves 2400 px images by 0.25 px.
     """
     grey = np.asarray(Image.fromarray(pixels).convert("L"))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -53,7 +52,10 @@ def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[
 def matches(
     first: Float32[ndarray, "k 128"], second: Float32[ndarray, "l 128"]
 ) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
-    """Return the rows in `first` and `second` of mutual nearest neighbours that pass the ratio test."""
+    """Return the matches of two images as rows of `first` and of `second` (unit descriptors).
+
+    Matches are mutual nearest neighbours that are nearer than FARTHEST and pass the ratio test.
+    """
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     cosine = first @ second.T
@@ -68,7 +70,7 @@ def matches(
 
 
 class SiftFeatures:
-    """SIFT keypoints and descriptors of a capture's images at the working size; invariant to image rotation."""
+    """SIFT keypoints and descriptors of images reduced to one size; image rotation does not change them."""
 
     minds_roll = False
     every_pair = 24

@@ -61,7 +61,7 @@ FOCAL_MATCHES = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Verified pairs of a capture and the intrinsics that they were verified with."""
+    """Result of the search for matching pairs: their two-view geometries, the intrinsics used, notes and warnings."""
 
     geometries: Geometries
     """Two-view geometries for the mapper, by pair."""
@@ -74,7 +74,7 @@ class Matched:
 
 @dataclass(kw_only=True)
 class _Search:
-    """State of the search for matching pairs."""
+    """State of the search for matching pairs: geometries found, image rotations tried, intrinsics, gripper motions."""
 
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
@@ -88,7 +88,7 @@ class _Search:
 
     @property
     def systematic(self) -> float:
-        """Systematic difference of camera and gripper angle, as a share of the angle."""
+        """Largest systematic difference of camera and gripper rotation, as a share of the angle."""
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
@@ -134,7 +134,7 @@ class _Search:
         return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x)
 
     def hide_still_parts(self) -> None:
-        """Find the parts of the image that stay while the gripper moves, and verify all pairs again without them."""
+        """Find the parts of the image that stay while the gripper moves; verify all matches without them."""
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
@@ -150,10 +150,10 @@ class _Search:
                 self.pairs[key] = self.matcher.pair(self.view, key, geometry), geometry
 
     def _is_better(self, new: Pair) -> bool:
-        """Test whether a pair's new geometry is to replace the old one.
+        """Test whether the new geometry of a pair is to replace the pair's old one.
 
-        It does if only the new one agrees with the gripper's angle; if both or neither agree, it needs more than half
-        as many matches as the old one.
+        It is if only the new one agrees with the gripper's angle. If both or neither agree, the new one needs more than
+        half as many matches as the old one.
         """
         if new.key not in self.pairs:
             return True

@@ -24,7 +24,7 @@ LARGEST_SIGMA_PX = 3.0
 
 @dataclass(frozen=True)
 class TwoViewMotion:
-    """One possible relative motion of the two cameras i and j of an image pair."""
+    """Possible relative motion of cameras i and j of an image pair: rotation, direction, covariance and noise."""
 
     rotation: Float[ndarray, "3 3"]
     """Rotation i_from_j."""
@@ -36,7 +36,7 @@ class TwoViewMotion:
     """Robust standard deviation of the matches' Sampson distances, px."""
 
     def angle_std(self) -> float:
-        """Return the standard deviation of the angle of rotation, rad."""
+        """Return the standard deviation, rad, of the angle by which the motion rotates."""
         covariance = self.covariance[:3, :3]
         if np.trace(self.rotation) > 2.999999:  # without rotation the axis is undefined
             return float(np.sqrt(np.trace(covariance) / 3))

@@ -149,7 +149,7 @@ def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Flo
 
 @dataclass(frozen=True)
 class _Keypoints:
-    """Keypoints found in an image rotated by one angle, best first."""
+    """XFeat keypoints, best first, of one image that was rotated by one angle, with their descriptors."""
 
     start: int
     """Row of the first of these keypoints among those of the image at all angles."""
@@ -226,7 +226,10 @@ class LearnedFeatures:
 def _prepared(
     image: UInt8[ndarray, "h w 3"], roll: float
 ) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "2 3"]]:
-    """Return the image rotated, reduced and padded (0 to 1), and the affine map of its pixels to the original image."""
+    """Return an image rotated by `roll` (rad), reduced and padded (RGB, 0 to 1), and its affine map to the original.
+
+    The map takes pixels of the result to pixels of the original image.
+    """
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     w, h = round(width * scale), round(height * scale)

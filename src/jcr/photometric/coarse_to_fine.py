@@ -52,7 +52,7 @@ class PyramidLevel:
 
 
 def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
-    """Return the point in the base frame that is nearest to all optical axes."""
+    """Return the point in the base frame with the least squared distances from the optical axes of the n cameras."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
@@ -67,7 +67,7 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Return the depths (m) to try in every image, one row per trial and one column per image."""
+    """Return the depths (m) to try in each image: d trials (rows) for n images (columns)."""
     pose = cameras.base_from_camera
     depth = ((axes_meet(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
     middle = np.clip(depth, *MEET_WITHIN)
@@ -103,7 +103,8 @@ def align_photometrically(
 ) -> tuple[Cameras, Points]:
     """Align cameras at one pyramid level by rounds of depth search and Gauss-Newton; return cameras and points.
 
-    The columns of `directions` are the free steps of the cameras (`tied_directions`, `free_directions`).
+    `stage` has the settings. The columns of `directions` are the free steps of the cameras (`tied_directions`,
+    `free_directions`).
     """
     host, x_px = strongest(level, _per_image(level, stage))
     before, points = np.inf, None

@@ -137,7 +137,7 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
 def images_that_fit(
     level: Level, cameras: Cameras, intrinsics_known: bool
 ) -> tuple[Int[ndarray, " m"], Cameras]:
-    """Return the rows of the images that agree with the others, and their cameras, aligned without the other images.
+    """Return the rows of the images that fit together, and their cameras, which are aligned by these images alone.
 
     The measure is the share of the points of other images that an image shows in the same colour. An image with a far
     lower share than the median, even with a free camera, has a wrong pose or shows another scene. Raises RejectedError
@@ -196,7 +196,7 @@ def camera_covariance(
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, intrinsics: Intrinsics) -> Tracks:
-    """Return tracks of the points: their pixels in the host image, and in the images that show their colour."""
+    """Return tracks of the points: a pixel in the point's host image, and one in each image that shows its colour."""
     _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
     image, point = np.nonzero(shown)

@@ -84,7 +84,7 @@ class Points:
     """True for points whose colour most of the images that should see them show."""
 
     def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
-        """Return the points selected by a mask or slice."""
+        """Return the points that a mask or slice selects."""
         return Points(**{name: values[kept] for name, values in vars(self).items()})
 
 
@@ -109,7 +109,7 @@ class PhotometricEquations:
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """Return the images (RGB, 0 to 1) reduced to `height` pixels and blurred, with derivatives."""
+    """Return the images (RGB, 0 to 1), with intrinsics `grid`, reduced to `height` pixels and blurred, as a level."""
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:
@@ -190,12 +190,12 @@ def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
 
 
 def _in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return the points in the camera frames of their host images."""
+    """Return each point in the camera frame of its host image, m."""
     return points.depth[:, None] * unproject(zoomed(level.grid, cameras.zoom), points.x_px)
 
 
 def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return the points in the base frame."""
+    """Return each point in the base frame, m."""
     pose = cameras.base_from_camera[points.host]
     return np.einsum("kij,kj->ki", pose[:, :3, :3], _in_host(level, cameras, points)) + pose[:, :3, 3]
 
@@ -229,7 +229,10 @@ def _sample(
 
 
 def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
-    """Return each image's brightness relative to the others (geometric mean 1), from points that images share."""
+    """Return the brightness of each image relative to the others (geometric mean 1), from the points that images share.
+
+    Points whose colour differs by more than 2 `sigma` are not used.
+    """
     _, u, v, seen = in_view(level, cameras, points)
     shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
     dark = 10 * _FAINT
@@ -248,7 +251,10 @@ def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: fl
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
-    """Return the mean robust cost, 0 to 1, over all views of the points that are agreed on."""
+    """Return the mean robust cost, 0 to 1, of the agreed points over all images that see them.
+
+    The cost of a colour difference r is r²/(r² + sigma²).
+    """
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     weight = seen & points.agreed

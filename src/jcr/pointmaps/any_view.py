@@ -26,7 +26,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class Views:
-    """Undistorted images of one camera, the input of a network."""
+    """Undistorted images of one camera and, if known, their intrinsics: the input of a network."""
 
     colors: UInt8[ndarray, "n h w 3"]
     """RGB, upright and undistorted, at the camera's own resolution; the network resizes them."""
@@ -117,7 +117,7 @@ def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarra
 
 
 def rigid(matrices: Float[ndarray, "n r 4"]) -> Float[ndarray, "n 4 4"]:
-    """Return rigid transforms from a network's 3x4 or 4x4 matrices, with the nearest exact rotations."""
+    """Return rigid transforms from a network's n matrices, 3x4 or 4x4, each with the nearest exact rotation."""
     made = np.tile(np.eye(4), (len(matrices), 1, 1))
     made[:, :3] = matrices[:, :3]
     made[:, :3, :3] = nearest_rotation(made[:, :3, :3])

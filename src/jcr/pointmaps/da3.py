@@ -65,7 +65,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def build(name: str) -> nn.Module:
-    """Return the network of a named configuration with random weights; raise KeyError for an unknown name."""
+    """Return Depth Anything 3 in the configuration `name`, with random weights; raise KeyError for an unknown name."""
     os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # otherwise the package prints its layers
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warnings of the configuration's library

@@ -30,7 +30,7 @@ PATCH = 16
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Pixel grid of a network in an undistorted image, which is resized to `resized_size` and then cropped."""
+    """Pixel grid of a network: the part of an undistorted image that remains after a resize and then a crop."""
 
     original_size: tuple[int, int]
     """Width, height of the upright, undistorted image, px."""
@@ -47,7 +47,7 @@ class ImageGrid:
 
     @property
     def scale(self) -> Float[ndarray, "2"]:
-        """Resized over original size for x and y, which differ by rounding."""
+        """Resized over original size, for x and for y; both differ only by rounding."""
         return np.array(self.resized_size) / np.array(self.original_size)
 
     def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
@@ -70,7 +70,7 @@ class ImageGrid:
 def image_grid(
     original_size: tuple[int, int], long_edge: int = 512, patch: int = PATCH, keep_square: bool = False
 ) -> ImageGrid:
-    """Return the resize and crop published with DUSt3R for an image of `original_size` (width, height).
+    """Return the resize and crop that DUSt3R applies to an image of `original_size` (width, height).
 
     With `long_edge` 512, the long edge becomes 512 and both edges are cropped around the centre to multiples of the
     patch. A square image is cropped to 4:3 unless `keep_square`, because DUSt3R was not trained on squares. With 224,
@@ -155,7 +155,7 @@ def read_colors(
 
 
 def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize and crop an image to the grid with the published filters: Lanczos to shrink, bicubic to enlarge."""
+    """Resize and crop an image to the grid by DUSt3R's filters: Lanczos to shrink, bicubic to enlarge."""
     shrinks = max(grid.original_size) > max(grid.resized_size)
     filter_ = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
     resized = Image.fromarray(image).resize(grid.resized_size, filter_)

@@ -27,8 +27,8 @@ ARRAYS = {
 class PairPredictions:
     """Pointmaps of ordered image pairs, each pair in its first image's camera frame and in a unit of its own.
 
-    For edge e = (n, m), `pts3d[e]` has a point for each pixel of image n, `pts3d_in_other_view[e]` one for each pixel of
-    image m, both in the camera frame of n (paper section III: X_n,e and X_m,e).
+    For pair e = (n, m) of `edges`, `pts3d[e]` has a point for each pixel of image n, `pts3d_in_other_view[e]` one for
+    each pixel of image m. Both are in the camera frame of n.
     """
 
     edges: Int[ndarray, "e 2"]

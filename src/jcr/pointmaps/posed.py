@@ -78,7 +78,7 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
 
 
 def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
-    """Return the covariance (6n,6n) of camera poses relative to the first, by the published errors of a network.
+    """Return the covariance (6n,6n) of n camera poses relative to the first, from errors published for a network.
 
     Every camera has an independent error; the first camera's error also moves all others relative to it.
     """

@@ -358,7 +358,7 @@ def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpt
 
 
 def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
-    """Delete random points until the model has at most _MOST_OBSERVATIONS observations."""
+    """Delete randomly chosen points until the model has at most _MOST_OBSERVATIONS observations."""
     if model.compute_num_observations() <= _MOST_OBSERVATIONS:
         return
     order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -390,7 +390,7 @@ def _align_observations(
 def _not_registered(
     matcher: Matcher, matched: Matched, model: pycolmap.Reconstruction | None
 ) -> RejectedError:
-    """Return the error that too few images register, with their number, the likely reason and a remedy."""
+    """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy."""
     x_px, pairs = matcher.x_px, len(matched.geometries)
     features = int(np.median([len(x) for x in x_px]))
     if features < _FEW_FEATURES:

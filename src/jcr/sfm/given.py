@@ -20,7 +20,7 @@ MIN_POINTS = 50
 def reconstruct_given(
     capture: Capture, cameras: Path, seed: int = 0, progress: Progress | None = None
 ) -> Reconstruction:
-    """Reconstruct the images that the COLMAP model at the path `cameras` contains, with its poses held.
+    """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
     Raises InputError when the model contains fewer than three, RejectedError when too few points can be triangulated.
     """

@@ -120,7 +120,10 @@ def reconstruction_of(
 
 
 def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
-    """Return the tracks of a model in the images `image_ids`, in pixels of images of `size` (width, height)."""
+    """Return the tracks of a model in the images with COLMAP's ids `image_ids`, in pixels of images of `size`.
+
+    The size is (width, height); rows of images are counted in the order of the ids.
+    """
     camera = model.camera(model.image(image_ids[0]).camera_id)
     original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
     seen = observations(model, image_ids)

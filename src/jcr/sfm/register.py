@@ -36,7 +36,7 @@ class ImageFeatures:
 
 @dataclass(frozen=True)
 class KnownImages:
-    """Images of one camera with known poses and intrinsics, and their features."""
+    """Images of one camera whose poses and intrinsics are known, and their SIFT features."""
 
     camera: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
@@ -71,7 +71,7 @@ class SharedPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """Pose of a new image, and the points that it shares with images of known poses."""
+    """Result of the registration of a new image: its pose, and the points that it shares with images of known poses."""
 
     pose: CameraPose
     points_in_recon: Float[ndarray, "p 3"]

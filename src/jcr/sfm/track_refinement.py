@@ -222,7 +222,7 @@ def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, mo
 @compiled
 @no_type_check
 def _window(radius):
-    """Return the offsets (n,2) of the pixels of a patch, row by row, and their weights, whose sum is 1."""
+    """Return the offsets (n,2), x and y in px, of the pixels of a patch, row by row, and their weights of sum 1."""
     side = 2 * radius + 1
     index = np.arange(side * side)
     offsets = np.stack((index % side - radius, index // side - radius), axis=1).astype(np.float64)
@@ -253,7 +253,7 @@ def _patch(grey, x_px, affine, bend, offsets, patch):
 @compiled
 @no_type_check
 def _smooth(grey, x, y):
-    """Return the grey at x, y by a cubic B-spline with the pixels as coefficients, which blurs by 0.58 px.
+    """Return the grey at x, y of a cubic B-spline whose coefficients are the pixels, which blurs by 0.58 px.
 
     Without this blur, interpolation would smooth differently on pixels and between them, which biases positions.
     """
@@ -310,9 +310,10 @@ def _template(around, offsets, window, template, pull):
 @compiled
 @no_type_check
 def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
-    """Update `x_px` and `affine` by Gauss-Newton; return the correlation at convergence, -1 without convergence.
+    """Align one patch to the template by Gauss-Newton: update `x_px` (its centre) and `affine`; return the correlation.
 
-    `template` and `pull` come from `_template`: a step is the sum over the patch of (grey − template)·pull.
+    The result is -1 without convergence, or if the patch moves more than `most_px` from `keypoint_px`. `template`,
+    `pull` and `deviation` come from `_template`: a step is the sum over the patch of (grey − template)·pull.
     """
     step = np.empty(_FREE)
     for _ in range(_STEPS):

@@ -26,7 +26,7 @@ def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray,
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
-    """Return every pair in both orders: (i, j) with i > j first, then each reversed, as published."""
+    """Return all ordered pairs of `count` images: first (i, j) with i > j, then each reversed, as DUSt3R has them."""
     return window_pairs(count, count)
 
 

@@ -47,7 +47,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """Return the network of a configuration with the tensors `state`, which share the memory of the mapped file."""
+    """Return the network of a configuration with the weights `state`, which share the memory of the mapped file."""
     mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
     config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")

@@ -60,7 +60,7 @@ class Alignment:
     """Faults of the alignment that the user must act on, such as pairs that do not agree at all."""
 
     def x_in_camera(self) -> Float[ndarray, "n h w 3"]:
-        """Return the point of every pixel in its own camera's frame, float32."""
+        """Return the point of every pixel in its own camera's frame, recon units, float32."""
         _, height, width = self.depth.shape
         pinhole = Intrinsics(*self.focal_px, *self.principal_point_px, width, height)
         return rays(pinhole).astype(np.float32) * self.depth[..., None]
@@ -72,9 +72,9 @@ def global_align(
     """Estimate camera poses, focal length, depths and pair scales from pairwise pointmaps, or from their npz file.
 
     `pixels` is the number of pixels used per image. The focal length is estimated from the pointmaps. The principal
-    point and the ratio fy / fx are those of the predictions' intrinsics; without these they are the image's middle and
-    1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and too few pixels;
-    RejectedError where the pointmaps do not determine the cameras.
+    point and the ratio fy / fx are those of the predictions' intrinsics; without intrinsics they are the image's middle
+    and 1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and too few pixels.
+    Raises RejectedError where the pointmaps do not determine the cameras.
     """
     predictions = pairs if isinstance(pairs, PairPredictions) else read_pairs(Path(pairs))
     if pixels < LEAST_PIXELS:
@@ -99,7 +99,7 @@ def _check_connected(predictions: PairPredictions) -> None:
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the alignment of a solution with the depth of every pixel."""
+    """Return the result of the alignment with the depth of every pixel, not only of those used to solve it."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

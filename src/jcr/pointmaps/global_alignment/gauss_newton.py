@@ -47,7 +47,7 @@ UNDETERMINED = "the pointmaps of the pairs have too little in common to be align
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentSolution:
-    """Result of Gauss-Newton: state, covariance, and noise of the pointmaps."""
+    """Result of the alignment by Gauss-Newton: unknowns, covariance of the camera poses, and noise of the pointmaps."""
 
     state: AlignmentState
     covariance: Float[ndarray, "r r"]

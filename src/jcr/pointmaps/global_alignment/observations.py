@@ -105,7 +105,7 @@ def _choose_pixels(problem: AlignmentProblem, count: int) -> list[Int[ndarray, "
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-    """Return the pointmaps of all pairs at `pixels` (flat indices) of one image."""
+    """Return the pointmaps of all pairs that contain `image`, at its `pixels` (flat indices)."""
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))
