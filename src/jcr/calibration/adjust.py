@@ -45,9 +45,9 @@ effects of that size are not reported either (checks/effects.py)."""
 
 
 def with_adjusted_images(case: Case) -> Case:
-    """Adjust the images of a case and replace its fit to camera poses by the resulting calibration.
+    """Return the case after bundle adjustment, with the adjusted calibration in place of the fit to camera poses.
 
-    A rejected fit is replaced too: without given intrinsics the camera poses are poor before the adjustment. For
+    A rejected fit is replaced too, because without given intrinsics its camera poses are poor. For
     correspondences between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
     decreases. The fit is kept if the motions are degenerate, or if the adjustment fails (points behind the cameras).
     """

@@ -98,9 +98,9 @@ def drift(
 
 
 def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Test:
-    """Return the test of a motion before image `first`: gripper_from_camera (SLIP) or base_from_recon (BASE_MOVED).
+    """Return the test that gripper_from_camera (SLIP) or base_from_recon (BASE_MOVED) changed before image `first`.
 
-    The test contains the estimate of the motion. The equations are linearized at each estimate until it converges.
+    The test contains the estimated change. The equations are linearized at each estimate until it converges.
     """
     (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
     columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)

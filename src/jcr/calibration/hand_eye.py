@@ -73,7 +73,7 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
     base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
     from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` (6n,6n) is
-    the covariance of these errors at 1 rad where it is known already.
+    the covariance of these errors for a size of 1 rad; None: it is computed.
 
     `scale` (metres per unit of the camera poses, 1 if these are metric) is known with the relative standard deviation
     `scale_std`; None: the scale is estimated. `offset` is a known coordinate of the camera, for motions that do not
@@ -209,7 +209,7 @@ JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
 
 
 def judged(hand_eye: Calibration) -> Calibration:
-    """Return the calibration with newly derived findings (kinds JUDGED) on image count, robot noise and uncertainty."""
+    """Return the calibration with findings on image count, robot noise and uncertainty derived again (kinds JUDGED)."""
     rejecting = list(_rejecting(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
     weak = "rejects" if any(one.kind is FindingKind.UNCERTAIN for one in rejecting) else "warns"

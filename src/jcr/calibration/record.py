@@ -275,7 +275,7 @@ class Calibration(Outcome):
 
     @model_validator(mode="after")
     def _is_of_one_mount(self) -> "Calibration":
-        """Raise ValueError unless exactly the two transforms of the camera's mount are set.
+        """Return the calibration; raise ValueError unless exactly the two transforms of the camera's mount are set.
 
         These are on_gripper and resting for mount "gripper", on_base and carried for mount "base".
         """
@@ -307,12 +307,12 @@ class Calibration(Outcome):
 
     @property
     def base_from_recon(self) -> Similarity:
-        """Similarity from the reconstruction to the base frame; raises InputError for a fixed camera."""
+        """Similarity from recon coordinates (any unit) to the base frame (m); raises InputError for a fixed camera."""
         return Similarity(self._require(self.resting, "gripper"), self.scale)
 
     @property
     def gripper_from_object(self) -> Similarity:
-        """Similarity from the reconstruction of the carried object to the gripper frame.
+        """Similarity from recon coordinates (any unit) of the carried object to the gripper frame (m).
 
         Raises InputError for a camera on the gripper.
         """

@@ -98,6 +98,6 @@ def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the rows and columns of a pose covariance (6 rows per pose) that belong to the poses of these indices."""
+    """Return the part of a covariance of poses (6 rows and columns per pose) for the poses of these indices."""
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

@@ -120,7 +120,7 @@ class Quantities(dict[str, Any]):
 
     @staticmethod
     def of(finding: Finding) -> "Quantities":
-        """Return the template values of a finding."""
+        """Return the values that the templates of a finding's message and remedy use, by name."""
         named = Quantities(images=_Images(finding.images), concerns=_Text(finding.concerns))
         for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
             if isinstance(one, str):

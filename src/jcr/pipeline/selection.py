@@ -97,7 +97,7 @@ class Trial:
     def is_doubtful(self) -> bool:
         """Whether findings of the images matter: no calibration, warnings, a rejection, or images left out.
 
-        An InputError of the back end is no doubt about the images.
+        It is False after an InputError of the back end, which has another cause than the images.
         """
         if self.hand_eye is None:
             return not isinstance(self.failure, InputError)

@@ -85,7 +85,7 @@ def with_state(result: RunResult, **fields: Any) -> RunResult:
 
 
 def stages_of(result: RunResult) -> list[str]:
-    """Return the names of the stages that a run needs for its cameras and options, in order."""
+    """Return the names of the stages that a run needs for its cameras and options, in the order of execution."""
     left_out = set() if result.others else {"cameras"}
     if result.state.options.map is None:
         left_out |= {"densify", "map"}

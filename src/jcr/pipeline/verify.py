@@ -78,7 +78,7 @@ class Verification(Drift):
 
     @property
     def finding(self) -> str:
-        """Phrase that states what has moved: nothing, the camera, the scene, or one of the two."""
+        """Phrase that states what has moved: nothing, the camera, the scene, or camera or scene if that is unclear."""
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}

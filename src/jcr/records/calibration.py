@@ -294,7 +294,7 @@ class SceneUncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class WithGivenIntrinsics:
-    """Transform to use with the given intrinsics: its most likely value if these replace the estimated intrinsics."""
+    """Most likely transform, and its covariance, for a user who keeps the given instead of the estimated intrinsics."""
 
     gripper_from_camera: Matrix
     covariance: Covariance7

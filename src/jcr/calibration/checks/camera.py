@@ -293,7 +293,7 @@ def with_effect_free(state: CameraAdjustment, best: CameraEffect) -> CameraAdjus
 
 
 def is_material(found: Finding, after: CameraAdjustment) -> bool:
-    """Return whether the effect `found`, estimated in `after`, is large and moves the camera by over half a std.
+    """Return whether an effect, estimated in `after`, is large and moves the camera by half a standard deviation.
 
     Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
@@ -349,7 +349,7 @@ def hypotheses(state: CameraAdjustment) -> list[CameraEffect]:
 
 
 def _freed(state: CameraAdjustment) -> tuple[str, ...]:
-    """Return the names of the intrinsic parameters that the effect "wrong intrinsics" tests."""
+    """Return the names of the parameters that the effect "wrong intrinsics" tests; for estimated ones fx, p1, p2."""
     return tuple(name for name in (INTRINSICS if state.is_given else ASPECT) if name in state.equations.names)
 
 

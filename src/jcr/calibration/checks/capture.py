@@ -130,7 +130,7 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 
 
 def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the fraction of an image's features that have at least TWINS similar features elsewhere in the image."""
+    """Return the fraction of an image's features that have three or more (TWINS) similar features elsewhere in it."""
     height, width = image.shape[:2]
     shrunk = min(1.0, TWINS_AT / max(height, width))
     x_px, descriptors = detect(grey_of(image, (round(shrunk * width), round(shrunk * height))))

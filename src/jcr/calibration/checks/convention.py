@@ -188,7 +188,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
     def with_rotation(name: str, read: Rotation, remedy: str = AT_SOURCE) -> _Candidate:
-        """Return a candidate with other rotations and the given translations."""
+        """Return a candidate convention with the rotations `read` and the given translations."""
         return (name, remedy, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
