@@ -35,9 +35,9 @@ def checked_capture(
 ) -> tuple[Capture, list[int]]:
     """Check images and gripper poses; return a capture without intrinsics, and the indices of the frames in it.
 
-    Every image is decoded once. Frames that cannot be used are left out with a note: those in `faults` (index to
-    message), and images that are missing, damaged, duplicated or of another size. Raises InputError if more frames than
-    `tolerated` are faulty. Messages begin with `where`, the file that names the images. One image is enough here.
+    A frame is an image with its pose. Left out with a note are the frames in `faults` (index to message), and images
+    that are missing, damaged, duplicated or of another size. Raises InputError if more than a quarter of the frames are
+    faulty. Messages begin with `where`, the file that names the images.
     """
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
@@ -100,7 +100,10 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
-    """Return the EXIF orientation that all images share; raise InputError if it differs or mirrors the images."""
+    """Return the EXIF orientation (1 to 8) that all images share; `orientation_of` has it by the name of each image.
+
+    Raises InputError if the orientations differ or mirror the images.
+    """
     (first, orientation), *others = orientation_of.items()
     remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
     if orientation not in (1, *ROTATED):

@@ -40,9 +40,10 @@ class PoseTable:
 
 
 def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOptions) -> Paired:
-    """Pair the rows of a pose file with a folder's images by name, else by time stamp, else by order.
+    """Pair the poses of a file with a folder's images by name, else by time stamp, else by order of the names.
 
-    Raises InputError if they cannot be paired.
+    Return image paths, base_from_gripper of each, messages for images without a usable pose, and notes for the user.
+    Raises InputError if poses and images cannot be paired.
     """
     if table.images is not None:
         return _paired_by_name(folder, file, table)
@@ -105,7 +106,10 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
-    """Pair rows with the images that they name, also if folder, slashes, case or file ending of the name differ."""
+    """Return the result of `pair_with_images` for a table whose rows name their images.
+
+    Folder, slashes, case and file ending of a name may differ from those of the image file.
+    """
     assert table.images is not None
     own: dict[str, list[str]] = {}
     for image in image_names(folder):
@@ -136,7 +140,10 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
 def _paired_by_time(
     folder: Path, file: Path, table: PoseTable, taken: list[str], options: ReadOptions
 ) -> Paired | None:
-    """Interpolate the poses at the time stamps that name the images; None if the names are not such stamps."""
+    """Return the result of `pair_with_images`, with poses interpolated at the time stamps that name the images `taken`.
+
+    None: the names are no time stamps, or none of the stamps is within the times of the table.
+    """
     assert table.stamp_ns is not None
     try:
         stamps = np.array([stamp_ns(Path(name).stem, str(folder / name)) for name in taken])

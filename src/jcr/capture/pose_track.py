@@ -25,7 +25,7 @@ stop."""
 
 
 class PoseTrack:
-    """Sampled poses a_from_b in ascending time; of samples with the same stamp, the first one is kept."""
+    """Poses a_from_b at ascending times, for interpolation; of poses with equal time stamps, the first one is kept."""
 
     def __init__(self, stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> None:
         self.stamp_ns, rows = np.unique(stamp_ns, return_index=True)

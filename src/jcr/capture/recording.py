@@ -55,7 +55,7 @@ def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], w
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """Frames of a recording, one row each, with gripper poses; images are read on demand."""
+    """Frames of a bag or data set: gripper pose, speed and time of each frame, and functions that read its image."""
 
     source: Path
     options: ReadOptions

@@ -160,7 +160,10 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return the first `used` bytes of each row, without padding to `step`; raise InputError if some are missing."""
+    """Return the pixel data of an image message, the first `used` bytes of each of its h rows, without padding.
+
+    Raises InputError, begun with `where` and the name `what` of the data, if bytes are missing.
+    """
     data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
     if message.step < used or data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")

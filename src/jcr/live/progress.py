@@ -57,7 +57,7 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors at the point of the requirement, or None."""
+        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors; None if the calibration has no requirement."""
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 

@@ -178,9 +178,10 @@ class LiveSession:
             last, limit = state.base_from_gripper, MOVED_ON if answer["accepted"] else TRY_AGAIN
 
     def take(self, state: RobotState, waits: bool = False) -> Answer:
-        """Take an image at the state of an arm at rest, start its calibration, and return whether the image is kept.
+        """Take an image while the arm rests at `state`, start a calibration with it, and return an answer for JSON.
 
-        `waits`: wait some seconds for the calibration, and add it and the next pose to the answer.
+        The answer has "accepted", and "image" (name) or "reason". `waits`: wait for the calibration, and add its state
+        and the next pose to the answer.
         """
         with self._lock:
             if self.state.is_over:

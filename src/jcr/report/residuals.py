@@ -13,7 +13,10 @@ NOTICEABLE = 1.05
 
 
 def residuals_section(result: RunResult) -> Content:
-    """Return residuals of each image as numbers and bars, the robot pose noise, and residuals of the whole fit."""
+    """Return the section on residuals of gripper poses against camera poses (mm, degrees).
+
+    Its content: residuals of each image as numbers and bars, those of the whole fit, and the robot pose noise.
+    """
     fit = result.found
     named = zip(shown_names(fit.images), fit.images, strict=True)
     rows = [(name, one) for name, one in named if one.translation_residual_mm is not None]

@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 
 class Lattice(nn.Module):
-    """Regular grid over the workspace, with trainable features at selected nodes, such as those near surfaces.
+    """Regular grid over the workspace whose selected nodes, such as those near surfaces, have trainable features.
 
-    A table of features has one row for each selected node; all other nodes share row 0.
+    The features are rows of a table outside of this class: one row for each selected node; all others share row 0.
     """
 
     lower: Tensor
@@ -41,7 +41,10 @@ class Lattice(nn.Module):
 
     @classmethod
     def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
-        """Return the lattice whose selected nodes are the corners of the cells in the mask `near`."""
+        """Return the grid whose selected nodes are the corners of the cells that are True in `near`.
+
+        `lower` is the lower corner (m), `cell` the side (m) of a cell.
+        """
         corner = F.pad(near, (1, 1, 1, 1, 1, 1))
         for axis, n in enumerate(corner.shape):
             corner = corner.narrow(axis, 0, n - 1) | corner.narrow(axis, 1, n - 1)

@@ -15,7 +15,7 @@ FREQUENCIES, HIDDEN, BATCH, RATE = 10, 256, 6144, 5e-3
 
 
 class PaperField(Field):
-    """Field of one property: sinusoidal encoding, one hidden layer of 256 ReLU units, one linear layer."""
+    """Network for one property as in the paper: sinusoids of the position, 256 hidden ReLU units, linear output."""
 
     def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
         """Initialise the layers of the property `name` from `generator`; `box` (2,3) m scales the positions."""
@@ -30,10 +30,11 @@ def train_paper(
     box: np.ndarray | None = None,
     max_seconds: float = np.inf,
 ) -> dict[str, PaperField]:
-    """Return trained fields of occupancy, color and, if the cloud has several labels, label.
+    """Return trained networks by property: "occupancy", "color" and, if the cloud has several labels, "label".
 
-    `weighted`: points weigh by their confidence. Occupancy is trained with the points as positives and as many negatives
-    drawn uniformly from the workspace `box` (binary cross-entropy); color by squared error, label by cross-entropy.
+    `weighted`: points weigh by their confidence. Occupancy is trained with the points as occupied and as many positions
+    drawn uniformly from the workspace `box` (m) as free (binary cross-entropy); color by squared error, label by
+    cross-entropy.
     """
     box = workspace_box(cloud, None) if box is None else box
     inside, start = rows_inside(cloud, box), time.perf_counter()

@@ -139,7 +139,10 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
 
 
 def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
-    """Return the joints of a robot, parents before children; `links` are the names to whose rows the joints refer."""
+    """Return the joints of a robot, parents before children; a joint names its two links by their indices in `links`.
+
+    Raises InputError, begun with `path`, for a type of joint that is not supported.
+    """
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
         if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):

@@ -267,10 +267,10 @@ def origin(folder: Path) -> Path:
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
-    """Copy a capture of another format into `folder` with a capture.json, and return the copy.
+    """Copy the images of a capture of another format into `folder`, write a capture.json, and return the copy.
 
-    A capture that was read from a capture.json is returned unchanged. A run with the copy can be resumed without the
-    options of the other format.
+    A capture that was read from a capture.json is returned unchanged, without a copy. With the copy, a run can be
+    resumed without the options of the other format.
     """
     if capture.source is None:
         return capture

@@ -30,7 +30,7 @@ _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FU
 
 
 def find_model(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model at a path or in its usual subfolders; None if there is none."""
+    """Return the folder of the COLMAP model at a path or in a subfolder such as sparse/0; None if there is none."""
     files = (path / place / f"cameras.{end}" for place in _PLACES for end in ("bin", "txt"))
     return next((file.parent for file in files if file.is_file()), None)
 
@@ -98,7 +98,7 @@ def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 
 
 
 def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] | None = None) -> Intrinsics:
-    """Read the intrinsics that all registered images share, or all of those with `names`.
+    """Return the intrinsics that all registered images of a COLMAP model share, or all registered images in `names`.
 
     Raises InputError if intrinsics differ, are for images of another size than `size` (width, height), or have a
     distortion model that jcr does not support.

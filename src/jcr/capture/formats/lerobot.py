@@ -46,7 +46,7 @@ class Feature(BaseModel):
 
 
 class Info(BaseModel):
-    """Content of meta/info.json."""
+    """Content of meta/info.json of a LeRobot data set: recorded quantities, frame rate, and templates of file paths."""
 
     model_config = ConfigDict(allow_inf_nan=False, strict=True)
     features: dict[str, Feature]

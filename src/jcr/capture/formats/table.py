@@ -70,7 +70,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """Read a file of gripper poses, or a folder that holds one; the images are in the same folder or in images/."""
+    """Read a capture from a file of gripper poses, or a folder with such a file, and the images in the same folder.
+
+    The images may also be in its subfolder images/.
+    """
     file = options.poses or find_table(path)
     if file is None:
         raise InputError(f"{path}: holds no table of poses ({', '.join(TABLES[:4])}); name it with --poses")
@@ -269,7 +272,7 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the usual name of a column and the unit after it: "Pos_X (mm)" gives "x" and "mm"."""
+    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm"."""
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
