@@ -59,10 +59,9 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the estimation problem of the own camera's images and the used images of the cameras `members`.
+    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`.
 
-    The order is the own camera, then `members`. Given intrinsics of the own camera are not used as a prior if its
-    images contradict them.
+    Given intrinsics of the own camera are not used as a prior if its images contradict them.
     """
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
@@ -124,7 +123,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:
-    """Return the distribution of the own camera's used poses in metres, for a reconstruction without image features."""
+    """Return the normal distribution of the own camera's used poses (m), for a reconstruction without image features."""
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:

@@ -49,8 +49,8 @@ def localise(
 ) -> tuple[Registration | None, int]:
     """Return the registration (pose and inliers) of an image in the reconstruction, and the number of inliers.
 
-    The registration is None if there are too few. The focal length is estimated if none is given, or if another value
-    gives clearly more inliers, because wrong intrinsics give a wrong pose with fewer inliers.
+    The registration is None if the inliers are too few. The focal length is estimated if none is given, or if another
+    value gives clearly more inliers, because wrong intrinsics give a wrong pose with fewer inliers.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
@@ -163,7 +163,7 @@ class Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Return the views with a rig for each used image; rigs are added if needed.
+        """Return the views with a rig (cameras that move together) for each used image; new rigs are added if needed.
 
         Return a rejected placement if the images cannot be assigned.
         """
@@ -187,9 +187,9 @@ class Rigs:
         return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Return the views of a second camera on the own gripper; image and own image taken together have one rig.
+        """Return the views of another camera on the own gripper; each image gets the rig of the own image taken with it.
 
-        Return a rejected placement if the second camera is not rigidly connected, or its images do not suffice.
+        Return a rejected placement if the other camera is not rigidly connected, or its images do not suffice.
         """
         assert seen.camera.frame is not None
         capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}

@@ -44,9 +44,9 @@ def posterior(
 ) -> tuple[Float[ndarray, " p"], Square, Budget]:
     """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
-    `mode` is the mode of the log sizes, `information` their information matrix there; the covariance includes
-    `region.spread`. `expected`: for predictions, the residuals are 0 and their squares are replaced by expectations
-    under the noise at the mode.
+    `mode` are the most likely logarithms of the robot's error sizes, `information` their information matrix; the
+    covariance includes `region.spread`. `expected`: for predictions, the residuals are 0 and their squares are replaced
+    by expectations under the noise at the mode.
     """
     root = cholesky(equations.covariance(mode))
 

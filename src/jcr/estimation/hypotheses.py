@@ -474,7 +474,7 @@ def test_combinations(
 def _step(
     equations: Alternatives, free: Float[ndarray, "e r"]
 ) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
-    """Return estimate and covariance of r coefficients, with the gain (decrease of twice the cost) between them.
+    """Return the estimate of r coefficients, the gain (decrease of twice the cost), and the estimate's covariance.
 
     The coefficients belong to the columns of `free`, directions in the e parameters of `equations`.
     """
@@ -503,8 +503,8 @@ def drift_covariance(
     """Return the covariance (6n,6n) of camera pose errors that accumulate along the sequence; None if they do not.
 
     Errors accumulate as in visual odometry; a gain of log evidence above CLEAR decides, from the `used` poses. `fit` is
-    the estimate of (X, scale, base_from_recon) without such errors. `error_covariance` and `noise_floor` are those of
-    the gripper poses in `pose_problem`.
+    the estimate of (gripper_from_camera, scale, base_from_recon) without such errors. `error_covariance` and
+    `noise_floor` are those of the gripper poses in `pose_problem`.
     """
     rows = np.flatnonzero(used)
     if len(rows) < FEWEST:

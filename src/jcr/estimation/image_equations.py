@@ -232,7 +232,7 @@ def cost_of_images(images: ImageEvidence, state: State) -> float:
 def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
     """Return an information matrix of this strength in the space of seven `steps`, those of a similarity of the world.
 
-    The seven columns are scaled and orthonormalised first, so only the space that they span matters.
+    The seven columns are orthonormalised first, so only the space that they span matters.
     """
     unseen = np.linalg.qr(steps)[0]
     return strength * unseen @ unseen.T

@@ -106,12 +106,12 @@ def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | Non
 
 
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
-    """Return the steps of gripper_from_camera, log scale and q intrinsics that images confuse with a thin prism.
+    """Return the steps of gripper_from_camera `x`, log scale and q intrinsics that images confuse with a thin prism.
 
-    `x` is gripper_from_camera. Column 0 is for a prism that displaces along x, column 1 along y; the rows are 7 + q. To
-    second order, a prism that displaces x by s · r² (r: radius) equals p2 = s, the principal point moved by 2 · s · fx
-    and the camera rotated by 2 · s about its y axis. s is one standard deviation: DECENTRING, or the estimated
-    tangential distortion if larger, because one defect of the optics causes both.
+    Column 0 is for a prism that displaces along x, column 1 along y; there are 7 + q rows. To second order, a prism
+    that displaces x by s · radius² equals p2 = s, the principal point moved by 2 · s · fx and the camera rotated by 2 ·
+    s about its y axis. s is one standard deviation: DECENTRING, or the estimated tangential distortion if larger,
+    because one defect of the optics causes both.
     """
     names = parameter_names(camera)
     out = np.zeros((7 + len(names), 2))

@@ -219,9 +219,10 @@ def scene_points(solution: Solution) -> ScenePoints:
 def _triangulation(
     solution: Solution, some: Int[ndarray, " n"]
 ) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of n points by d columns (cameras, boards, rigs), and their covariance for exact columns.
+    """Return the derivative of n points by d columns (cameras, boards, rigs), and each point's covariance.
 
-    `some` are the ascending numbers of the points; the order is that of `Problem.columns`.
+    The covariance is that by errors of the observations, for exact columns. `some` are the ascending numbers of the
+    points; the order of columns is that of `Problem.columns`.
     """
     images, problem = solution.images, solution.problem
     _, rows_point, rows_rig, _ = problem.rows

@@ -279,7 +279,7 @@ def choose_poses(
 
 
 def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "3"] | None = None) -> float:
-    """Return the sum of the variances of gripper_from_camera (6) and log scale, each divided by the square of its UNIT.
+    """Return the sum of the variances of gripper_from_camera (6) and log scale in units of 1 mm, 0.1° and 0.2 % (UNIT).
 
     With a `point` (m, from the camera in gripper axes), the variances of the point's position and of the rotation are
     summed instead.
@@ -293,9 +293,9 @@ def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "
 def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:
-    """Return the information matrix of hand-eye transform, log scale and base_from_recon by each of n gripper poses.
+    """Return the information matrix of X (6), log scale and base_from_recon (6) by each of n gripper poses.
 
-    `noise` (m, rad) are the standard deviations of the random errors of a pose. The 13 unknowns are in this order.
+    X is gripper_from_camera. `noise` (m, rad) are the standard deviations of the random errors of a pose.
     """
     # The frame of the reconstruction is arbitrary; here it is the base frame, in metres.
     camera = base_from_gripper @ gripper_from_camera

@@ -42,7 +42,10 @@ UNKNOWNS = 13
 
 
 def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
-    """Return the 12 columns of the X and Z of arm number `arm` among the unknowns; the common log scale is column 6."""
+    """Return the 12 columns of an arm's X (gripper_from_camera) and Z (base_from_recon) among the unknowns.
+
+    `arm` counts from 0; column 6 is the log scale, which all arms share.
+    """
     first = 12 * arm
     return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
 
@@ -321,7 +324,7 @@ class Problem:
 
     @property
     def arm_unknowns(self) -> int:
-        """Number of unknowns of the arms: 12 of X and Z for each arm, and one scale."""
+        """Number of unknowns of the arms: hand-eye transform (6) and base_from_world (6) of each arm, and one scale."""
         return 12 * len(self.arms) + 1
 
     @cached_property
@@ -507,8 +510,8 @@ def stepped(
 ) -> State:
     """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
 
-    `arms` holds X, log scale and Z of the first arm, then X and Z of further arms; `columns` (d,) has the order of
-    `Problem.columns`. None: no step. Points do not move.
+    `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
+    arms; `columns` (d,) has the order of `Problem.columns`. None: no step. Points do not move.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
