@@ -49,7 +49,7 @@ class _Seen:
 def with_boards(
     capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress | None = None
 ) -> Reconstruction:
-    """Add the corners of the boards that `spec` (the option `--board`) names to the tracks of a reconstruction.
+    """Add the corners of the board or tags that `spec` (the value of --board) names to the tracks of a reconstruction.
 
     Raises InputError for a name that means no board.
     """
@@ -128,7 +128,7 @@ def _agreeing(
 def _triangulated(
     x_px: Float[ndarray, "b c 2"], cameras: Float[ndarray, "b 4 4"], intrinsics: Intrinsics
 ) -> Float[ndarray, "c 3"]:
-    """Return the corners in the recon frame, triangulated from these images; NaN if fewer than two show it."""
+    """Return the c corners in the recon frame, triangulated from b images; NaN if fewer than FEWEST_IMAGES show it."""
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])
     for c in np.flatnonzero(shown.sum(0) >= FEWEST_IMAGES):
@@ -146,7 +146,7 @@ def _with_corners(
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """Return the tracks with a board's corners in `images` (rows) added, and the board with its track points."""
+    """Return the tracks with a board's corners in `images` (rows) added, and the board's rows of track points."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

@@ -115,7 +115,7 @@ def _contradicted(
     """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
-        """Return pixels v, u in image `other` of the points of image `row`, and whether each hides the surface."""
+        """Return pixels v, u in image `other` of the n points of image `row`, and which hide other's surface."""
         other_from_recon = inverse(recon_from_camera[other])
         depth = apply(other_from_recon, points_in_recon[other])[..., 2]
         nearest = np.where(known[other], depth, np.inf).astype(np.float32)

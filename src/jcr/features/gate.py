@@ -69,7 +69,7 @@ class RotationOfX:
 
 @dataclass(frozen=True)
 class Gate:
-    """Image pairs, divided into confirmed, undecided and contradicted by the gripper's rotation, with the hand-eye."""
+    """Image pairs that the gripper's rotation confirms, leaves undecided or contradicts; and the hand-eye rotation."""
 
     confirmed: tuple[Pair, ...]
     """Pairs that agree with the gripper's motion; the first of their `readings` is the motion that agrees best."""

@@ -186,7 +186,7 @@ def _retracted(
 
 
 def _sideways(direction: Float[ndarray, "3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return two unit vectors that are orthogonal to a direction and to each other."""
+    """Return two unit vectors that, together with the unit vector `direction`, are orthogonal to each other."""
     across_with = skew(direction)
     one = _unit(across_with[:, int(np.argmin(np.abs(direction)))])
     return one, across_with @ one

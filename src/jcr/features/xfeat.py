@@ -50,7 +50,10 @@ SHA256 = {
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    """Return XFeat and LightGlue with their published weights, in evaluation mode; raise InputError without them."""
+    """Return XFeat and LightGlue with their published weights, in evaluation mode.
+
+    Raises InputError if the weights are not installed.
+    """
     kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
     network, matcher = (
         kornia.XFeatModel(),

@@ -39,7 +39,7 @@ SETTLED = 0.995
 
 @dataclass(frozen=True)
 class PyramidLevel:
-    """Settings of the alignment at one level of the image pyramid."""
+    """Settings of the alignment at one image height: points per image, number of rounds, scale of the robust cost."""
 
     height: int
     """Height of the images in pixels."""

@@ -44,7 +44,7 @@ def search(
     intrinsics_known: bool,
     report: Progress,
 ) -> Cameras:
-    """Return the cameras by the hand-eye transform for which the images agree best in colour.
+    """Return the cameras (gripper poses times one hand-eye transform) for which the images agree best in colour.
 
     `levels` are the images by their height in pixels. Raises RejectedError where a different hand-eye transform fits as
     well, or where the images have no edges.

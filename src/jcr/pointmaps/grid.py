@@ -47,11 +47,11 @@ class ImageGrid:
 
     @property
     def scale(self) -> Float[ndarray, "2"]:
-        """Resized over original size, for x and for y; both differ only by rounding."""
+        """Factor of the resize for x and for y; the two differ only by rounding."""
         return np.array(self.resized_size) / np.array(self.original_size)
 
     def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Map pixels (...,2) of the original image to the grid."""
+        """Return the pixels on the grid that correspond to pixels (...,2) of the original, undistorted image."""
         return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
 
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
@@ -109,7 +109,7 @@ class PreparedImages:
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
     def grid_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Map pixels (...,2) of the capture's distorted images to the grid."""
+        """Return the pixels on the grid that correspond to pixels (...,2) of the capture's distorted images."""
         camera = self.intrinsics_of_capture
         if self.pinhole is not None and camera is not None and is_distorted(camera):
             x_px = project(self.pinhole, unproject(camera, x_px))
@@ -140,9 +140,10 @@ def prepare_images(
 def read_colors(
     capture: Capture, grid: ImageGrid, intrinsics: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
-    """Read the images of a capture on a grid; images of a camera with distortion are undistorted to `pinhole` first.
+    """Read the images of a capture, resized and cropped to `grid`.
 
-    Raises InputError for an image that cannot be read.
+    If `intrinsics` have distortion, the images are undistorted to those of `pinhole` first. Raises InputError for an
+    image that cannot be read.
     """
     width, height = grid.size
     colors = np.empty((len(capture), height, width, 3), np.uint8)

@@ -22,7 +22,7 @@ FOCAL_STD = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class PosedPointmaps:
-    """Camera pose and pointmap of each image, in one recon frame."""
+    """Camera pose and pointmap (3D point of each pixel, with confidence) of each image, in one recon frame."""
 
     grid: ImageGrid
     """Position of the pointmaps' pixels in the undistorted images."""

@@ -33,10 +33,10 @@ def align_pairs(
     progress: Progress | None = None,
     pixels: int = PIXELS,
 ) -> PosedPointmaps:
-    """Align pairwise pointmaps into one frame by global alignment.
+    """Return pointmaps and camera poses in one frame, from pairwise pointmaps by global alignment.
 
-    The focal length is estimated from the pointmaps, even with known intrinsics: with another one the pointmaps do not
-    fit each other, and the cameras move.
+    The focal length is estimated from the pointmaps, even if the intrinsics are known: with another focal length the
+    pointmaps do not fit each other, and the cameras move. `pixels` is the number of pixels used per image.
     """
     alignment = global_align(replace(predictions, intrinsics=images.intrinsics), pixels, progress)
     return PosedPointmaps(

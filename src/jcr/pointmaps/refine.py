@@ -66,11 +66,12 @@ def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray
 def _depth_changes(
     made: Reconstruction, maps: PosedPointmaps, x_px: Float[ndarray, "k 2"]
 ) -> tuple[Float[ndarray, "n 6"], float]:
-    """Return the log of the factor that corrects each image's depth map, as quadratic coefficients, and a unit.
+    """Fit a smooth correction of each image's depth map to the points; return its coefficients (n,6) and a unit.
 
-    The coefficients are in the order of `_basis`. The unit is that of the reconstruction `made`, in units of the
-    prediction. `x_px` are the pixels of the tracks on the pointmaps' grid. The fit is robust, with a prior on all
-    coefficients but the constant, so that five points in a corner do not change the depth elsewhere.
+    The log of the correction factor is quadratic in the image, with coefficients in the order of `_basis`. The unit is
+    that of the reconstruction `made`, in units of the prediction. `x_px` are the pixels of the tracks on the pointmaps'
+    grid. The fit is robust, with a prior on all coefficients but the constant, so that five points in a corner do not
+    change the depth elsewhere.
     """
     tracks, size = made.tracks, maps.grid.size
     camera_from_recon = inverse(made.recon_from_camera)[tracks.image]

@@ -341,7 +341,10 @@ def _map_incrementally(
 
 
 def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Return the options of COLMAP's incremental mapping, for which a seed gives the same result."""
+    """Return the options of COLMAP's incremental mapping, by which a seed always gives the same result.
+
+    The intrinsics are held if `known`.
+    """
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2

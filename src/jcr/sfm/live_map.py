@@ -27,7 +27,7 @@ FEW = 5
 
 
 class LiveMap:
-    """Map (camera poses and tracks) of the images of a capture that is being taken."""
+    """Map (camera poses and tracks) that grows while the images of a capture are being taken."""
 
     def __init__(self, capture: Capture) -> None:
         """Create a map without images; intrinsics that the capture does not have are estimated during the mapping."""

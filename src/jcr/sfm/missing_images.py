@@ -83,7 +83,7 @@ def model_near_cameras(
     known: bool,
     mapped: Container[int] | None = None,
 ) -> pycolmap.Reconstruction:
-    """Return COLMAP's model of all verified matches of the database, adjusted from predicted camera poses by image row.
+    """Return COLMAP's model, adjusted to all verified matches of the database from predicted camera poses by image row.
 
     The intrinsics of `camera` are held if `known`. Images with fewer than LEAST_POINTS points are removed. Only points
     that an image of the rows `mapped` sees are counted, or all points if `mapped` is None.

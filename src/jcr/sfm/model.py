@@ -162,7 +162,8 @@ def triangulated_model(
 ) -> pycolmap.Reconstruction:
     """Return a model of images (by row) with fixed poses, and points triangulated from all matches of the database.
 
-    Points with a reprojection error above `largest_px` are removed. The same input gives the same bits.
+    Points with a reprojection error above `largest_px` are removed, in at most `refinements` rounds. The same input
+    gives the same bits.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -210,7 +211,7 @@ def adjust_robustly(
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Suppress COLMAP's log on stderr except for fatal errors, and restore Python's handler of SIGTERM.
+    """Suppress COLMAP's log on stderr, except fatal errors, within the context; restore Python's handler of SIGTERM.
 
     The import of pycolmap installs glog's handler of SIGTERM, which prints a page of C++ frames and of which Python has
     no record. Setting Python's handler again removes it.

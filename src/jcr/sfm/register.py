@@ -110,7 +110,7 @@ def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFea
 
 
 def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
-    """Match the features of a new image with those of known images, and triangulate them from the known images."""
+    """Match the features of a new image with those of known images; triangulate the matches from the known images."""
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
     feature = np.concatenate([mine for mine, _ in of_row])
     row = np.repeat(np.arange(len(of_row)), [len(mine) for mine, _ in of_row])

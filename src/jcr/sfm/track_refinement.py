@@ -179,8 +179,9 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
 def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
     """Align all observations except the references: update `warp` (pixels, affine parts, bends) and `variance_px`.
 
-    `ends` are the first observations of the tracks and the end of the last track; `reference` is the reference
-    observation of each track. The variance (px²) of an observation that could not be aligned stays infinite.
+    `image` and `keypoint_px` are the image (row of `greys`) and the initial pixel of each observation; `most_px` is the
+    largest shift. `ends` are the first observations of the tracks and the end of the last track; `reference` is the
+    reference observation of each track. The variance (px²) of an observation that could not be aligned stays infinite.
     """
     offsets, window = _window(_RADIUS)
     wide, _ = _window(_RADIUS + 1)

@@ -175,7 +175,7 @@ def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: 
 
 
 def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b heads n d"]:
-    """Rotate queries or keys by their position: the first half of a head's channels by y, the second by x."""
+    """Return queries or keys rotated by their positions: the first half of the channels by y, the second half by x."""
     # Each half of the channels holds pairs (a, b), all a before all b: a cos - b sin and b cos + a sin. Whole rows
     # and a small matrix are several times as quick as slices of a few channels.
     cos, sin = rotary.to(x.dtype).repeat_interleave(2, -2).flatten(-2)

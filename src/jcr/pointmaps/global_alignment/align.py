@@ -85,7 +85,7 @@ def global_align(
 
 
 def _check_connected(predictions: PairPredictions) -> None:
-    """Raise InputError with the names of images that no chain of pairs connects to the first pair's."""
+    """Raise InputError if no chain of pairs connects some images to the first pair; the message names these images."""
     count, edges = predictions.image_count, predictions.edges
     if len(edges) == 0:
         raise InputError("the predictions have no pair; predict at least one")

@@ -63,11 +63,11 @@ class AlignmentSolution:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageEquations:
-    """Gauss-Newton equations of one image, without its pixel depths and pair errors, and the matrices that give these.
+    """Gauss-Newton equations of one image with its pixel depths and pair errors eliminated.
 
-    The c local unknowns are one twist for each of n second views (relative motion of the image's camera and the
-    observer, in whose frame the view is), the log scales of the pairs, and the log focal length. The t = 6n pair errors
-    and the m log depths are eliminated. Twists are those of geometry.twist_from_step.
+    The c remaining unknowns are one twist for each of n second views (motion of the image's camera relative to the
+    camera in whose frame the view is), the log scales of the pairs, and the log focal length. The other fields give the
+    steps of the eliminated t = 6n pair errors and m log depths. Twists are those of geometry.twist_from_step.
     """
 
     hessian: Float[ndarray, "c c"]
@@ -289,7 +289,7 @@ def _eliminated(
 
 
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
-    """Return the matrix from a step of all unknowns to a step of the local unknowns of ImageEquations of one image."""
+    """Return the matrix that maps a step of all unknowns to a step of the c unknowns of one image's ImageEquations."""
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)

@@ -18,7 +18,7 @@ POOR = 0.2
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Pairwise predictions to align, with the fixed principal point and fy / fx and the rule of the weights."""
+    """Pairwise predictions to align, the fixed principal point and fy / fx, and the rule for weights by confidence."""
 
     predictions: PairPredictions
     principal_point_px: tuple[float, float]
@@ -30,7 +30,10 @@ class AlignmentProblem:
 
     @classmethod
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
-        """Return the problem of the predictions; without intrinsics, the principal point is the middle of the grid."""
+        """Return the problem of aligning these predictions.
+
+        Without intrinsics, the principal point is the middle of the grid, and fy / fx is 1.
+        """
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
         middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)

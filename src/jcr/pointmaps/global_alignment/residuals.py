@@ -28,7 +28,7 @@ DEPTH_ITERATIONS = 2
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentState:
-    """Unknowns of the alignment: camera poses, focal length, pair scales, pair errors and depths."""
+    """Unknowns of the alignment: camera poses, log focal length, log scale and error (twist) of pairs, log depths."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     log_focal: float
