@@ -80,7 +80,7 @@ def checked_capture(
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
-    """Raise InputError for fewer frames than `at_least`, or more than MAX_FRAMES."""
+    """Raise InputError, begun with `where`, if `count` frames are fewer than `at_least` or more than 1000."""
     if count > MAX_FRAMES:
         raise InputError(f"{where}: {count} frames; choose {MAX_FRAMES} at most, 8 to 15 are good")
     if count < at_least:

@@ -29,7 +29,7 @@ QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
 
 @dataclass(frozen=True)
 class Convention:
-    """Notation and units in which one kind of controller writes a pose."""
+    """Pose convention: names, order, rotation notation and units of the numbers with which a robot writes a pose."""
 
     columns: tuple[str, ...]
     """Names of a pose's numbers, in the order in which they are written. The position is first, except in a matrix."""

@@ -48,7 +48,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
 
 
 def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
-    """Read an image as `read_image` does; return also the EXIF orientation of its file, 1 if it needs no rotation."""
+    """Return an image as RGB, rotated upright, and the EXIF orientation of its file: 1 if the image was not rotated."""
     require_file(path)
     try:
         with warnings.catch_warnings():

@@ -32,9 +32,10 @@ class PoseTrack:
         self.a_from_b = a_from_b[rows]
 
     def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return interpolated poses at time stamps (ns), and the time (ns) between the two samples around each.
+        """Return interpolated poses at n time stamps (ns), and the time (ns) between the two samples around each.
 
-        Positions are interpolated linearly and rotations by slerp.
+        That time is 0 at a sample, and the largest int64 for a stamp outside of the samples. Positions are interpolated
+        linearly and rotations by slerp.
         """
         before, share, gap = bracket(self.stamp_ns, stamp_ns)
         if len(self.stamp_ns) == 1:

@@ -211,7 +211,7 @@ class CompareCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print the difference, whether the reported errors explain it, and the shares of its possible causes."""
+        """Print the difference of two calibrations, whether the reported errors explain it, and its possible causes."""
         from jcr.calibration.difference import difference, read_hand_eye
 
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
@@ -274,7 +274,7 @@ class VerifyCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print for each camera whether it has moved, and the remedy; return the exit status."""
+        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status."""
         from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 
@@ -346,7 +346,7 @@ class TouchCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the verdict, then the error at each point with its expected standard deviation."""
+        """Print the verdict, then the error at each touched point and its expected standard deviation."""
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)

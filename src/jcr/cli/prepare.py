@@ -43,7 +43,7 @@ class BoardCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Write the sheet and print the option that it is used with."""
+        """Write the sheet with the board, and print the option --board for its use; return the exit status 0."""
         from jcr.boards.sheet import as_pdf, board_sheet
 
         if self.out.suffix.lower() != ".pdf":
@@ -71,7 +71,7 @@ class DocsCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print a page, or the names and titles of all pages."""
+        """Print a page of the manual, or the names and titles of all pages; return the exit status 0."""
         if self.name is not None:
             text = page(self.name)
             self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
@@ -136,7 +136,7 @@ class ModelsCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the list of back ends, or download weights."""
+        """Print the list of back ends, or download the weights of one; return the exit status."""
         if self.action == "get":
             return self._get()
         if self.name is not None or self.accept_licence or self.revision is not None:

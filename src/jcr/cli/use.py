@@ -53,7 +53,7 @@ class MapCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Build the map and print its path."""
+        """Build cloud, map and report of a run, and print their paths; return the exit status."""
         from jcr.pipeline.run import build_map
 
         options = self.cloud, self.map, self.segment
@@ -93,7 +93,7 @@ class ExportCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Write the file and print its path, or list the formats; RejectedError gives status 3."""
+        """Export the run and print the path of the file, or list the formats; raise RejectedError for a rejected run."""
         from jcr.export.formats import FORMATS, write_run
         from jcr.export.ros import static_transform_publisher
 
@@ -289,7 +289,7 @@ class ViewCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Serve the page until Ctrl-C."""
+        """Show the run in the browser: serve its page until Ctrl-C; return the exit status 0."""
         from jcr.result import load_run
 
         run = load_run(self.out)  # raises an InputError at once if there is no run

@@ -261,7 +261,7 @@ def _number(value: float) -> str:
 
 
 def _comments(mount: CameraMount, *more: str) -> str:
-    """Return the result of `notes` and the lines `more` as one text of comments for YAML or Python (#)."""
+    """Return the notes of a mount (frames, units, rejection) and the lines `more` as comments of YAML or Python."""
     return "\n".join(f"# {' '.join(line.split())}" for line in [*notes(mount), *more])
 
 
@@ -272,7 +272,7 @@ def _xml_comment(*lines: str) -> str:
 
 
 def _yaml(mount: CameraMount, content: Mapping[str, Any], *more: str, flow: bool | None = None) -> str:
-    """Return YAML text: the result of `notes` and the lines `more` as comments, then the content.
+    """Return YAML text: the notes of a mount (frames, units, rejection) and `more` as comments, then the content.
 
     `flow` is the default_flow_style of yaml.safe_dump.
     """

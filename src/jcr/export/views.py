@@ -69,7 +69,10 @@ def write_nerfstudio(
 
 
 def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
-    """Return camera model and intrinsics for transforms.json; raise InputError if nerfstudio lacks the model."""
+    """Return the entries of transforms.json for camera model and intrinsics (px).
+
+    Raises InputError if nerfstudio does not support the distortion model.
+    """
     if intrinsics.model in ("rational", "thin_prism"):
         raise InputError(f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort")
     plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)

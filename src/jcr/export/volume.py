@@ -145,7 +145,7 @@ def write_rrd(
 ) -> None:
     """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
 
-    Raises InputError without rerun-sdk, which is 500 MB and therefore an extra of its own.
+    Raises InputError if the package rerun-sdk (500 MB) is not installed.
     """
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)

@@ -121,7 +121,7 @@ class Frames:
             self._thread.join(TIMEOUT_S)
 
     def _watch(self) -> None:
-        """Read frames in the thread, and keep the newest, until the source ends or `close` is called."""
+        """Read frames in a thread until the source ends or `close` is called; keep only the newest frame."""
         while self._is_open and (frame := self._read()) is not None:
             with self._arrived:
                 self._frame = frame

@@ -176,7 +176,7 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
-    """Return the data of the 3D view: points, images, next pose, and cameras of registered images once calibrated."""
+    """Return the data of the 3D view: points, images, next pose, and, after a calibration, cameras with their poses."""
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
     faults_of = {one["name"]: one["fault"] for one in _cards(state)}

@@ -125,7 +125,10 @@ def faults(state: Progress) -> list[Finding]:
 
 
 def finding_lines(state: Progress) -> list[str]:
-    """Return each of `faults` as a sentence, with the commands that retake or remove its image; images count from 1."""
+    """Return each finding that rejects or warns as a sentence, with the commands that retake or remove its image.
+
+    Images are numbered from 1 in the commands.
+    """
     retake = {name: f" (retake {k}, or remove {k})" for k, name in enumerate(state.images, start=1)}
     return [
         sentence(one) + (retake.get(one.images[0], "") if len(one.images) == 1 else "")
@@ -188,7 +191,10 @@ def accuracy_line(state: Progress) -> str:
 def pose_lines(
     pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
 ) -> list[str]:
-    """Return lines with a gripper pose in a notation, for a UR also as URScript, and with the joint angles (rad)."""
+    """Return lines of text with a gripper pose in a pose convention (`notation`), and `joints` in ° and rad.
+
+    For the convention of UR, there is also a line in URScript.
+    """
 
     def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
         """Return numbers with `digits` decimals, separated by commas."""

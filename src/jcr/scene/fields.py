@@ -182,7 +182,7 @@ class Field(nn.Module):
 
     @property
     def tables(self) -> nn.ParameterList:
-        """Trainable features of each lattice, (rows, features)."""
+        """Trainable features: for each grid of nodes a table with a row per node and a column per feature."""
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
@@ -246,7 +246,7 @@ def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple
     wanted = any(column.requires_grad for column in columns)
 
     def answer(piece: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """Return the tensors of `ask` for some rows of all columns."""
+        """Return the results of `ask` for one piece: the same rows of each column."""
         with torch.inference_mode(not wanted):
             return ask(*piece)
 

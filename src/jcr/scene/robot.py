@@ -31,7 +31,7 @@ column's value plus offset; factor is 1 and offset 0 for other joints."""
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpheres:
-    """Robot as spheres that are fixed to its links, and the joints that move the links."""
+    """Robot model for collision tests: spheres that are fixed to the links, and the joints that move the links."""
 
     links: tuple[str, ...]
     """Names of the links."""

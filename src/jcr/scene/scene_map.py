@@ -35,7 +35,10 @@ FORMAT = "jcr.map/1"
 
 
 class Sample:
-    """Values of the map at n points, each computed at its first use; arrays for arrays of points, else tensors."""
+    """Result of a query of the map at n points; each property is computed at its first use.
+
+    Properties are numpy arrays if the points of the query were arrays, else tensors.
+    """
 
     def __init__(
         self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], *, unknown: str, tensors: bool

@@ -36,7 +36,7 @@ LOOK, FALLS = 6, 2
 
 @dataclass(frozen=True, kw_only=True)
 class Rays:
-    """Training data: one ray from a surface point to its camera per row, on the training device."""
+    """Training data: rays from surface points to their cameras, one per row, on the training device."""
 
     x: Float[Tensor, "n 3"]
     """Surface points (m, base frame)."""
@@ -83,7 +83,7 @@ def workspace_box(
 
 
 def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
-    """Return the rows of the points inside the box (m); raise InputError for fewer than 100."""
+    """Return the indices of the cloud's points inside `box` (lower and upper corner, m); raise InputError below 100."""
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
     if len(inside) < 100:

@@ -30,7 +30,7 @@ SAME_TOP = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSize:
-    """Size and position of one object on the support plane; standard deviations are one sigma."""
+    """Size and position of one object on the support plane, with standard deviations (m)."""
 
     label: int
     name: str

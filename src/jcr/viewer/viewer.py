@@ -64,7 +64,7 @@ SliceOf = Literal["distance", "occupancy"]
 
 
 class LocalServer(viser.ViserServer):
-    """Server of viser that other machines cannot reach: it opens no tunnel to the internet, and prints nothing."""
+    """Server of the viewer's page (viser) that other machines cannot reach: it opens no tunnel and prints nothing."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Return None instead of a public address, because sharing is disabled."""

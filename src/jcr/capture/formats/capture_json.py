@@ -205,7 +205,7 @@ def _stated_intrinsics(
 
 
 def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
-    """Return the JSON entries of a record's intrinsics and standard deviations; inverse of `_stated_intrinsics`."""
+    """Return the entries "intrinsics" and "intrinsics_std" of capture.json for the intrinsics of a capture or camera."""
     given, std = record.intrinsics, record.intrinsics_std
     entries: dict[str, Any] = {"intrinsics": None if given is None else IntrinsicsEntry.of(given)}
     if std is not None:

@@ -29,14 +29,14 @@ STATE = "observation.state"
 
 
 class Feature(BaseModel):
-    """Entry of meta/info.json for one recorded quantity: its type and the names of its numbers."""
+    """Entry of a LeRobot data set's meta/info.json for one recorded quantity: its type and the names of its numbers."""
 
     dtype: str = ""
     names: Any = None
     """Names of the numbers: a list of texts, or such a list inside {"motors": …} or {"axes": …}."""
 
     def numbers(self) -> list[str]:
-        """Return the names of the feature's numbers, in lower case; empty if it names none."""
+        """Return the names of the quantity's numbers, in lower case and without ".pos"; empty if there are no names."""
         names = self.names
         while isinstance(names, dict):
             names = next(iter(names.values()), None)
