@@ -209,9 +209,9 @@ def image_equations(
 ) -> ImageEquations:
     """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their spread `noise`.
 
-    A change v of a modelled point at distance |x| along the unit vector x̂ changes the weighted squared residuals by vᵀ
-    (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights of the residuals across and
-    along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
+    A modelled point lies at distance |x| along the unit vector x̂. If it moves by v, the weighted squares of the
+    residuals' changes sum to vᵀ (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights
+    of the residuals across and along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
     # The confidence weights are scaled to mean 1, so that the hessian is the information of the pointmaps.

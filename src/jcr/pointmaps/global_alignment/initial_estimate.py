@@ -69,8 +69,8 @@ def _focal(images: list[ImageObservations]) -> float:
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:
     """Return an image's m pixel depths, in a unit of the image, and the log scales of the f pairs that have it first.
 
-    The depth is the median over these pairs. Without such a pair, it comes from resection: the camera's pose in the
-    other pointmap with most inliers.
+    The depth is the median over these pairs. Without such a pair, it comes from the second view with most inliers, by
+    the pose of the image's camera in the frame of this view (resection).
     """
     if len(o.pair) > o.second_count:
         forward = np.maximum(o.direction[o.second_count :, 2], 1e-6).astype(np.float64)
