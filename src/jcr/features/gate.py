@@ -156,7 +156,7 @@ def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX,
 def _common_rotation(
     passing: Sequence[tuple[Key, TwoViewMotion, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
-    """Return the hand-eye rotation R_X if at least LEAST_PAIRS image pairs agree on it, else None.
+    """Return the hand-eye rotation R_X; None if fewer than LEAST_PAIRS image pairs agree on it or it is uncertain.
 
     `passing` lists image pairs, each with a camera motion and its tolerance (rad); `motion[i, j]` is gripper i_from_j.
     """

@@ -81,7 +81,7 @@ def reconstruct_colmap(
     progress: Progress | None = None,
     working_size_px: int = WORKING_SIZE_PX,
 ) -> Reconstruction:
-    """Reconstruct camera poses and tracks of a capture, in a frame and unit of their own; a seed gives the same bits.
+    """Reconstruct camera poses and tracks of a capture; frame and unit are arbitrary, and a seed fixes every bit.
 
     The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated.
     Raises RejectedError when fewer than three images register, with their number, the likely reason and a remedy.

@@ -45,10 +45,10 @@ def with_missing_images(
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
 ) -> pycolmap.Reconstruction:
-    """Return the model with the missing images that enough points confirm, near camera poses predicted by the robot.
+    """Return the model with those missing images whose predicted camera poses are confirmed by enough points.
 
-    The prediction uses the hand-eye transform of the images in the model. `base_from_gripper` has a row per image of
-    the matcher.
+    The poses are predicted from the gripper poses by the hand-eye transform of the images in the model.
+    `base_from_gripper` has a row per image of the matcher.
     """
     rows = rows_of(model)
     poses = poses_of(model, rows)
