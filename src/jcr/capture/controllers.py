@@ -137,9 +137,9 @@ def poses_from_numbers(
 def checked_rows(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
-    """Convert rows of the k numbers of a convention to base_from_gripper; return also the faults of the rows.
+    """Convert rows of the k numbers of a pose convention to base_from_gripper; return also the faults of the rows.
 
-    The faults map the index of each row that is no pose to a message; its pose is NaN. `units` other than auto replace
+    The faults map the index of each row that is no pose to a message; its pose is NaN. `units` such as "mm-deg" replace
     the convention's units. Raises InputError if the size of the numbers contradicts the units.
     """
     form = CONVENTIONS[convention]

@@ -64,7 +64,8 @@ class LiveCalibration:
     ) -> None:
         """Open or begin a capture; raise InputError if the capture cannot be continued or an option is wrong.
 
-        `exclusive`: lock the folder against other processes until `close`; InputError if another one holds the lock.
+        The docstring of the class explains the arguments. `exclusive`: lock the folder against other processes until
+        `close`; InputError if another one holds the lock.
         """
         self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):

@@ -111,7 +111,8 @@ class LiveSession:
     ) -> None:
         """Prepare a session that adds images of `camera` to `calibration`; `run` starts it.
 
-        `tell` and `gripper`: see the class. `notation` is that of proposed poses.
+        `tell` is called with each answer (JSON) and its lines for a person. `gripper` returns the arm's state now; None:
+        poses are typed or posted. `notation` is that of proposed poses.
         """
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
         self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)

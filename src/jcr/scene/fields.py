@@ -113,7 +113,7 @@ def interpolate_grid(
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a linear layer with the initial weights of torch.nn.Linear, drawn from `generator`."""
+    """Return a linear layer with initial weights from `generator`, distributed as those of torch.nn.Linear."""
     layer, bound = cast(nn.Linear, nn.utils.skip_init(nn.Linear, inputs, outputs)), inputs**-0.5
     nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
     nn.init.uniform_(layer.bias, -bound, bound, generator=generator)

@@ -171,8 +171,8 @@ def spheres_of_shape(
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
     """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
-    The spheres exceed the shape by at most `excess` (m) plus half a voxel, which is a sixth of the excess for shapes up
-    to 15 cm.
+    `link_from_shape` is the pose of the shape in the link's frame. The spheres exceed the shape by at most `excess` (m)
+    plus half a voxel, which is a sixth of the excess for shapes up to 15 cm.
     """
     from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 

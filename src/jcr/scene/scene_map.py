@@ -152,7 +152,10 @@ class SceneMap:
         label_names: tuple[str, ...],
         history: dict[str, str] | None = None,
     ) -> None:
-        """Create a map from trained fields and the grid of seen space; `label_names` names the labels, 0 = none."""
+        """Create a map from trained networks (`fields`) and the grid of seen space.
+
+        `label_names` are the names of the labels, 0 = none; `history` are notes on how the map was made.
+        """
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
@@ -237,10 +240,11 @@ class SceneMap:
         radii: ArrayLike | float,
         unknown: Unknown = "occupied",
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether spheres collide while they move on lines from starts to ends (…,3) m; see `check_spheres`.
+        """Test whether spheres collide while their centres move on lines from starts to ends (…,3), m, base frame.
 
-        Spheres are tested at steps of half a cell. A corner of an obstacle may therefore be inside the swept volume by
-        r - sqrt(r² - (cell/4)²) without being detected: 0.2 mm for a radius r of 2 cm and the default cell.
+        `radii` (m), `unknown` and the result are those of `check_spheres`. Spheres are tested at steps of half a cell.
+        A corner of an obstacle may therefore be inside the swept volume by r - sqrt(r² - (cell/4)²) without being
+        detected: 0.2 mm for a radius r of 2 cm and the default cell.
         """
         starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)
         if starts.ndim == 0 or starts.shape[-1] != 3 or starts.shape != ends.shape:
@@ -330,9 +334,10 @@ class SceneMap:
         )
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
-        """Return points as a tensor on the map's device; raise InputError for wrong shapes, values or `unknown`.
+        """Return points (n,3) m as a tensor on the map's device.
 
-        `what` is the name of the points in the message.
+        Raises InputError for another shape, values that are not finite, or an invalid `unknown`; `what` is the name of
+        the points in the message.
         """
         if unknown not in get_args(Unknown):
             raise InputError(f"unknown={unknown!r}: choose occupied, free or report")

@@ -60,10 +60,11 @@ class Rays:
 def workspace_box(
     cloud: PointCloud, workspace: tuple[float, float, float, float, float, float] | None
 ) -> Float[ndarray, "2 3"]:
-    """Return lower and upper corner (2,3) of the workspace (m, base frame): as given, or computed from the cloud.
+    """Return lower and upper corner (2,3) of the workspace (m, base frame), by default computed from the cloud.
 
-    The computed box encloses the cameras and, along each axis, 99 % of the points that are nearer to their camera than
-    1.5 times the median distance, with a margin of 5 cm. Raises InputError for an invalid `workspace` or an empty cloud.
+    `workspace` are the two corners as x y z x y z; None: computed. The computed box encloses the cameras and, along
+    each axis, 99 % of the points that are nearer to their camera than 1.5 times the median distance, with a margin of 5
+    cm. Raises InputError for an invalid `workspace` or an empty cloud.
     """
     if workspace is not None:
         box = np.array(workspace, dtype=np.float64).reshape(2, 3)

@@ -155,7 +155,10 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 def _read_table(
     path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
-    """Read columns of one episode from a Parquet table, only of the frames with index `rows` if these are given."""
+    """Read columns of one episode from a Parquet table: a list of values for each name in `columns`.
+
+    `rows` are the frame indices to read; None: all frames of the episode.
+    """
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
