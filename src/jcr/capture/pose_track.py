@@ -84,7 +84,10 @@ class TfTree:
         """Samples of parent_from_child by the child frame: time stamps (ns), and x, y, z, qx, qy, qz, qw of each."""
 
     def add(self, transforms: list[Any], static: bool) -> None:
-        """Add the transforms of one message; a new parent of a frame replaces its former parent and samples."""
+        """Add the transforms of one message; `static`: of the topic /tf_static.
+
+        If a frame has another parent than before, the former parent and its samples are dropped.
+        """
         for stamped in transforms:
             child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             if self._parent.get(child) != parent:

@@ -61,7 +61,10 @@ def read_source(
     progress: Progress | None = None,
     at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
-    """Read a capture as `read_capture` does; return PosePairs if the file has camera poses but no images."""
+    """Return the capture at a path, or PosePairs if the file has camera poses but no images.
+
+    The arguments are those of `read_capture`.
+    """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
         raise InputError(

@@ -87,13 +87,13 @@ def on_root(
 
 
 def static_transform_publisher(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """Return the shell command that publishes the transform in ROS 2."""
+    """Return the shell command that publishes parent_from_child (m), the pose of frame `child`, in ROS 2."""
     arguments = _publisher_arguments(parent, child, parent_from_child)
     return f"ros2 run tf2_ros static_transform_publisher {' '.join(arguments)}"
 
 
 def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """Return the origin element of a URDF joint."""
+    """Return parent_from_child (m) as the XML element `origin` of a URDF joint (xyz, rpy)."""
     xyz, rpy = parent_from_child[:3, 3], roll_pitch_yaw(parent_from_child[:3, :3])
     return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
 
@@ -171,7 +171,7 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
 
 
 def _joint(parent: str, child: str, origin: str | None = None) -> str:
-    """Return a URDF joint: fixed with the element `origin`, or floating if `origin` is None."""
+    """Return the XML of a URDF joint between two links: fixed with the element `origin`; floating if that is None."""
     placed = "" if origin is None else f"    {origin}\n"
     return f"""  <joint name="{child}_joint" type="{"floating" if origin is None else "fixed"}">
     <parent link="{parent}"/>

@@ -253,9 +253,9 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
     def _send(self, body: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> None:
-        """Send a response of MIME type `kind`, with HEADERS, which protect it from other web sites.
+        """Send a response with MIME type `kind`, HTTP `status`, and the security headers HEADERS.
 
-        An underscore in the name of a keyword argument becomes a hyphen in the header.
+        `headers` are further headers by name; an underscore in a name becomes a hyphen.
         """
         self.send_response(status)
         own = {"Content-Type": kind, "Content-Length": str(len(body))} | headers
