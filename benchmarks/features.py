@@ -71,7 +71,8 @@ def _row(folder: Path, features: FeatureName, gate: bool, way: str) -> tuple[boo
 def _match_all(
     matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
 ) -> Matched:
-    """Match without gripper poses: all pairs, none judged."""
+    """Match without gripper poses: all pairs, none judged, as if the gripper moved between all images."""
     pairs = all_pairs(len(matcher.x_px))
-    geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)))
+    moving = np.zeros((len(gripper), len(gripper)), bool)
+    geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)), moving)
     return Matched(geometries=geometries, intrinsics=working)
