@@ -57,6 +57,10 @@ class Apart(NamedTuple):
     """Distance that 95 % of both errors are stated to stay below, at the centre."""
 
 
+SIDE_CELL = 3
+"""Column of the side of a board over the stated one, in the table of boards that took no part."""
+
+
 class Row(NamedTuple):
     """One calibration beside its reference."""
 
@@ -96,7 +100,8 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
             try:
                 seen = find_corners(capture, board)
                 known = reference(capture.base_from_gripper, seen, capture.image_size, capture.intrinsics)
-                references.append(_reference_cells(folder.name, known))
+                cells = _reference_cells(folder.name, known)
+                references.append([*cells[:-1], cells[-1] if "SIDE" not in board else ""])
             except (RejectedError, cv2.error) as refusal:
                 absent.append(f"- {folder.name}, reference: {str(refusal).splitlines()[0]}")
         rows.append(_row(capture, None, alone := _calibrated(capture), known))
@@ -105,7 +110,9 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         halves += _halves(capture)
         if isinstance(alone[0], RunResult) and board is not None:
             try:
-                corners.append(_checked(folder.name, alone[0], board))
+                scatter, expected, cells = _checked(folder.name, alone[0], board)
+                side = cells[SIDE_CELL] if "SIDE" not in board else ""
+                corners.append((scatter, expected, [*cells[:SIDE_CELL], side, *cells[SIDE_CELL + 1 :]]))
             except (InputError, RejectedError) as refusal:
                 absent.append(f"- {folder.name}, check points: {refusal}")
     ratios = [scatter / expected for scatter, expected, _ in corners]
