@@ -190,7 +190,7 @@ def test_the_command_is_content_with_what_has_not_moved(out: Path, capture: Capt
     poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(2))
     write_capture(tmp_path / "today", capture, poses, [10, 11])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 0
-    assert capsys.readouterr().out.startswith("ACCEPTED: nothing has moved")
+    assert capsys.readouterr().out.startswith("ACCEPTED: no drift is detected")
 
 
 def test_images_of_the_calibration_are_refused_by_their_content(

@@ -82,7 +82,7 @@ class Verification(Drift):
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
-        return f"{moved[self.cause]} has moved" if self.moved else "nothing has moved"
+        return f"{moved[self.cause]} has moved" if self.moved else "no drift is detected"
 
     @property
     def advice(self) -> str:
