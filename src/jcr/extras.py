@@ -13,8 +13,8 @@ DISTRIBUTION = "jcr-handeye"
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
     """Import and return an optional module that the feature `what` needs.
 
-    Raises InputError if the import fails; the message contains the pip command for the extra `name` (as in
-    jcr-handeye[name]), followed by the text `otherwise`.
+    Raises InputError if the import fails; the message contains the pip command for the extra `name` of this
+    distribution, followed by the text `otherwise`.
     """
     try:
         return import_module(module)
