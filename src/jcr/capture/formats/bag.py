@@ -11,6 +11,7 @@ from jaxtyping import Int, UInt16
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import read_yaml
 from jcr.capture.pose_track import TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros import image_of, intrinsics_of_ros, read_ros_depth
@@ -167,6 +168,11 @@ def _opened(path: Path) -> Iterator[Any]:
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:
+        metadata = path / "metadata.yaml"
+        about = read_yaml(metadata) if metadata.is_file() else None
+        files = about["rosbag2_bagfile_information"]["relative_file_paths"] if about is not None else []
+        if not isinstance(files, list):  # a text would be taken for as many files as it has letters
+            raise ValueError("its metadata has no list of files")
         # Older sqlite3 bags hold no message definitions; the standard messages have not changed since.
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=standard)
