@@ -208,7 +208,7 @@ _LAST = (
         selected_by="predictions",
         needs="predictions",
         keeps_order=True,
-        accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/pointmaps)",
+        accuracy="1.20 mm and 0.048° from simulated predictions (jcr docs results/pointmaps)",
     ),
     Backend(
         name="given",
