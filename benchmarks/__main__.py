@@ -42,8 +42,8 @@ BENCHES = {
     "pointmaps": (OTHERS, "Pointmaps"),
 }
 """Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
-FETCH = "fetch-captures"
-"""Word in place of a bench's name, with arguments of its own."""
+COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
+"""Modules of commands that are no bench and take arguments of their own, by name."""
 CLAIM = "> "
 """Prefix of the lines of a page that state its result in a sentence."""
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ class Arguments:
       python -m benchmarks fetch-captures captures
       python -m benchmarks real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
       python -m benchmarks all captures --out docs/results
+      python -m benchmarks align PAIRS.npz OUT.npz --method adam
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
@@ -168,8 +169,8 @@ def heading(arguments: Arguments) -> str:
 
 if __name__ == "__main__":
     try:
-        if sys.argv[1:2] == [FETCH]:
-            sys.exit(import_module("benchmarks.real_captures.fetch").main(sys.argv[2:]))
+        if sys.argv[1:2] and (command := COMMANDS.get(sys.argv[1])):
+            sys.exit(import_module(command).main(sys.argv[2:]))
         sys.exit(main(tyro.cli(Arguments, prog="python -m benchmarks")))
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

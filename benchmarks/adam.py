@@ -2,23 +2,34 @@
 
 The model is the published one: a depth map, a focal length and a camera per image; a rigid transform and a
 scale per pair, tied to no camera; residual norms (not their squares) weighted by log confidence; Adam from a
-spanning tree of the pairs. It is the baseline that Gauss-Newton is measured against.
+spanning tree of the pairs. It is the baseline that Gauss-Newton is measured against. `python -m benchmarks align` aligns
+one file of pairwise pointmaps by either method.
 """
 
+import json
 import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from jcr.files import written_whole
 from jcr.geometry import inverse, transform
+from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import AlignmentState, initial_depth
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pairs import PairPredictions, read_pairs
 
 STEPS, LEARNING_RATE = 300, 0.01
 """Steps, and learning rate of the first; it falls to 0 along a cosine."""
@@ -29,11 +40,57 @@ PAIRS_AT_ONCE = 16
 """Bounds the memory of one forward and backward pass."""
 
 
-def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Float[ndarray, "n 4 4"]:
-    """Return recon_from_camera after Adam steps over all pixels of all pairs."""
+@dataclass(frozen=True)
+class Arguments:
+    """Align pairwise pointmaps into one reconstruction.
+
+    PAIRS.npz holds edges (E,2), pts3d and pts3d_in_other_view (E,H,W,3), conf and conf2 (E,H,W). OUT.npz gets
+    poses (N,4,4), camera to recon; focals (N,); depth and confidence (N,H,W); principal_point (2,); pair_scale and
+    pair_residual (E,).
+
+    examples:
+      python -m benchmarks align pairs.npz aligned.npz
+      python -m benchmarks align pairs.npz published.npz --method adam
+    """
+
+    pairs: Annotated[Path, tyro.conf.Positional]
+    """Pairwise pointmaps to read."""
+    result: Annotated[Path, tyro.conf.Positional]
+    """Alignment to write."""
+    method: Literal["fast", "adam"] = "fast"
+    """fast: Gauss-Newton on chosen pixels (jcr.global_align); adam: gradient descent on every pixel, as published."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Read the pairs, align them, write the result, and print the seconds of the alignment as JSON."""
+    arguments = tyro.cli(Arguments, prog="python -m benchmarks align", args=words)
+    predictions = read_pairs(arguments.pairs)
+    begin = time.perf_counter()
+    alignment = align_adam(predictions) if arguments.method == "adam" else global_align(predictions)
+    seconds = time.perf_counter() - begin
+    with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
+        np.savez(
+            stream,
+            poses=alignment.recon_from_camera,
+            focals=np.full(len(alignment.depth), alignment.focal_px[0]),
+            depth=alignment.depth,
+            confidence=alignment.confidence,
+            principal_point=np.array(alignment.principal_point_px),
+            pair_scale=alignment.pair_scale,
+            pair_residual=alignment.pair_residual,
+        )
+    for text in (*alignment.warnings, *alignment.notes):
+        sys.stderr.write(f"{text}\n")
+    sys.stdout.write(json.dumps({"method": arguments.method, "seconds": seconds}) + "\n")
+    return 0
+
+
+def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Alignment:
+    """Align by Adam steps over all pixels of all pairs; the result has no covariance (NaN)."""
     problem = AlignmentProblem.of(predictions)
+    count, height, width = predictions.image_count, *predictions.conf.shape[1:]
     start = initial_state(problem.observe_all(START_PIXELS), predictions.edges)
-    everything = (observe(problem, k, slice(None)) for k in range(predictions.image_count))
+    everything = (observe(problem, k, slice(None)) for k in range(count))
     model = PointmapModel(start, np.stack([initial_depth(o, start) for o in everything]), problem)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.9))
@@ -51,10 +108,38 @@ def align_adam(predictions: PairPredictions, steps: int = STEPS) -> Float[ndarra
             loss.backward()
         points.backward(gathered.grad)
         optimizer.step()
+    # The network's confidence, averaged over the pairs that show an image.
+    total = np.zeros((count, height, width), np.float32)
+    for edge, *confidences in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
+        for image, confidence in zip(edge, confidences, strict=True):
+            total[image] += problem.weigh(confidence)
+    shown = np.bincount(predictions.edges.ravel(), minlength=count)
+    mean = total / shown[:, None, None].astype(np.float32)
     with torch.no_grad():
-        rotation = model.rotation(model.camera_quat_xyzw).double().numpy()
-        recon_from_camera = transform(rotation, model.camera_center.double().numpy())
-    return inverse(recon_from_camera[0]) @ recon_from_camera
+        points = model.points()
+        residual = [
+            torch.maximum(
+                *(
+                    model.distance(points, group, view).median(dim=1).values / model.range(group, view)
+                    for view in (0, 1)
+                )
+            )
+            for group in groups
+        ]
+        recon_from_camera = transform(
+            model.rotation(model.camera_quat_xyzw).double().numpy(), model.camera_center.double().numpy()
+        )
+        focal = float(model.focal())
+        return Alignment(
+            recon_from_camera=inverse(recon_from_camera[0]) @ recon_from_camera,
+            focal_px=(focal, focal * problem.aspect),
+            principal_point_px=problem.principal_point_px,
+            depth=model.log_depth.exp().reshape(count, height, width).numpy(),
+            confidence=np.exp(mean) if problem.log_weight else mean,
+            pair_scale=model.scale().double().numpy(),
+            pair_residual=torch.cat(residual).double().numpy(),
+            covariance=np.full((6 * count, 6 * count), np.nan),
+        )
 
 
 class PointmapModel(torch.nn.Module):
@@ -104,6 +189,11 @@ class PointmapModel(torch.nn.Module):
         aligned = shown @ self.rotation(self.pair_quat_xyzw[pairs]).mT + self.pair_center[pairs, None]
         aligned = self.scale()[pairs, None, None] * aligned
         return torch.linalg.vector_norm(points[self.images[pairs, view]] - aligned, dim=2)
+
+    def range(self, pairs: slice, view: int) -> Tensor:
+        """Return the median distance (pairs,) of a view's points from the first camera, recon units."""
+        shown = torch.from_numpy(self.shown[view][pairs]).flatten(1, 2)
+        return self.scale()[pairs] * torch.linalg.vector_norm(shown, dim=2).median(dim=1).values
 
     @staticmethod
     def rotation(quat_xyzw: Tensor) -> Tensor:

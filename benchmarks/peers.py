@@ -251,13 +251,13 @@ def alignment_page() -> Iterator[str]:
         # 300 steps at the larger size take a quarter of an hour: extrapolated from a few.
         steps = STEPS if size == SIZES[0] else FEW_STEPS
         for name, align, done in (
-            ("jcr.global_align", lambda pairs: global_align(pairs).recon_from_camera, STEPS),
+            ("jcr.global_align", global_align, STEPS),
             (f"Adam, {STEPS} steps", lambda pairs, n=steps: align_adam(pairs, n), steps),
         ):
             begun = time.process_time()
             found = align(predictions)
             spent[name] = (time.process_time() - begun) * STEPS / done
-            mm, deg = camera_errors(truth.base_from_camera, found)
+            mm, deg = camera_errors(truth.base_from_camera, found.recon_from_camera)
             errors = [f"{mm:.2f}", f"{deg:.3f}"] if done == STEPS else ["", ""]
             rows.append([f"{size[0]}x{size[1]}", name, f"{spent[name]:.1f}", *errors])
     ours_s, published_s = spent.values()

@@ -10,10 +10,13 @@ import pytest
 
 from benchmarks import __main__ as machinery
 from benchmarks.__main__ import BENCHES, Arguments, claims, main, run_all, write_index
+from benchmarks.peers import grid_search
 from benchmarks.pointmaps import end_to_end
 from jcr.errors import InputError
+from jcr.geometry import rotation_between_deg, scale_translation
 from jcr.records import Intrinsics
 from places import ROOT
+from simulation.problems import hand_eye_problem
 from simulation.render import render
 from simulation.scenes import make_scene
 
@@ -79,3 +82,13 @@ def test_predictions_become_a_calibration_and_a_map_in_metres():
     found = end_to_end(5, 1, (0.0, 0.0))
     assert found.translation_mm < 1.5 and found.rotation_deg < 0.1 and found.scale_percent < 0.3
     assert found.surface_mm < 5 and found.sigmas < 2
+
+
+def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there():
+    problem = hand_eye_problem(np.random.default_rng(5), 8)
+    for scale, found_there in ((2.0, True), (5.0, False)):
+        x, found = grid_search(
+            problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale / scale)
+        )
+        assert rotation_between_deg(x[:3, :3], problem.gripper_from_camera[:3, :3]) < 1e-5
+        assert (abs(found - scale) < 3 / 20_000) == found_there
