@@ -171,10 +171,8 @@ def advised(
 ) -> Calibration:
     """Return the calibration with its point uncertainty, the required accuracy, and the gripper poses to add.
 
-    Poses are proposed if the required accuracy is not reached or the option `next_poses` requests them. `gripper` and
-    `robot` are the gripper poses of the registered images and the prior of their errors; `assumptions` is the camera
-    and robot that predictions assume. `scene` is the uncertainty of the reconstructed scene; None for a calibration
-    from camera poses.
+    Poses are proposed if the required accuracy is not reached or `next_poses` requests them. `gripper` and `robot` are
+    those of the registered images. `scene` is None for a calibration from camera poses.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
     x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty

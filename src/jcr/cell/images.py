@@ -59,10 +59,7 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`.
-
-    Given intrinsics of the own camera are not used as a prior if its images contradict them.
-    """
+    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`."""
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.

@@ -52,10 +52,9 @@ def place_cameras(
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
 ) -> CellPlacement:
-    """Return the placement of the cameras `others`, which observe the scene of a calibrated capture.
+    """Return the placement of the cameras `others`, which observe the scene that `hand_eye` is the calibration of.
 
-    `hand_eye` is the calibration of the capture's own camera. A camera that cannot be placed is in the result with the
-    reason.
+    A camera that cannot be placed is in the result with the reason.
     """
     if not others:
         return CellPlacement(())

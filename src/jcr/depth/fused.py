@@ -55,10 +55,9 @@ def fused_depth(
     """Return maps (m,h,w) of inverse depth, confidence, reason (origin of the depth) and relative standard deviation.
 
     A matched depth needs two other images that agree (one, with fewer than three neighbours), and more than twice as
-    many as see through the point; in `changing` scenes, sight through it does not count. Only pixels with enough
-    agreeing images count as seeing through. With `priors`, pixels without a match get the depth of a fitted plane where
-    no image contradicts it. `score` is the correlation of the matches. Confidence and standard deviation are 0 without
-    depth.
+    many as see through the point (not counted in `changing` scenes). Only pixels with enough agreeing images count as
+    seeing through. With `priors`, pixels without a match get the depth of a fitted plane where no image contradicts it.
+    `score` is the correlation of the matches. Confidence and standard deviation are 0 without depth.
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import parameter_names
@@ -360,32 +360,14 @@ def alternatives(
     of the distortion that no camera model expresses; None: as estimated.
     """
     problem, images = solution.problem, solution.images
-    state, observations = images.state, problem.observations
+    observations = problem.observations
     assert observations is not None
     mine = np.flatnonzero(observations.camera == camera)
-    rows, units, weak = rows_of(problem, camera, mine, problem.n_images)
-    # The new columns replace those that were freed for this camera.
-    own = len(problem.directions.T) - len(problem.freed_std)
-    before, steps = problem.directions[:, own:], state.camera_steps[own : problem.columns.cameras.stop]
-    others, each = ~before[rows].any(0), np.zeros((len(before), len(rows)))
-    each[rows] = np.diag(units)
-    total, names = before[rows] @ steps / units, parameter_names(problem.cameras[camera].intrinsics)
-    first = own + int(others.sum())
-    sizes = state.model_error_std
-    wider = image_evidence(
-        with_free(
-            problem,
-            freed=np.concatenate([before[:, others], each], axis=1),
-            freed_std=np.r_[problem.freed_std[others], weak],
-        ),
-        replace(
-            state,
-            camera_steps=np.r_[
-                state.camera_steps[:own], steps[others], total, state.camera_steps[own + len(steps) :]
-            ],
-            model_error_std=sizes if model_error_std is None else np.full_like(sizes, model_error_std),
-        ),
+    units, names = (
+        rows_of(problem, camera, mine, problem.n_images)[1],
+        parameter_names(problem.cameras[camera].intrinsics),
     )
+    wider, total, first = _with_one_camera_free(solution, camera, mine, model_error_std)
     # The arms are at the most likely state, the images at the state of the evidence.
     at, likely, begin = wider.state, solution.most_likely, problem.arm_unknowns
     at = replace(at, x=likely.x, scale=likely.scale, z=likely.z)
@@ -393,7 +375,7 @@ def alternatives(
     found = solve_equations(equations, solution.log_sizes)
     hessian = equations.jacobian.T @ found.weighed + equations.prior_information
     right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
-    rest = begin + first + np.arange(len(rows))
+    rest = begin + first + np.arange(len(units))
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
@@ -420,6 +402,36 @@ def alternatives(
         distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
         down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
     )
+
+
+def _with_one_camera_free(
+    solution: Solution, camera: int, mine: Int[ndarray, " m"], model_error_std: float | None
+) -> tuple[ImageEvidence, Float[ndarray, " f"], int]:
+    """Return the images' evidence with all parameters of one camera free.
+
+    Also return the present values of these parameters, in their units, and the first of their columns. `mine` are the
+    images of the camera. The new columns replace those that were freed for this camera.
+    """
+    problem, state = solution.problem, solution.images.state
+    rows, units, weak = rows_of(problem, camera, mine, problem.n_images)
+    own = len(problem.directions.T) - len(problem.freed_std)
+    before, steps = problem.directions[:, own:], state.camera_steps[own : problem.columns.cameras.stop]
+    others, each = ~before[rows].any(0), np.zeros((len(before), len(rows)))
+    each[rows] = np.diag(units)
+    total, sizes = before[rows] @ steps / units, state.model_error_std
+    camera_steps = np.r_[
+        state.camera_steps[:own], steps[others], total, state.camera_steps[own + len(steps) :]
+    ]
+    freed = np.concatenate([before[:, others], each], axis=1)
+    wider = image_evidence(
+        with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std[others], weak]),
+        replace(
+            state,
+            camera_steps=camera_steps,
+            model_error_std=sizes if model_error_std is None else np.full_like(sizes, model_error_std),
+        ),
+    )
+    return wider, total, own + int(others.sum())
 
 
 def _dispersion(images: ImageEvidence) -> float:
