@@ -37,7 +37,7 @@ from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, ob
 
 COUNTS = (8, 12, 30)
 DRAWS, PREDICTED_DRAWS = 10, 20
-"""Captures per row of seen points, and captures of predicted uncertainty."""
+"""Captures per row of points, and captures of predicted uncertainty."""
 POINTS, PIXEL_STD, DISTANCE_M = 400, 0.3, 0.45
 OFF = 0.005
 """Relative error of a focal length that is given wrong; its principal point is 3 px off."""
@@ -162,17 +162,17 @@ WAYS = (
 
 
 class SeenRow(NamedTuple):
-    """Errors of seen points over all captures of a robot, a number of images and a knowledge of the intrinsics."""
+    """Errors of points over all captures of a robot, a number of images and a knowledge of the intrinsics."""
 
     preset: PresetName
     images: int
     known: str
     within_95: float
-    """Share of seen points whose error is below what 95 % are stated to be below."""
+    """Share of points whose error is below what 95 % are stated to be below."""
     within_3: float
     """Share of those within 3 σ on every axis."""
     seen_mm: float
-    """Median error of a seen point."""
+    """Median error of a point."""
     stated_mm: float
     """Median of the stated 95 % bound."""
     camera_mm: float
@@ -220,7 +220,7 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
 
 
 def predicted(draws: int = PREDICTED_DRAWS) -> Float[ndarray, "k 3"]:
-    """Return predicted over reported uncertainty of seen point, camera and rotation for accepted captures.
+    """Return predicted over reported uncertainty of point, camera and rotation for accepted captures.
 
     Captures differ in arm, its errors, number of images, intrinsics and noise.
     """
@@ -300,7 +300,7 @@ def _claims(
     agree = (np.abs(np.log(ahead)) < np.log(FACTOR)).sum(0)
     worst = np.exp(np.abs(np.log(ahead)).max(0))
     parts = [f"{what} {n} of {len(ahead)}, at most {most:.2f} times"
-             for what, n, most in zip(("seen point", "camera", "rotation"), agree, worst, strict=True)]  # fmt: skip
+             for what, n, most in zip(("point", "camera", "rotation"), agree, worst, strict=True)]  # fmt: skip
     yield f"> Predicted and reported uncertainty agree within a factor of {FACTOR:g}: {'; '.join(parts)}."
 
 
@@ -338,7 +338,7 @@ def _tables(
     )
     yield from ("", "## Predicted over reported uncertainty", "")
     quantiles = np.quantile(ahead, (0.0, 0.25, 0.5, 0.75, 1.0), axis=0).T
-    names = ("seen point", "camera on the gripper", "rotation")
+    names = ("point", "camera on the gripper", "rotation")
     yield from table(
         "95 % of errors of | least | 25 % | median | 75 % | most",
         ([name, *map(number, row)] for name, row in zip(names, quantiles, strict=True)),

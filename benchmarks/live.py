@@ -44,7 +44,7 @@ from simulation.render import render
 from simulation.scenes import Scene, make_scene, moved
 
 REQUIRE = (2.0, 0.3)
-"""mm, degrees: 95 % of errors of a seen point, and of directions there."""
+"""mm, degrees: 95 % of errors of a point, and of directions there."""
 GOAL = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
 FIRST, MOST = 3, 24
 """Images at varied poses with which every way begins, and images after which a capture ends without a claim."""
@@ -112,7 +112,7 @@ def run(captures: Path) -> str:
         f"{AT}, {seconds[-1]:.1f} s after image {len(seconds)} (640x480).",
         "",
         "A rendered camera on an arm with errors of 0.1° a joint and 0.3 mm a link goes to poses until the calibration "
-        f"claims {GOAL} (95 % of errors of a seen point) and its leave-one-out error confirms it, which takes 8 images "
+        f"claims {GOAL} (95 % of errors of a point) and its leave-one-out error confirms it, which takes 8 images "
         "at least. Errors are against the effective transform about the poses of the capture.",
         "",
         *table(

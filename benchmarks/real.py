@@ -173,14 +173,14 @@ def _claims(rows: Sequence[Row], halves: Sequence[Apart]) -> Iterator[str]:
         if apart := [row.apart for row in accepted if row.apart is not None]:
             mm = [one.mm for one in apart]
             yield (
-                f"> From {what}: {len(accepted)} of {len(some)} real captures are accepted; a seen point is "
+                f"> From {what}: {len(accepted)} of {len(some)} real captures are accepted; a point is "
                 f"{np.median(mm):.1f} mm from its place by the reference (median of {len(mm)}, worst {max(mm):.1f} mm), "
                 f"within 2 σ of both in {sum(one.sigmas < 2 for one in apart)}."
             )
     if halves:
         yield (
             f"> Of {len(halves)} captures cut in halves {sum(one.sigmas < 2 for one in halves)} agree within 2 σ, a "
-            f"seen point within what both state for 95 % in {sum(one.mm < one.stated_mm for one in halves)}."
+            f"point within what both state for 95 % in {sum(one.mm < one.stated_mm for one in halves)}."
         )
 
 

@@ -51,5 +51,5 @@ print(f"used: {solve.images_used} of {len(solve.images)} poses")
 sliding, recon_from_camera, _ = simulated(transforms(np.zeros((10, 3)), positions))
 solve = jcr.solve_hand_eye(sliding, recon_from_camera)
 print(f"without rotating: observable {solve.observability.observable}, {solve.verdict}")
-for unseen, cure in zip(solve.observability.unobservable, solve.observability.advice, strict=True):
-    print(f"- {unseen}; {cure}")
+for unobservable, remedy in zip(solve.observability.unobservable, solve.observability.advice, strict=True):
+    print(f"- {unobservable}; {remedy}")

@@ -39,5 +39,5 @@ for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
 found = jcr.check_capture(capture, look=False)
 print(f"motions show everything: {found.observability.observable}")
 if found.expected is not None and (seen := found.expected.seen) is not None:
-    print(f"to be expected: a seen point within {seen.within_95_mm:.1f} mm (95 % of errors)")
+    print(f"to be expected: a point within {seen.within_95_mm:.1f} mm (95 % of errors)")
 print(f"next: jcr run {out / 'capture'} {out / 'run'}")

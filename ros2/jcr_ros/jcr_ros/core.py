@@ -209,7 +209,7 @@ class Calibrator:
         return state
 
     def _states(self) -> Iterator[jcr.RobotState]:
-        """Yield the states of the gripper, while tf knows it."""
+        """Yield the states of the gripper, while tf has it."""
         while not self._is_stopped:
             state = self.gripper()
             if state is not None:

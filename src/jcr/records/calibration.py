@@ -99,7 +99,7 @@ class NextPose:
     expected_std: Numbers7
     """Predicted standard deviations, in COVARIANCE_ORDER."""
     within_95_mm: Spread
-    """Predicted bound on 95 % of the errors of a seen point (mm), as in Seen."""
+    """Predicted bound on 95 % of the errors of a point (mm), as in Seen."""
     rotation_95_deg: Spread
     """Predicted bound on 95 % of the direction errors (degrees), as in Seen."""
     moved_m: Annotated[Metres, Field(alias="moved_mm")] = 0.0
@@ -322,7 +322,7 @@ class ModelError:
 
 @dataclass(frozen=True, kw_only=True)
 class JointCovariance:
-    """Joint covariance of transform, scale and intrinsics, from which the uncertainty of any seen point follows."""
+    """Joint covariance of transform, scale and intrinsics, from which the uncertainty of any pixel's point follows."""
 
     covariance: Square
     """Covariance with rows and columns in `order`."""
