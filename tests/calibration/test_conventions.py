@@ -55,6 +55,15 @@ def test_rows_in_another_order_of_the_images_names_are_named():
 
 
 @pytest.mark.slow
+def test_the_order_counts_images_without_a_camera_pose():
+    """The reverse order of the images that registered is no reverse order."""
+    problem = hand_eye_problem(np.random.default_rng(4), 10, robot_noise=(2e-4, 5e-4))
+    rows = np.array([0, 2, 3, 4, 5, 6, 7, 8, 9])
+    found = better_reading(problem.base_from_gripper[::-1], problem.recon_from_camera[rows], rows=rows)
+    assert found is not None and "reverse order" in found[0].name and found[0].used == 9
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
 def test_sound_poses_are_left_alone(noise):
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)

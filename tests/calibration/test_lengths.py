@@ -59,16 +59,12 @@ def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
 
 
 @pytest.mark.parametrize("pose_scale", [1.015, 0.95])
-def test_positions_too_long_are_named_with_the_board_and_the_truth_is_within_what_is_stated(
-    pose_scale: float,
-):
-    hand_eye, x = calibrated(Sheet(bend_m=2e-3), pose_scale)
+def test_a_board_that_contradicts_the_robot_s_lengths_is_named_and_not_used(pose_scale: float):
+    """A misprinted board is likelier than positions that are all too long, which no image shows."""
+    hand_eye, _ = calibrated(Sheet(bend_m=2e-3), pose_scale)
     named = of_kind(hand_eye, FindingKind.BOARD_SIZE)
     assert named.std is not None and named.value == pytest.approx(pose_scale - 1, abs=3 * named.std)
-    assert not hand_eye.lengths[0].used
-    assert hand_eye.converged == (abs(pose_scale - 1) < 0.03)
-    error = np.r_[step_between(hand_eye.gripper_from_camera, x), -np.log(hand_eye.scale)]
-    assert (np.abs(error) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
+    assert hand_eye.converged and named.shift is None and not hand_eye.lengths[0].used
 
 
 def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_line():
@@ -84,15 +80,20 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
         (Sheet(stretch=0.01), FindingKind.BOARD_STRETCHED),
         (Sheet(stretch=0.03), FindingKind.BOARD_STRETCHED),
         (Sheet(moved_m=3e-3), FindingKind.BOARD_MOVED),
+        (Sheet(moved_m=1e-3), FindingKind.BOARD_MOVED),
+        (Sheet(size_error=0.02), FindingKind.BOARD_SIZE),
+        (Sheet(bend_m=3e-3), FindingKind.BOARD_BENT),
     ],
 )
 def test_a_board_that_is_wrong_is_named_and_leaves_the_result_as_it_is_without(
     sheet: Sheet, kind: FindingKind
 ):
-    alone, _ = calibrated(None)
-    hand_eye, x = calibrated(sheet)
-    assert of_kind(hand_eye, kind).severity == "warns"
-    assert hand_eye.converged and hand_eye.lengths == ()
+    alone, _ = calibrated(None, seed=1)
+    hand_eye, x = calibrated(sheet, seed=1)
+    assert of_kind(hand_eye, kind).severity == ("informs" if kind is FindingKind.BOARD_BENT else "warns")
+    # The shape of a bent board, and the corners of a moved one in most images, are still good.
+    is_used = kind in {FindingKind.BOARD_BENT, FindingKind.BOARD_MOVED}
+    assert hand_eye.converged and any(one.used for one in hand_eye.lengths) == is_used
     std, without = (np.sqrt(np.diag(one.covariance)) for one in (hand_eye, alone))
     assert (std < 1.1 * without).all()
     assert (np.abs(step_between(hand_eye.gripper_from_camera, x)) < 3 * std[:6]).all()

@@ -9,8 +9,8 @@ import pytest
 import jcr
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.findings import FindingKind, kinds_of, without_consequences
-from jcr.geometry import rotation_exp, transform
-from jcr.pipeline.check import check_capture
+from jcr.geometry import inverse, rotation_exp, transform
+from jcr.pipeline.check import check_capture, spread_rows
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import reconstruct_colmap
 from scenes import MISTAKES, Change
@@ -82,6 +82,24 @@ def test_the_first_message_names_the_poses(real_captures: Path, name: str, what:
         assert said[0] is FindingKind.POSE_CONVENTION and MISTAKES[what][1] in doubt, doubt
     else:
         assert said[0] in OF_POSES and check_capture(wrong).findings[0].kind in OF_POSES, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["inverses", "reversed"])
+def test_wrong_poses_of_few_images_without_intrinsics_lead(real_captures: Path, what: str):
+    """Cameras of few images without intrinsics fit no poses well before the images are adjusted with them.
+
+    Inverses were not named, and with reversed poses "few images used" led, because four images registered.
+    """
+    capture = jcr.read_capture(real_captures / "floor_carton")
+    capture = capture.of_rows(spread_rows(len(capture)))
+    poses = capture.base_from_gripper
+    wrong = with_poses(capture, inverse(poses) if what == "inverses" else poses[::-1])
+    finding = check_capture(wrong).findings[0]
+    if what == "inverses":
+        assert finding.kind is FindingKind.POSE_CONVENTION and "inverses" in finding.details["reading"]
+    else:
+        assert finding.kind in {FindingKind.POSE_CONVENTION, FindingKind.POSES_CONTRADICT_IMAGES}
 
 
 @pytest.fixture(scope="module")

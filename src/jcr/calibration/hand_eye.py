@@ -211,8 +211,10 @@ JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
 def judged(hand_eye: Calibration) -> Calibration:
     """Return the calibration with findings on image count, robot noise and uncertainty derived again (kinds JUDGED)."""
     rejecting = list(_rejecting(hand_eye))
-    # A weakly observed direction explains an uncertainty that rejects, and is therefore named first.
-    weak = "rejects" if any(one.kind is FindingKind.UNCERTAIN for one in rejecting) else "warns"
+    # A weakly observed direction explains an uncertainty that rejects, and is therefore named first, unless the poses
+    # are wrong: those of a wrong convention may be near a degenerate motion.
+    uncertain = any(one.kind is FindingKind.UNCERTAIN for one in rejecting)
+    weak = "rejects" if uncertain and poses_agree(hand_eye.robot_noise) else "warns"
     others = [
         replace(finding, severity=weak) if "nearly" in finding.details else finding
         for finding in hand_eye.findings

@@ -210,11 +210,16 @@ def is_lasting(finding: Finding) -> bool:
 
 
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings by severity; within a severity those on images, then those that explain others, then the rest."""
+    """Return findings by severity; within a severity those on images, then those that explain others, then the rest.
 
-    def place(finding: Finding) -> tuple[int, bool, bool]:
-        """Return the sort key of a finding: severity, not about images, explains no other."""
-        return RANK[finding.severity], finding.kind.row.group != "images", not is_cause(finding)
+    Of the rest, gripper poses that contradict the images come first: they leave nothing to conclude from the motions.
+    """
+
+    def place(finding: Finding) -> tuple[int, bool, bool, bool]:
+        """Return the sort key of a finding: severity, not about images, explains no other, not about wrong poses."""
+        of_images = finding.kind.row.group == "images"
+        of_poses = finding.kind is FindingKind.POSES_CONTRADICT_IMAGES
+        return RANK[finding.severity], not of_images, not is_cause(finding), not of_poses
 
     return tuple(sorted(findings, key=place))
 

@@ -234,6 +234,9 @@ class FindingKind(StrEnum):
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {percent:!.1f} % longer along one side than along the other: it was not printed at its size",
         "print it without scaling (jcr board) and measure both sides; its size is not used for the scale")
+    BOARD_BENT = "board bent", KindRow("lengths",
+        "{board} is bent: its highest corner is {mm:.1f} mm above its lowest one; its shape is estimated",
+        help="nothing for this calibration; mount the board on a flat plate for methods that take it as flat")
     BOARD_NOT_FOUND = "board not found", KindRow("lengths",
         "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",

@@ -43,15 +43,19 @@ def check_registered(case: Case) -> Case:
 
     The remedy is then a better reconstruction and not other motions. If the poses of all registered images would be
     observable but few of them agree, the used images agree by chance; their unobservable directions are not reported.
+    Nothing is concluded from gripper poses that contradict the images.
     """
     hand_eye, capture = case.hand_eye, case.capture
     unseen = hand_eye.observability.findings
     if len(case.used) == len(capture) or not unseen or observability(capture.base_from_gripper).findings:
         return case
-    contradicted = any(one.kind is FindingKind.FEW_AGREE for one in hand_eye.findings)
+    kinds = {one.kind for one in hand_eye.findings}
+    contradicted = FindingKind.FEW_AGREE in kinds
     if contradicted and not observability(case.base_from_gripper).findings:
         rest = tuple(one for one in hand_eye.findings if one not in unseen)
         return case.after((), replace(hand_eye, findings=rest))
+    if FindingKind.POSES_CONTRADICT_IMAGES in kinds:
+        return case
     rejected = any(one.severity == "rejects" for one in hand_eye.findings)
     counts = {"value": float(len(case.used)), "of": float(len(capture))}
     few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)

@@ -5,8 +5,8 @@ are fitted. A convention that fits is reported, and never applied.
 """
 
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -14,9 +14,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.hand_eye import MAX_NOISE, poses_agree, solve_hand_eye
 from jcr.calibration.record import Calibration
+from jcr.calibration.robot_errors import errors_of
 from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.robust import least_trimmed
@@ -33,6 +35,10 @@ BETTER = 3.0
 """Ratio of the misfit of the given poses to that of a candidate, above which the candidate is reported."""
 ROUGHLY = 2.0
 """Factor by which the misfit of a closed form may differ from that of a fit."""
+USUAL = 13
+"""Number of first candidates that are examined before those whose angles are nearer the cameras'."""
+ADJUSTED = 2
+"""Largest number of candidates with which the images are adjusted; each takes seconds."""
 MIN_SHARE = 0.8
 """Smallest fraction of the images that must agree with a candidate convention."""
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
@@ -44,7 +50,7 @@ EULER_ORDERS = (
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
 )
 """Sequences of Euler angles in SciPy's notation (lower case: fixed axes, upper case: moving axes), usual ones first."""
-_Candidate = tuple[str, str, Float[ndarray, "k 4 4"], Int[ndarray, " k"]]
+_Candidate = tuple[str, str, Float[ndarray, "_ 4 4"], Int[ndarray, " _"]]
 """Candidate convention: name, remedy, base_from_gripper in it, and for each pose the index of its camera pose."""
 
 
@@ -60,6 +66,12 @@ class PoseConvention:
     """Estimated robot error per axis (degrees), random and systematic."""
     used: int
     """Number of images that agree with the fit."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the error is small enough for an accepted calibration."""
+        small = self.translation_mm <= 1e3 * MAX_NOISE[0], self.rotation_deg <= np.degrees(MAX_NOISE[1])
+        return all(map(bool, small))
 
     @property
     def misfit(self) -> float:
@@ -78,10 +90,12 @@ def check_convention(case: Case) -> Case:
     if case.hand_eye.converged or fit.converged or by_board:
         return case
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    by_name = {by_number: poses[case.reconstruction.image_index] for by_number, poses in by_name.items()}
+    rows = case.reconstruction.image_index
     # Candidates are fitted without given noise, known lengths and camera covariance; the given poses must be, too.
     alone = not case.priors and case.reconstruction.evidence is None and fit.robot_noise.given is None
-    found = better_reading(case.base_from_gripper, case.recon_from_camera, by_name, fit if alone else None)
+    solved = fit if alone else None
+    found = better_reading(capture.base_from_gripper, case.recon_from_camera, by_name, solved, rows)
+    found = found or _better_adjusted(case, by_name)
     if found is None:
         return case
     observable = case.hand_eye.observability.observable
@@ -90,29 +104,24 @@ def check_convention(case: Case) -> Case:
 
 def better_reading(
     base_from_gripper: Poses,
-    recon_from_camera: Poses,
+    recon_from_camera: Float[ndarray, "m 4 4"],
     by_name: Mapping[bool, Poses] | None = None,
     solved: Calibration | None = None,
+    rows: Int[ndarray, " m"] | None = None,
 ) -> tuple[PoseConvention, PoseConvention] | None:
     """Return the pose convention that fits much better than the given one, then the given one; None if none does.
 
-    `by_name` holds the gripper poses that the images have if they are sorted by name, as numbers (key True) or as text
-    (key False). `solved` is a fit of the given poses to the camera poses alone; None: it is computed.
+    `rows` are the gripper poses of the m camera poses; None: all, one each. `by_name` holds the gripper poses that the
+    images have if they are sorted by name, as numbers (key True) or as text (key False). `solved` is a fit of the given
+    poses to the camera poses alone; None: it is computed.
     """
-    n = len(base_from_gripper)
-    given, *others = _candidates(base_from_gripper)
-    for by_number, poses in (by_name or {}).items():
-        column = "add a column image with the images' names"
-        others.append((BY_NUMBER if by_number else BY_TEXT, column, poses, np.arange(n)))
+    rows = np.arange(len(base_from_gripper)) if rows is None else rows
+    n = len(rows)
+    given, *others = _candidates(base_from_gripper, by_name or {}, rows)
     as_given = _solved(given, recon_from_camera, solved)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
-    camera_angle, gaps = _angles(recon_from_camera), []
-    for _, _, gripper, image in others:
-        gap = np.abs(_angles(gripper) - camera_angle[np.ix_(image, image)])
-        gaps.append(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
-    order = np.argsort(np.round(np.divide(gaps, SAME_ANGLE)), kind="stable")[:SOLVED]
-    worth = [others[k] for k in order if gaps[k] < 2 * min(gaps) + SAME_ANGLE]
+    worth = _congruent(others, recon_from_camera)
     rough = [_rough_error(candidate, recon_from_camera) for candidate in worth]
     # Candidates whose closed form fits too badly are not fitted; shuffled poses fit no candidate.
     enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
@@ -124,8 +133,54 @@ def better_reading(
     ]
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
-    is_better = best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit
+    is_better = best.agrees and best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit
     return (best, as_given) if is_better else None
+
+
+def _better_adjusted(
+    case: Case, by_name: Mapping[bool, Poses]
+) -> tuple[PoseConvention, PoseConvention] | None:
+    """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
+
+    Camera poses from images without given intrinsics are too poor to select a convention, before the images are
+    adjusted. The candidates are the ADJUSTED best ones by their closed form, if it fits better than the given poses'.
+    """
+    rows = case.reconstruction.image_index
+    given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
+    if not case.is_adjustable or case.tracks.from_pointmaps or poses_agree(case.hand_eye.robot_noise):
+        return None
+    worth = _congruent(others, case.recon_from_camera)
+    rough = [_rough_error(candidate, case.recon_from_camera) for candidate in worth]
+    limit = _rough_error(given, case.recon_from_camera)
+    for k in np.argsort(rough, kind="stable")[:ADJUSTED]:
+        name, remedy, poses, image = worth[k]
+        if rough[k] >= limit:
+            break
+        reported, every = case.base_from_gripper.copy(), case.capture.base_from_gripper.copy()
+        reported[image] = poses
+        every[rows] = reported
+        systematic = errors_of(reported)
+        fit = solve_hand_eye(
+            reported,
+            case.recon_from_camera,
+            systematic=systematic.systematic,
+            in_sequence=False,
+            names=case.names,
+        )
+        tried = replace(
+            case,
+            capture=replace(case.capture, base_from_gripper=every),
+            robot=systematic,
+            hand_eye=replace(fit, intrinsics=case.pose_fit.intrinsics),
+            fit=None,
+            chosen_tracks=None,
+            adjusted=None,
+        )
+        found = with_adjusted_images(tried).hand_eye
+        if found.converged and found.inliers.sum() >= MIN_SHARE * (len(reported) - 2):
+            readings = (_reading(name, remedy, found), _reading(given[0], given[1], case.hand_eye))
+            return readings if readings[0].misfit * BETTER < readings[1].misfit else None
+    return None
 
 
 def convention_finding(
@@ -147,8 +202,25 @@ def _solved(
     """Return a candidate convention with the misfit of a calibration, which is `solved` or, if None, computed."""
     name, remedy, base_from_gripper, image = candidate
     fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
+    return _reading(name, remedy, fit)
+
+
+def _reading(name: str, remedy: str, fit: Calibration) -> PoseConvention:
+    """Return the record of a convention with the misfit of its calibration."""
     metres, radians = fit.robot_noise.together
     return PoseConvention(name, remedy, 1e3 * metres, float(np.degrees(radians)), int(fit.inliers.sum()))
+
+
+def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> list[_Candidate]:
+    """Return the candidates whose angles between poses fit those of the camera poses: usual ones, then the nearest."""
+    camera_angle, gaps = _angles(recon_from_camera), []
+    for _, _, gripper, image in candidates:
+        gap = np.abs(_angles(gripper) - camera_angle[np.ix_(image, image)])
+        gaps.append(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
+    nearest = np.round(np.divide(gaps, SAME_ANGLE))
+    nearest[:USUAL] = 0
+    near = [k for k in np.argsort(nearest, kind="stable") if gaps[k] < 2 * min(gaps) + SAME_ANGLE]
+    return [candidates[k] for k in near[:SOLVED]]
 
 
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
@@ -168,23 +240,31 @@ def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
     return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
 
 
-def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
-    """Yield the given poses, then candidates that each correct one assumed mistake; usual mistakes come first."""
-    n = len(base_from_gripper)
-    every = np.arange(n)
+def _candidates(
+    every_pose: Poses, by_name: Mapping[bool, Poses], rows: Int[ndarray, " m"]
+) -> Iterator[_Candidate]:
+    """Yield the given poses, then candidates that each correct one assumed mistake; usual mistakes come first.
+
+    `every_pose` are all gripper poses of the capture, `rows` those of the m camera poses. `by_name` holds all gripper
+    poses in the orders of the image names, as in `better_reading`.
+    """
+    base_from_gripper, every = every_pose[rows], np.arange(len(rows))
     yield ("they are given", "", base_from_gripper, every)
     inverses = "their inverses (gripper_from_base was given)"
     yield (inverses, "add --pose-inverted", inverse(base_from_gripper), every)
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     flip = "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses"
     yield (MIRRORED, flip, mirror @ base_from_gripper @ mirror, every)
-    yield ("listed in reverse order of the images", AT_SOURCE, base_from_gripper[::-1], every)
-    for shift in range(1, min(2, n - 5) + 1):
-        later, earlier = slice(shift, None), slice(n - shift)
+    yield ("listed in reverse order of the images", AT_SOURCE, every_pose[::-1][rows], every)
+    for shift in range(1, min(2, len(rows) - 5) + 1):
         ahead = f"{shift} ahead of the images (image k has pose k + {shift})"
         behind = f"{shift} behind the images (image k has pose k − {shift})"
-        yield (ahead, AT_SOURCE, base_from_gripper[later], every[earlier])
-        yield (behind, AT_SOURCE, base_from_gripper[earlier], every[later])
+        for name, row in ((ahead, rows + shift), (behind, rows - shift)):
+            inside = (row >= 0) & (row < len(every_pose))
+            yield (name, AT_SOURCE, every_pose[row[inside]], every[inside])
+    for by_number, poses in by_name.items():
+        column = "add a column image with the images' names"
+        yield (BY_NUMBER if by_number else BY_TEXT, column, poses[rows], every)
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
     def with_rotation(name: str, read: Rotation, remedy: str = AT_SOURCE) -> _Candidate:

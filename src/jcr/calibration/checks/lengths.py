@@ -15,11 +15,12 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
-from jcr.calibration.checks.boards import board_faults
+from jcr.calibration.checks.boards import STRETCHED, stretch_of
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_depth_images
+from jcr.estimation.boards import STRETCH_STD
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
@@ -40,6 +41,9 @@ AGREES = 2.0
 """Difference of a length from the robot's, in standard deviations, below which the length is a prior of the scale. At a
 larger difference a prior does harm: with robot positions 1 % too long, it increases the error of the transform from 1.0
 to 1.4 mm, because the adjustment rotates and shifts the transform."""
+MISPRINTED = 0.1
+"""Largest relative difference that a board's print or a mistyped side explains better than an error of the robot, whose
+positions have a common scale error of ROBOT_STD; larger ones come from units."""
 EXACT = 0.015
 """Largest relative standard deviation with which a length can reject a calibration."""
 WORTH = 10.0
@@ -103,7 +107,7 @@ def check_lengths(case: Case) -> Case:
     alone = not compared and case.reconstruction.metric_std is None
     findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
     if pair is not None:
-        return case.after((_contradiction(*pair, hand_eye), *findings), hand_eye)
+        return case.after((_contradiction(*pair, lengths, hand_eye), *findings), hand_eye)
     # The difference of the most exact length from the robot, as far as it exceeds their uncertainties, is a fault.
     best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
     beyond = best.off**2 - best.std**2 - robot.std**2
@@ -126,7 +130,7 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
         adjusted is not None
         and adjusted.problem.boards is not None
         and size_std is not None
-        and not board_faults(case)
+        and abs(stretch_of(adjusted)) <= STRETCHED * STRETCH_STD
     ):
         off, by_unknown = size_of_boards(adjusted)
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
@@ -147,14 +151,27 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     return hand_eye, found
 
 
-def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
-    """Return the finding that two lengths contradict each other; a length by the robot must be the argument `one`."""
+def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: Calibration) -> Finding:
+    """Return the finding that two of the `lengths` contradict each other; a length by the robot must be `one`.
+
+    A board that contradicts the robot by up to MISPRINTED, with no other length near the board's, was printed or stated
+    at a wrong size: the result is that of the robot alone.
+    """
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
         size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
         return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", **size)
     exact = of_robot and max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
     kind = FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES
+    support = (third for third in lengths if third is not other and third.std < EXACT)
+    if (
+        kind is FindingKind.BOARD_SIZE
+        and abs(off) <= MISPRINTED
+        and all(
+            abs(third.off - other.off) > AGREES * float(np.hypot(third.std, other.std)) for third in support
+        )
+    ):
+        return Finding.of(kind, "warns", "none", value=float(np.expm1(off)), std=std)
     shift = tuple(_shift(off, hand_eye).tolist()) if of_robot and other.std < EXACT else None
     size = {"value": float(np.expm1(off)), "std": std, "shift": shift, "one": one.name, "other": other.name}
     return Finding.of(kind, "rejects" if exact else "warns", "poses", **size)
