@@ -39,7 +39,7 @@ test-lowest: .venv-lowest/ready
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(TWO_WORKERS) -o addopts='--import-mode=importlib -ra' \
 		--deselect tests/boards/test_marker.py::test_real_boards_reproduce_their_references \
 		--deselect "tests/boards/test_marker.py::test_calibrates_from_every_kind_of_board[charuco:7x6:0.030:0.022:DICT_4X4_50]" \
-		tests/test_without_torch.py tests/test_api.py tests/test_extras.py tests/test_geometry.py tests/test_camera.py \
+		tests/test_without_torch.py tests/test_api.py tests/test_geometry.py tests/test_camera.py \
 		tests/estimation tests/calibration tests/capture tests/boards/test_marker.py tests/pointmaps/test_grid.py
 
 .venv-lowest/ready: pyproject.toml constraints-lowest.txt

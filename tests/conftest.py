@@ -55,16 +55,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "small_done", "opengl", "real_captures", "attacks", "tiny_sam"}
+SLOW_FIXTURES = {"done", "small_done", "simulated", "real_captures", "tiny_sam"}
 """Fixtures that run the command line, draw, reconstruct from images, or load a network."""
 
 
 FIRST = (
-    "live/test_calibration.py", "calibration/test_faults.py",
-    "ros2/test_jcr_ros.py", "test_verify.py", "cell/test_cell.py", "faults/test_surroundings.py",
-    "faults/test_wrong_poses.py", "test_real_captures.py", "boards/test_marker.py", "test_batch.py",
-    "test_examples.py", "scene/test_map.py", "scene/test_map_update.py", "cli/test_cli.py",
-    "calibration/test_conventions.py", "report/test_report.py", "faults/test_faults.py",
+    "live/test_calibration.py", "calibration/test_faults.py", "scene/test_map.py", "test_verify.py",
+    "ros2/test_jcr_ros.py", "cell/test_cell.py", "estimation/test_solve.py", "faults/test_faults.py",
+    "test_real_captures.py", "faults/test_wrong_poses.py", "cli/test_cli.py", "boards/test_marker.py",
+    "test_batch.py", "test_examples.py", "scene/test_map_update.py", "report/test_report.py",
+    "pointmaps/test_any_view.py", "features/test_gate.py", "calibration/test_conventions.py",
 )  # fmt: skip
 """Files by their processor seconds, longest first, after the two that the workers begin with: one makes the run of
 `done`, the other does without it."""
@@ -196,15 +196,6 @@ def true_mesh(tabletop: Path) -> "trimesh.Trimesh":
     return trimesh.util.concatenate(
         [trimesh.Trimesh(apply(where, mesh.vertices), mesh.faces, process=False) for where, mesh in placed]
     )
-
-
-@pytest.fixture(scope="session")
-def attacks() -> Path:
-    """Return rendered captures with one fault each, which are beside the project and not in it."""
-    folder = SHARED / "attacks"
-    if not folder.is_dir():
-        pytest.skip(f"the captures with faults are not at {folder}")
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -120,7 +120,6 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "inverses": (inverse, "inverse"),
     "reversed": (lambda g: g[::-1].copy(), "reverse order"),
     "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
-    "early by two": (lambda g: np.roll(g, -2, 0), "2 behind the images"),
     "left-handed base": (mirrored, "mirrored ones"),
     "transposed": (rotated(lambda r: r.inv()), "transposed rotations"),
     "w first": (
@@ -135,10 +134,6 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "vectors, radians for degrees": (
         rotated(lambda r: Rotation.from_rotvec(np.radians(r.as_rotvec()))),
         "rotation vectors in radians that were taken as degrees",
-    ),
-    "angles, radians for degrees": (
-        rotated(lambda r: Rotation.from_euler("xyz", np.radians(r.as_euler("xyz")))),
-        r"Euler angles \(xyz\) in radians that were taken as degrees",
     ),
 }
 """Mistakes in writing gripper poses that another reading explains, and how that is named."""

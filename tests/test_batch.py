@@ -59,54 +59,38 @@ def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys)
 def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
     tmp_path: Path, captures: list[Path], monkeypatch: pytest.MonkeyPatch
 ):
-    """Robot, URDF, joints, depth, further cameras and a result that is gone count as the images and poses do."""
+    """Robot, URDF, joints and a result that is gone count as the images and poses do."""
     capture, report = shutil.copytree(captures[1], tmp_path / "capture"), tmp_path / "all/capture/report.html"
-    shutil.copytree(capture / "images", capture / "other")
-    depth = [f"{k}.png" for k in range(5)]
-    for name in depth:
-        (capture / name).write_bytes(encode_png(np.full((240, 320), 600, np.uint16)))
     (capture / "robot.urdf").write_text('<robot name="r"><link name="base"/></robot>')
-    frames = json.loads((capture / "capture.json").read_text())["frames"]
+    content, file = json.loads((capture / "capture.json").read_text()), capture / "capture.json"
+    called: list[object] = []
 
-    def is_made() -> bool:
+    def noted(*stages: object) -> None:
+        called.append(stages)
+        raise module.InputError("no work here")
+
+    def is_made(changed: dict) -> bool:
         """Run the batch, with a stage in place of the work, and return whether it was called."""
-        called = []
-
-        def noted(result: object, stages: object, progress: object) -> None:
-            called.append(result)
-            raise module.InputError("no work here")
-
+        called.clear()
+        file.write_text(json.dumps(content | changed))
         with monkeypatch.context() as patched:
             patched.setattr("jcr.pipeline.run.make", noted)
             run_one(*task)
         return bool(called)
 
     task = capture, report.parent, RunOptions(map=None), ReadOptions()
-    assert run_one(*task).status != "failed" and not is_made()
+    file.write_text(json.dumps(content))
+    assert run_one(*task).status != "failed" and not is_made({})
+    jointed = [frame | {"joints": [0.1 * k] * 6} for k, frame in enumerate(content["frames"])]
     for changed in (
-        {"frames": frames[:4]},
+        {"frames": content["frames"][:4]},
         {"robot": "ur5e"},
-        {"intrinsics_std": {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0, "distortion": [0.1] * 5}},
-        {"cameras": {"fixed": {"mount": "base", "intrinsics": None, "images": ["other/00.jpg"]}}},
-        {"frames": [frame | {"depth": name} for frame, name in zip(frames, depth, strict=True)]},
-        {"frames": [frame | {"joints": [0.1 * k] * 6} for k, frame in enumerate(frames)]},
+        {"frames": jointed},
         {"urdf": "robot.urdf"},
     ):
-        before = (capture / "capture.json").read_text()
-        (capture / "capture.json").write_text(json.dumps(json.loads(before) | changed))
-        assert is_made(), changed
-        (capture / "capture.json").write_text(before)
-        assert not is_made(), changed
+        assert is_made(changed) and not is_made({}), changed
     report.unlink()
-    assert is_made()
-
-
-def test_cores_are_counted_where_processes_cannot_be_bound_to_them(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]
-):
-    monkeypatch.delattr(module.os, "sched_getaffinity", raising=False)  # as on macOS
-    (row,) = batch([captures[2]], tmp_path / "all", RunOptions(), BatchOptions(calibrate_only=True))
-    assert row.status == "failed" and "not a readable image" in row.reason
+    assert is_made({})
 
 
 def test_a_recording_is_not_extracted_into_a_folder_where_another_process_writes(

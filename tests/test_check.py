@@ -1,12 +1,9 @@
 """What `jcr check` names before heavy work: a camera at rest, poses that were exchanged, images that show nothing."""
 
 import json
-import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,10 +11,9 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image, show_one_view
+from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
 from jcr.cli.check import read_arguments
 from jcr.findings import FindingKind
@@ -27,15 +23,6 @@ from scenes import capture_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 
 RNG = np.random.default_rng(0)
-
-
-def changed(source: Path, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """Copy a capture with a change of its capture.json."""
-    shutil.copytree(source / "images", folder / "images")
-    content = json.loads((source / "capture.json").read_text())
-    change(content)
-    (folder / "capture.json").write_text(json.dumps(content))
-    return folder
 
 
 def test_a_camera_at_rest_is_named_before_anything_is_matched(small_capture: Path, tmp_path: Path, capsys):
@@ -50,17 +37,6 @@ def test_a_camera_at_rest_is_named_before_anything_is_matched(small_capture: Pat
     assert not said.err
 
 
-def test_a_board_that_the_robot_holds_is_no_stream_that_stands_still(tabletop: Path):
-    first, other = (read_image(tabletop / f"images/{k:02d}.jpg").copy() for k in (0, 6))
-    height, width = first.shape[:2]
-    squares = (np.indices((height, width // 3)) // 16).sum(0) % 2
-    for image in (first, other):
-        image[:, : width // 3] = 255 * squares[..., None]
-    assert not show_one_view(first, other)
-    noisy = np.clip(1.2 * first + RNG.normal(0, 6, first.shape), 0, 255).astype(np.uint8)
-    assert show_one_view(first, noisy)
-
-
 def test_blur_is_measured_by_the_image_itself(tabletop: Path):
     """Not against the other images, which may all be blurred; a plain wall with noise has no edges to judge by."""
     sharp = [read_image(tabletop / f"images/{k:02d}.jpg") for k in range(12)]
@@ -70,24 +46,6 @@ def test_blur_is_measured_by_the_image_itself(tabletop: Path):
     for blurred in (cv2.GaussianBlur(sharp[0], (0, 0), 5), cv2.filter2D(sharp[0], -1, along)):
         assert edge_width(np.asarray(blurred, np.uint8)) > BLURRED_EDGE
     assert edge_width(RNG.normal(120, 4, sharp[0].shape).astype(np.uint8)) == 0.0
-
-
-@pytest.mark.slow
-def test_a_wrong_focal_length_is_named_before_what_follows_from_it(tabletop: Path, tmp_path: Path, capsys):
-    """Half as long again: 303.9 px are true."""
-
-    def change(content: dict[str, Any]) -> None:
-        content["intrinsics"] |= {name: 1.5 * content["intrinsics"][name] for name in ("fx", "fy")}
-
-    folder = changed(shrunk_capture(tabletop, tmp_path / "shrunk", 8, 320), tmp_path / "capture", change)
-    assert dispatch(["check", str(folder)]) == 0  # the calibration estimates it
-    said = capsys.readouterr().out
-    first = next(line for line in said.splitlines() if line.startswith("WARNING"))
-    assert re.search(
-        r"show focal lengths of \(30[345]\.\d, .*\) ± \S+ px where \(456\.0, 456\.0\) is given",
-        first,
-    )
-    assert said.startswith("ACCEPTED with 1 warning") and "add images" not in said
 
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
@@ -112,21 +70,6 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     assert not left_out_poses(replace(capture, base_from_gripper=right), made, of_right)
 
 
-@pytest.mark.slow
-def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
-    tabletop: Path, tmp_path: Path, capsys
-):
-    def change(content: dict[str, Any]) -> None:
-        one, other = (content["frames"][k] for k in (3, 8))
-        key = "base_from_gripper"
-        one[key], other[key] = other[key], one[key]
-
-    assert dispatch(["check", str(changed(tabletop, tmp_path / "capture", change))]) == 3
-    said = capsys.readouterr()
-    assert "\nCause       images/03.jpg and images/08.jpg have each other's gripper poses" in said.out
-    assert "Agreement" not in said.out and "Expected" not in said.out
-
-
 @pytest.mark.parametrize("convention", ["ur", "yaskawa"])
 def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
     convention: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -141,18 +84,3 @@ def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
     assert read_arguments(options) == ["--pose-convention", convention]
     assert isinstance(found, Capture) and found.pose_convention == convention
     assert f"read with --pose-convention {convention}" in found.notes[-1]
-
-
-@pytest.mark.slow
-def test_columns_rx_ry_rz_are_read_as_the_images_show(
-    tabletop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    capture = jcr.read_capture(tabletop)
-    few = capture.of_rows(range(8))
-    writers.write_table(tmp_path, few, "ur", "image,x,y,z,rx,ry,rz")
-    with pytest.raises(jcr.InputError, match=r"say which, or find out from the images with jcr check"):
-        jcr.read_capture(tmp_path)
-    assert dispatch(["check", str(tmp_path), "--json"]) == 0
-    said = capsys.readouterr().out
-    (note,) = (remark for remark in json.loads(said)["notes"] if "rx, ry, rz" in remark)
-    assert "read with --pose-convention ur: these poses agree" in note and "jcr check" not in said

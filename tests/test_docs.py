@@ -1,10 +1,12 @@
-"""Files, imports and commands that the documents name exist; links and anchors are Sphinx's (`make docs`)."""
+"""Files, imports, commands and extras that the documents name exist; docstrings begin with noun or verb."""
 
 import ast
 import json
 import re
 import shlex
+import sys
 import tomllib
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -21,6 +23,7 @@ from jcr.cli.prepare import page as page_named
 from jcr.cli.prepare import pages
 from jcr.cli.usage import parsed
 from jcr.errors import InputError
+from jcr.extras import DISTRIBUTION, extra
 from jcr.findings import FindingKind
 from jcr.records.capture_json import CameraEntry, CaptureFile, FrameEntry, IntrinsicsEntry
 from places import ROOT
@@ -165,3 +168,71 @@ def test_version_and_date_of_the_release_are_the_same_everywhere():
     latest = re.search(r"^## (\S+) — (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert latest is not None and latest[1] == PROJECT["project"]["version"]
     assert (cited["version"], str(cited["date-released"])) == latest.groups()
+
+
+FRAGMENT = re.compile(r"(Of|That|Those|What|Where|Which|How|The same|As|Beside|With|In)\b")
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and text of the docstrings of modules, classes, functions, fields and constants."""
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    for node in (one for one in ast.walk(tree) if isinstance(one, documented)):
+        for before, own in zip([None, *node.body], node.body, strict=False):
+            is_place = before is None or isinstance(before, ast.Assign | ast.AnnAssign)
+            value = own.value if is_place and isinstance(own, ast.Expr) else None
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                yield own.lineno, value.value.strip()
+
+
+def test_no_docstring_is_a_fragment():
+    found = [
+        f"{file.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
+        for file in sorted((ROOT / "src" / "jcr").rglob("*.py"))
+        for line, text in docstrings(ast.parse(file.read_text()))
+        if FRAGMENT.match(text)
+    ]
+    assert found == []
+
+
+METADATA = PROJECT["project"]
+
+
+def test_the_extras_that_are_named_exist():
+    assert METADATA["name"] == DISTRIBUTION
+    named = set()
+    for folder in ("src", "benchmarks", "docs", "examples"):
+        for file in (one for one in (ROOT / folder).rglob("*.*") if one.suffix in (".py", ".md")):
+            text = file.read_text()
+            assert not re.search(r"pip\s+install\s+'?jcr\b(?!-)", text), file
+            several = ",".join(re.findall(rf"{DISTRIBUTION}\[([\w,]+)\]", text)).split(",")
+            every = [*re.findall(r'\bextra\("[\w.]+", "(\w+)"', text), *filter(None, several)]
+            named |= {(name, file.name) for name in every}
+    assert {name for name, _ in named} >= {"networks", "view", "sam", "ros", "lerobot", "planning"}
+    assert not {(name, file) for name, file in named if name not in METADATA["optional-dependencies"]}
+
+
+def test_the_lowest_versions_are_those_that_are_tested():
+    bounds = {}
+    for requirement in [*METADATA["dependencies"], *METADATA["optional-dependencies"]["ros"],
+                        *METADATA["optional-dependencies"]["lerobot"]]:  # fmt: skip
+        name, version = re.fullmatch(r"([\w-]+)>=([\d.]+)(?:,.*)?", requirement).groups()
+        bounds[name] = version
+    pinned = dict(
+        line.split("==")
+        for line in (ROOT / "constraints-lowest.txt").read_text().splitlines()
+        if "==" in line
+    )
+    assert pinned.keys() == bounds.keys()
+    for name, version in bounds.items():
+        shortest = re.sub(r"(\.0)+$", "", pinned[name])
+        assert shortest == version or pinned[name].startswith(f"{version}.0."), name
+
+
+def test_a_package_that_is_there_but_broken_reports_why(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "brokenpackage.py").write_text("raise ImportError('libmissing.so: no such file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"cannot be imported \(libmissing.so: no such file\): pip install"):
+        extra("brokenpackage", "view", "the simulation")
+    monkeypatch.setitem(sys.modules, "brokenpackage", None)
+    with pytest.raises(InputError, match="the simulation needs brokenpackage, which is not installed"):
+        extra("brokenpackage", "view", "the simulation")

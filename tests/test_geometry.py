@@ -14,7 +14,6 @@ from jcr.geometry import (
     inverse,
     motion_length,
     nearest_rotation,
-    nearest_to_lines,
     require_rigid,
     retract,
     rotation_between_deg,
@@ -87,12 +86,6 @@ def test_a_step_moves_points_as_its_twist_and_its_motion_in_other_axes_do(a_from
     rotation = a_from_b[:3, :3]
     on_the_right = step_axes(rotation.T) @ step
     assert np.allclose(adjoint(a_from_b[None])[0] @ on_the_right, twist, atol=1e-12)
-
-
-def test_the_point_nearest_to_skew_lines_is_halfway_between_them():
-    origin = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [[5.0, 1.0, 0.0], [0.0, 1.0, 4.0]]])
-    direction = np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), (2, 1, 1))
-    assert np.allclose(nearest_to_lines(origin, direction), [[0.0, 0.0, 0.5], [0.0, 1.0, 2.0]], atol=1e-4)
 
 
 def test_similarity_is_recovered_exactly_and_ignores_points_without_weight():

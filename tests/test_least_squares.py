@@ -1,11 +1,14 @@
-"""The damped robust Gauss-Newton against SciPy's, on curves, on poses, on what it cannot see."""
+"""The damped robust Gauss-Newton and the distributions, against SciPy's."""
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jcr.calibration import hand_eye
+from jcr.distributions import chi2
+from jcr.distributions import f as f_distribution
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
 from jcr.least_squares import minimise
 from simulation.problems import hand_eye_problem
@@ -105,3 +108,20 @@ def test_small_systems_are_solved_by_one_blas_thread(monkeypatch: pytest.MonkeyP
     with threadpool_limits(2, user_api="blas"), pytest.raises(InterruptedError):
         hand_eye.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert seen and set(seen) == {1}
+
+
+@pytest.mark.parametrize("name", ["cdf", "sf", "ppf", "isf"])
+def test_chi_squared_is_that_of_scipy(name: str) -> None:
+    x = np.array([0.0, 0.05, 0.5, 0.95]) if name in ("ppf", "isf") else np.array([0.0, 0.3, 6.0, 300.0])
+    for freedom in (1.0, 6.0, 40.0):
+        np.testing.assert_allclose(
+            getattr(chi2, name)(x, freedom), getattr(stats.chi2, name)(x, freedom), rtol=1e-10
+        )
+
+
+def test_the_tail_of_f_is_that_of_scipy_down_to_nothing() -> None:
+    x = np.array([0.0, 1.0, 30.0, 1e3])
+    np.testing.assert_allclose(f_distribution.logsf(x, 3, 200), stats.f.logsf(x, 3, 200), rtol=1e-8)
+    # Beyond the smallest number the logarithm stays finite and keeps its order.
+    values = f_distribution.logsf(np.array([1e5, 1e7, 1e9]), 3, 200)
+    assert np.isfinite(values).all() and (np.diff(values) < 0).all()

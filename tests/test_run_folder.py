@@ -1,7 +1,9 @@
-"""Run folders that somebody edited or cut: refused in one line, or read; never a traceback."""
+"""Run folders that somebody edited or cut are refused in one line, or read; their files are written whole."""
 
 import json
+import os
 import shutil
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -10,19 +12,15 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-import capture_writers as writers
 from corpus import sound_run
-from jcr.capture.formats.capture_json import kept
-from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.files import locked
-from jcr.pipeline import selection, verify
+from jcr.files import locked, write_new, write_text, written_whole
+from jcr.pipeline import selection
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.stages import begun, complete, is_unchanged
-from jcr.reconstruct import ReconstructOptions
-from jcr.records import Capture, CellCamera
+from jcr.records import CellCamera
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of
 
@@ -164,48 +162,6 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
 
 
 @pytest.mark.slow
-def test_verify_reconstructs_with_the_options_of_the_run(
-    small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    out = shutil.copytree(small_done, tmp_path / "out")
-    content = json.loads((out / "run.json").read_text())
-    content["options"]["reconstruct"] |= {"backend": "colmap", "seed": 7}
-    (out / "run.json").write_text(json.dumps(content))
-
-    def reconstruct(capture: Capture, options: ReconstructOptions, progress: object) -> NoReturn:
-        assert (options.backend, options.seed) == ("colmap", 7)
-        raise InterruptedError
-
-    monkeypatch.setattr(verify, "register", lambda made, then, now: [0] * len(now))  # another scene
-    monkeypatch.setattr(verify, "_new_images", lambda *_: ([None] * 5, [None] * 5))
-    monkeypatch.setattr(verify, "reconstruct", reconstruct)
-    with pytest.raises(InterruptedError):
-        verify.verify_run(out, small_capture)
-
-
-def test_a_table_with_depth_images_is_copied_once_and_read_again_where_one_changed(
-    small_capture: Path, tmp_path: Path
-):
-    table, out = tmp_path / "table", tmp_path / "out"
-    writers.write_table(table, read_capture(small_capture))
-    (table / "depth").mkdir()
-    for image in (small_capture / "images").iterdir():
-        (table / "depth" / f"{image.stem}.png").write_bytes(encode_png(np.full((150, 200), 600, np.uint16)))
-
-    def begin() -> RunResult:
-        return begun(out, kept(read_capture(table), out / "capture"), RunOptions(map=None))
-
-    complete(begin())
-    (depth,) = (out / "capture").rglob("00.png")
-    (out / "report.html").write_text("")
-    complete(begin())
-    stamp = depth.stat().st_mtime_ns
-    assert is_unchanged(begin()) and depth.stat().st_mtime_ns == stamp
-    (table / "depth" / "00.png").write_bytes(encode_png(np.full((150, 200), 700, np.uint16)))
-    assert not is_unchanged(begin()) and depth.stat().st_mtime_ns > stamp
-
-
-@pytest.mark.slow
 def test_a_capture_whose_images_changed_is_not_read_with_the_run_of_the_earlier_ones(
     small_capture: Path, small_done: Path
 ):
@@ -214,3 +170,37 @@ def test_a_capture_whose_images_changed_is_not_read_with_the_run_of_the_earlier_
     for rows in ([1, 0, 2, 3, 4], [0, 1, 2, 3]):
         with pytest.raises(InputError, match="has changed since"):
             RunResult(small_done, capture=capture.of_rows(np.array(rows))).of_wrist_camera()
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_a_file_has_the_users_permissions_and_the_umask_of_the_process_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: int
+):
+    """Files that another thread makes meanwhile must not be open to everybody."""
+    before = os.umask(umask)
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "umask", lambda mask: pytest.fail("the umask of the process is changed"))
+            write_text(tmp_path / "calibration.json", "{}")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "calibration.json").stat().st_mode) == 0o666 & ~umask
+    assert [file.name for file in tmp_path.iterdir()] == ["calibration.json"]
+
+
+def test_a_file_that_has_the_bytes_already_keeps_its_time(tmp_path: Path):
+    file = tmp_path / "depth.png"
+    write_new(file, b"one")
+    os.utime(file, (1, 1))
+    write_new(file, b"one")
+    assert file.stat().st_mtime == 1
+    write_new(file, b"two")
+    assert file.read_bytes() == b"two" and file.stat().st_mtime > 1
+
+
+def test_a_file_that_is_not_written_whole_leaves_the_old_one_and_nothing_beside_it(tmp_path: Path):
+    (tmp_path / "map.bin").write_text("old")
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "map.bin") as temporary:
+        temporary.write_text("new")
+        raise KeyboardInterrupt
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("map.bin", "old")]

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,7 +100,7 @@ def test_the_second_run_makes_nothing(
     assert "unchanged" not in capsys.readouterr().err and made == ["colmap"], "other options, same cameras"
 
 
-@pytest.mark.parametrize("format", ["poses.csv", "bag", "LeRobot"])
+@pytest.mark.parametrize("format", ["poses.csv", "bag"])
 def test_edited_input_is_read_and_run_again(
     format: str, capture: Capture, tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
 ):
@@ -118,17 +117,3 @@ def test_edited_input_is_read_and_run_again(
     assert made == ["colmap", "colmap"]
     found = jcr.read_capture(out / "capture").base_from_gripper
     assert found[:, 0, 3].mean() == pytest.approx(moved[:, 0, 3].mean(), abs=0.02)
-
-
-def test_a_frame_that_is_left_out_is_named_by_the_command_and_in_its_result(
-    capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    folder, out = tmp_path / "capture", tmp_path / "out"
-    shutil.copytree(capture.folder, folder)
-    content = json.loads((folder / "capture.json").read_text())
-    content["frames"][2]["base_from_gripper"][0][0] = 5.0
-    (folder / "capture.json").write_text(json.dumps(content))
-    dispatch(["calibrate", str(folder), str(out), "--backend", "colmap"])
-    said = capsys.readouterr().out
-    notes = json.loads((out / "calibration.json").read_text())["notes"]
-    assert notes[0].startswith("left out: ") and "frame 2" in notes[0] and f"Note        {notes[0]}\n" in said

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from conftest import shrunk_capture
 from jcr.cli import COMMANDS
 from jcr.extras import DISTRIBUTION
 from places import ROOT
@@ -51,31 +50,26 @@ def run_jcr(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    return shrunk_capture(tabletop, tmp_path_factory.mktemp("core") / "capture", 8, 400)
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+def calibrated(tmp_path_factory: pytest.TempPathFactory, small_capture: Path) -> Path:
     """A run folder made without torch, by a program that imported pycolmap before jcr."""
     out = tmp_path_factory.mktemp("core") / "out"
-    done = without_torch("import pycolmap\nfrom jcr.cli import main; main()", "run", capture, out)
+    done = without_torch("import pycolmap\nfrom jcr.cli import main; main()", "run", small_capture, out)
     assert done.returncode == 0, done.stderr
     missing = f"the map needs torch, which is not installed: pip install '{DISTRIBUTION}[map]'"
     assert f"\nMap         no map was made: {missing}" in done.stdout
     return out
 
 
-def test_a_capture_is_calibrated_and_reported(calibrated: Path, tabletop: Path):
+def test_a_capture_is_calibrated_and_reported_as_with_torch(calibrated: Path, small_done: Path):
     names = {path.name for path in calibrated.iterdir()} - {".lock"}
     assert names == {"calibration.json", "reconstruction.npz", "report.html", "log.txt", "run.json"}
-    compared = run_jcr("compare", calibrated, tabletop, "--json")
+    compared = run_jcr("compare", calibrated, small_done, "--json")
     assert compared.returncode == 0, compared.stderr
-    assert json.loads(compared.stdout)["translation_mm"] < 1.5
+    assert json.loads(compared.stdout)["translation_mm"] < 1e-3
 
 
 def test_what_needs_torch_shows_what_to_install_before_any_work(
-    capture: Path, calibrated: Path, tmp_path: Path
+    small_capture: Path, calibrated: Path, tmp_path: Path
 ):
     mapped = tmp_path / "mapped"
     shutil.copytree(calibrated, mapped)
@@ -84,7 +78,7 @@ def test_what_needs_torch_shows_what_to_install_before_any_work(
         "map": ["map", str(calibrated)],
         "glb": ["export", str(mapped), "glb"],
         "octomap": ["export", str(mapped), "octomap"],
-        "dust3r": ["run", str(capture), str(tmp_path / "out"), "--backend", "dust3r"],
+        "dust3r": ["run", str(small_capture), str(tmp_path / "out"), "--backend", "dust3r"],
     }
     code = "import json; from jcr.cli import dispatch\nfor words in json.loads(sys.argv[1]): print(dispatch(words))"
     done = without_torch(code, json.dumps(list(commands.values())))

@@ -1,24 +1,29 @@
-"""The machinery of the benches, the numbers that the README quotes, and two of the benches."""
+"""The benches: their pages, the numbers that the README quotes, references of real captures and how these are built."""
 
+import json
 import re
+import subprocess
+from dataclasses import replace
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from benchmarks import __main__ as machinery
-from benchmarks.__main__ import BENCHES, Arguments, claims, main, run_all, write_index
-from benchmarks.peers import grid_search
-from benchmarks.pointmaps import end_to_end
+from benchmarks.__main__ import BENCHES, claims, write_index
+from benchmarks.real import WristCamera, pixels_of
+from benchmarks.real_captures.fetch import Recipe, build, recipes
+from benchmarks.references import Corners, reference
+from jcr.camera import parameters
+from jcr.capture.controllers import numbers_from_poses
+from jcr.capture.read import read_capture
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg, scale_translation
+from jcr.geometry import step_between
 from jcr.records import Intrinsics
 from places import ROOT
-from simulation.problems import hand_eye_problem
-from simulation.render import render
-from simulation.scenes import make_scene
+from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
 
 RESULTS = ROOT / "docs" / "results"
 MEASURED = re.compile(r"(\d[\d,.]*\d|\d)\s?(mm|cm|°|%|ms|s|dB|GiB|GB|MiB|M|minutes|times)(?![\w])")
@@ -33,24 +38,6 @@ def test_every_page_of_results_belongs_to_a_bench_and_the_index_is_current(tmp_p
             (tmp_path / page.name).write_text(text)
     write_index(tmp_path)
     assert (tmp_path / "README.md").read_text() == (RESULTS / "README.md").read_text()
-
-
-@pytest.mark.slow
-def test_a_bench_that_fails_is_reported_and_stops_no_other_and_options_it_does_not_use_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    for arguments, message in (
-        (Arguments("real"), "name the folder"),
-        (Arguments("map", captures=Path("captures")), "does not use captures"),
-        (Arguments("all"), "--out"),
-    ):
-        with pytest.raises(InputError, match=message):
-            main(arguments)
-    monkeypatch.setattr(machinery, "BENCHES", {name: BENCHES[name] for name in ("real", "cameras")})
-    (tmp_path / "captures").mkdir()
-    assert run_all(tmp_path, tmp_path / "captures") == 1
-    reported = "\n" + capsys.readouterr().err
-    assert all(f"\n{name}: exit status 2: error: " in reported for name in ("real", "cameras"))
 
 
 def test_every_bench_can_be_imported_and_takes_known_options():
@@ -70,25 +57,91 @@ def test_every_number_of_the_readme_is_in_the_results():
     assert quoted >= 8
 
 
-@pytest.mark.gl
+CAMERA = Intrinsics(620.0, 620.0, 322.0, 236.0, 640, 480, (-0.08, 0.03, 0.0, 0.0, 0.0))
+NOISE_PX = 0.1
+X_IN_BOARD = np.stack([*np.meshgrid(np.arange(8), np.arange(5)), np.zeros((5, 8))], -1).reshape(-1, 3) * 0.025
+
+
+def seen(
+    problem: HandEyeProblem, bend: float = 0.0, noise_px: float = NOISE_PX
+) -> tuple[WristCamera, Corners]:
+    """Return the true camera, and a board about the target, its edges raised by `bend` (m), in its images."""
+    camera = WristCamera(CAMERA, problem.gripper_from_camera, problem.true_base_from_gripper)
+    x_in_base = X_IN_BOARD - X_IN_BOARD.mean(0)
+    x_in_base[:, 2] = bend * (x_in_base[:, 0] / x_in_base[:, 0].max()) ** 2
+    image, corner = (index.ravel() for index in np.indices((len(problem.base_from_gripper), len(X_IN_BOARD))))
+    corners = Corners(image, corner, np.zeros((len(image), 2)), X_IN_BOARD)
+    x_px = pixels_of(camera, corners, x_in_base + TARGET_IN_BASE)
+    return camera, replace(corners, x_px=x_px + noise_px * np.random.default_rng(1).normal(size=x_px.shape))
+
+
 @pytest.mark.slow
-def test_predictions_become_a_calibration_and_a_map_in_metres():
-    """Pointmaps with a network's errors, against the truth of a simulated capture."""
-    camera = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
-    try:
-        next(render(make_scene("measuring", 0), camera, np.eye(4)[None], textured=False, with_truth=False))
-    except InputError as error:
-        pytest.skip(str(error))
-    found = end_to_end(5, 1, (0.0, 0.0))
-    assert found.translation_mm < 1.5 and found.rotation_deg < 0.1 and found.scale_percent < 0.3
-    assert found.surface_mm < 5 and found.sigmas < 2
+def test_references_state_their_own_error():
+    """Errors over σ of X and intrinsics of boards that are bent and of another size than stated: χ² per parameter."""
+    squared = []
+    for seed in range(2):
+        problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=(4e-4, 1e-3))
+        camera, corners = seen(problem, 0.001)
+        stated = replace(corners, x_in_board=X_IN_BOARD / 1.02)
+        found = reference(problem.base_from_gripper, stated, (CAMERA.width, CAMERA.height))
+        off = np.r_[
+            step_between(found.gripper_from_camera, camera.gripper_from_camera),
+            parameters(CAMERA) - parameters(found.intrinsics),
+        ]
+        squared.append(off @ np.linalg.solve(found.covariance, off) / len(off))
+        assert found.size == pytest.approx(1.02, abs=0.005)
+        assert found.noise[0] == pytest.approx(4e-4, rel=0.5) and found.rms_px < 2 * NOISE_PX
+    # The mean square of 30 parameters is 1 ± 0.26.
+    assert 0.22 < np.mean(squared) < 1.78
 
 
-def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there():
-    problem = hand_eye_problem(np.random.default_rng(5), 8)
-    for scale, found_there in ((2.0, True), (5.0, False)):
-        x, found = grid_search(
-            problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale / scale)
-        )
-        assert rotation_between_deg(x[:3, :3], problem.gripper_from_camera[:3, :3]) < 1e-5
-        assert (abs(found - scale) < 3 / 20_000) == found_there
+@pytest.mark.slow
+def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path: Path):
+    folder, poses = tmp_path / "repository", hand_eye_problem(np.random.default_rng(0), 11).base_from_gripper
+    (folder / "data").mkdir(parents=True)
+    for k in range(11):
+        grey = np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8)
+        Image.fromarray(grey).save(folder / "data" / f"view_{k}.png")
+    rows = numbers_from_poses(poses, "rotation-vector")
+    (folder / "data" / "poses.txt").write_text("\n".join(", ".join(map(repr, row)) for row in rows.tolist()))
+
+    def git(*words: str) -> str:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        done = subprocess.run(["git", "-C", str(folder), *identity, *words], check=True, capture_output=True)
+        return done.stdout.decode().strip()
+
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "data")
+    recipe = Recipe(
+        repository=str(folder),
+        commit=git("rev-parse", "HEAD"),
+        licence="MIT",
+        images="data/view_*.png",
+        poses="data/poses.txt",
+        convention="rotation-vector",
+        use_images="1:",
+        use_poses=[1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+        intrinsics=[60.0, 61.0, 31.5, 23.5],
+    )
+    capture = read_capture(build(recipe, tmp_path / "capture"))
+    # Names are in the order of their numbers, not of their letters.
+    assert capture.images[1] == "images/view_2.png" and capture.images[-1] == "images/view_10.png"
+    np.testing.assert_allclose(capture.base_from_gripper, poses[1:], atol=1e-12)
+    assert capture.intrinsics is not None and capture.intrinsics.fy == 61.0
+    assert (
+        json.loads((tmp_path / "capture" / "capture.json").read_text())["source"]["commit"] == recipe.commit
+    )
+    # A clone that is there already is used as it is; other content than the recipe's is refused.
+    with pytest.raises(InputError, match="not that of the recipe"):
+        build(replace(recipe, repository="nowhere", sha256="0"), tmp_path / "other", str(folder))
+    with pytest.raises(InputError, match="11 images and 10 poses"):
+        build(replace(recipe, use_images=":"), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_every_recipe_names_a_commit_a_licence_and_what_it_makes():
+    known = recipes()
+    assert len(known) == 14
+    for name, recipe in known.items():
+        assert len(recipe.commit) == 40 and len(recipe.sha256) == 64 and recipe.licence, name

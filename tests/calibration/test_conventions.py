@@ -47,8 +47,6 @@ def test_rows_in_another_order_of_the_images_names_are_named():
         ([names[k] for k in by_text], poses, BY_NUMBER),
     ):
         cameras = problem.recon_from_camera[[int(Path(name).stem) - 1 for name in images]]
-        # Without the names all readings are tried, in seconds: once is enough.
-        assert order == BY_NUMBER or better_reading(rows, cameras) is None
         found = better_reading(rows, cameras, paired_by_name(images, rows))
         assert found is not None and found[0].name == order
         assert "add a column image" in sentence(convention_finding(found))
@@ -64,7 +62,7 @@ def test_the_order_counts_images_without_a_camera_pose():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-3, np.radians(1.0))])
 def test_sound_poses_are_left_alone(noise):
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)
     assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None

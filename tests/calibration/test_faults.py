@@ -2,26 +2,17 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-import jcr
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.adjust import adjust_case
-from jcr.calibration.case import Case
-from jcr.calibration.checks import effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
-from jcr.camera import project, unproject
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import arm_named
-from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind, kinds_of, sentence
-from jcr.geometry import apply, inverse, step_between
-from jcr.sfm.colmap import reconstruct_colmap
+from jcr.geometry import inverse, step_between
 from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
@@ -66,12 +57,6 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         Faults(slip=(3.6e-3, np.radians(0.8))),
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
         [3.6, 0.8],
-        0.6,
-    ),
-    "slip": (
-        Faults(slip=(3.6e-3, np.radians(1.1))),
-        r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
-        [3.6, 1.1],
         0.6,
     ),
     # Another TCP: the adjustment takes it for robot pose noise.
@@ -144,7 +129,7 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
         off = np.array(camera.distortion[-4:]) - NAMED[name][0].prism
         assert (np.abs(off) < 3 * np.array(camera.std[-4:])).all()
     # No one result is right on both sides of a motion beyond the requirement, and a delay of that size leaves ± 10 mm.
-    assert hand_eye.converged is (name not in ("slip", "tool changed", "base pushed", "delay"))
+    assert hand_eye.converged is (name not in ("tool changed", "base pushed", "delay"))
 
 
 def test_what_given_intrinsics_may_be_off_is_within_sigma_unsaid():
@@ -157,16 +142,6 @@ def test_nothing_is_named_where_nothing_is_wrong(images: int, given: bool):
     assert calibrated(Faults(), 0, images, given)[1].warnings == ()
 
 
-@pytest.mark.long
-def test_an_effect_that_moves_the_calibration_by_all_points_too_little_is_not_reported(attacks: Path):
-    """Twice the same 16 views share errors of pixels: 800 of their points show focal lengths that differ by 0.05 %.
-
-    A calibration of those points moves by two standard deviations with them, that of all points by 0.1.
-    """
-    capture = jcr.read_capture(attacks / "scale_32")
-    assert not calibrate_reconstruction(capture, reconstruct_colmap(capture)).warnings
-
-
 def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot():
     problem = bent_problem(arm_named("panda"), "low-cost", 12, 2)
     capture = capture_of(problem.base_from_gripper, intrinsics=OBSERVED_BY)
@@ -176,36 +151,6 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot():
     assert not kinds_of("strain") & {
         one.kind for one in calibrate_reconstruction(capture, reconstruction).findings
     }
-
-
-def test_an_unmeasured_prism_of_estimated_intrinsics_is_within_sigma():
-    """Here the prism hides in the tangential distortion: the pair places points alike, and ± says how far X is off."""
-    found, hand_eye = calibrated(NAMED["thin prism"][0], 3, given=False)
-    step = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
-    assert np.degrees(np.linalg.norm(step[3:])) > 1.0 and outcome(found, hand_eye).is_sound
-    camera = hand_eye.intrinsics
-    assert camera is not None
-    ahead = np.array([[0.0, 0.0, 0.5]])
-    # A point half a metre ahead of the true camera, where the calibrated pair places its pixel.
-    pixel = project(found.intrinsics, ahead)
-    placed = apply(hand_eye.gripper_from_camera, 0.5 * unproject(camera, pixel))
-    assert np.linalg.norm(placed - apply(found.gripper_from_camera, ahead)) < 2e-3
-
-
-def test_many_images_with_an_effect_each_are_adjusted_with_the_points_that_memory_allows(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    counts: list[int] = []
-
-    def counted(case: Case, **free: Any) -> Solution:
-        counts.append(len(case.tracks.image))
-        return adjust_case(case, **free)
-
-    monkeypatch.setattr(effects, "adjust_case", counted)
-    monkeypatch.setattr(effects, "MOST_BYTES", 16 * 12 * 1000)
-    found, hand_eye = calibrated(Faults(focal_scatter=0.02), 3)
-    assert counts and max(counts) <= 1000 < len(found.tracks.image)
-    assert outcome(found, hand_eye).is_within
 
 
 def test_a_focus_that_varies_is_modelled():
@@ -235,16 +180,15 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 
-@pytest.mark.parametrize("mm", [3.0, 100.0])
-def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large(mm: float):
+def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large():
     """The fit takes it for noise of all translations, beside which it was lost the more the larger it was."""
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
     gripper = problem.base_from_gripper.copy()
-    gripper[4:, :3, 3] += 1e-3 * mm * gripper[4:, :3, 0]
+    gripper[4:, :3, 3] += 0.1 * gripper[4:, :3, 0]
     pairs = pairs_of(gripper, problem.recon_from_camera, images=tuple("abcdefgh"))
     found = next(one for one in calibrate_pose_pairs(pairs).findings if one.kind is FindingKind.SLIP)
     assert found.images == ("d", "e")
-    assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)
+    assert found.value == pytest.approx(0.1, abs=1e-3)
 
 
 def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_and_a_known_length_contradicts_them():

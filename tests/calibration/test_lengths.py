@@ -1,18 +1,32 @@
-"""Lengths beside the robot's positions: compared, weighed where they agree, named where they do not."""
+"""Lengths beside the robot's positions, and depth cameras whose scale is wrong: weighed or named, and corrected."""
 
+import json
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
 from jcr.calibration import stage
 from jcr.calibration.checks import lengths
+from jcr.calibration.checks.lengths import depth_check
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, validated
 from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.words import details
+from jcr.camera import rays
+from jcr.capture.images import encode_png, read_depth_images
+from jcr.capture.read import read_capture
+from jcr.depth.measured import with_measured_depth
+from jcr.errors import InputError
+from jcr.files import write_bytes
 from jcr.findings import Finding, FindingKind, sentence
-from jcr.geometry import step_between
-from jcr.records import DepthCheck
+from jcr.geometry import apply, inverse, rotation_exp, step_between, transform
+from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
+from scenes import capture_of, maps_of, no_depth, reconstruction_of
 from simulation.boards import Sheet, with_sheet
 from simulation.faults import Faults, faulty_capture, reconstructed
 
@@ -31,6 +45,12 @@ def calibrated(
     return hand_eye, found.gripper_from_camera
 
 
+@cache
+def calibrated_alone(seed: int) -> Calibration:
+    """The calibration of the same 12 images without a board."""
+    return calibrated(None, seed=seed)[0]
+
+
 def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
     """A known length makes the simulated reconstruction, which is in metres, so much larger."""
     for module in (stage, lengths):
@@ -43,7 +63,7 @@ def of_kind(hand_eye: Calibration, kind: FindingKind) -> Finding:
 
 
 def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
-    alone, _ = calibrated(None)
+    alone = calibrated_alone(0)
     both, x = calibrated(Sheet())
     assert both.covariance[6, 6] < 0.9 * alone.covariance[6, 6]
     (board,) = both.lengths
@@ -78,7 +98,6 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
     ("sheet", "kind"),
     [
         (Sheet(stretch=0.01), FindingKind.BOARD_STRETCHED),
-        (Sheet(stretch=0.03), FindingKind.BOARD_STRETCHED),
         (Sheet(moved_m=3e-3), FindingKind.BOARD_MOVED),
         (Sheet(moved_m=1e-3), FindingKind.BOARD_MOVED),
         (Sheet(size_error=0.02), FindingKind.BOARD_SIZE),
@@ -88,7 +107,7 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
 def test_a_board_that_is_wrong_is_named_and_leaves_the_result_as_it_is_without(
     sheet: Sheet, kind: FindingKind
 ):
-    alone, _ = calibrated(None, seed=1)
+    alone = calibrated_alone(1)
     hand_eye, x = calibrated(sheet, seed=1)
     assert of_kind(hand_eye, kind).severity == ("informs" if kind is FindingKind.BOARD_BENT else "warns")
     # The shape of a bent board, and the corners of a moved one in most images, are still good.
@@ -127,20 +146,167 @@ def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees
     assert [one.name for one in both.lengths] == ["board", "known length"]
 
 
-def test_a_depth_camera_that_contradicts_robot_and_board_is_named_with_the_percent(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    measured = DepthCheck(
-        off_percent=9.0,
-        std_percent=0.3,
-        noise_m=1e-3,
-        noise_per_m=1e-3,
-        distances_m=(0.4, 0.7),
-        images=12,
-        features=900,
+INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
+OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
+"""Too long by 3 %; sigma 2 mm at 0.7 m."""
+X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
+
+
+def with_depth(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> Calibration:
+    found = depth_check(capture, reconstruction, hand_eye)
+    return replace(hand_eye, depth_check=found)
+
+
+@pytest.fixture(scope="module")
+def measured(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Capture, Reconstruction, Calibration, np.ndarray]:
+    """A capture with depth images, its features, the calibration, and the true depth."""
+    folder, draw = tmp_path_factory.mktemp("depth"), np.random.default_rng(0)
+    base_from_camera = looking_at_table(12)
+    true = np.stack([cast_depth(pose, INTRINSICS) for pose in base_from_camera])
+    wrong = OFF * true + NOISE_PER_M * true**2 * draw.normal(size=true.shape)
+    wrong[:, 50:60, 100:120] = 0
+    names = tuple(f"depth/{k}.png" for k in range(len(true)))
+    for name, depth in zip(names, wrong, strict=True):
+        write_bytes(folder / name, encode_png(np.rint(1e3 * depth).clip(0, 65535).astype(np.uint16)))
+    gripper = base_from_camera @ inverse(X)
+    gripper[:, :3, 3] += 3e-4 * draw.normal(size=(12, 3))
+    facts = {"image_size": (WIDTH, HEIGHT), "intrinsics": INTRINSICS, "depths": names}
+    capture = capture_of(gripper, folder=folder, **facts)
+    base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
+    cameras = inverse(base_from_recon) @ base_from_camera
+    cameras[:, :3, 3] /= SCALE
+    return capture, _reconstruction(cameras, true, draw), solve_hand_eye(gripper, cameras), true
+
+
+def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Generator) -> Reconstruction:
+    count = 150
+    image = np.repeat(np.arange(len(true)), count)
+    v, u = draw.integers(1, HEIGHT - 1, image.shape), draw.integers(1, WIDTH - 1, image.shape)
+    hit = true[image, v, u] > 0
+    image, v, u = image[hit], v[hit], u[hit]
+    z = true[image, v, u] / SCALE * (1 + 1e-3 * draw.normal(size=len(u)))
+    points = np.stack(
+        [apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(INTRINSICS)[v, u], strict=True)]
     )
-    monkeypatch.setattr(lengths, "depth_check", lambda *_: measured)
-    hand_eye, _ = calibrated(Sheet())
-    named = of_kind(hand_eye, FindingKind.SCALES)
-    assert named.details["other"] == "depth camera" and named.severity == "warns" and hand_eye.converged
-    assert "the depth camera contradict each other by 8.3 ± 2.0 %" in sentence(named)
+    x_px, point = np.stack([u, v], 1).astype(float), np.arange(len(image))
+    tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
+    maps = maps_of(np.zeros((*true.shape, 3)), INTRINSICS, **no_depth(true.shape))
+    return reconstruction_of(cameras, intrinsics=INTRINSICS, tracks=tracks, backend="cast", pointmaps=maps)
+
+
+def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tuple):
+    capture, reconstruction, hand_eye, _ = measured
+    check = depth_check(capture, reconstruction, hand_eye)
+    assert check is not None and check.images == 12 and check.features > 500
+    assert check.off_percent == pytest.approx(3.0, abs=min(3 * check.std_percent, 0.5))
+    depth = np.array([0.65, 0.75])
+    noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
+    assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
+    assert (check.std_m(depth) > noise).all()
+    content = replace(hand_eye, depth_check=check)
+    said = f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %"
+    assert f"Depth camera: scale error, compared with the robot: {said}" in details(content)
+    assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
+    assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None
+
+
+def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured: tuple):
+    capture, reconstruction, hand_eye, true = measured
+    hand_eye = with_depth(capture, reconstruction, hand_eye)
+    mapped, notes = with_measured_depth(capture, reconstruction, hand_eye.depth_check, hand_eye.scale)
+    found = mapped.dense
+    assert not notes and (found.reason == np.where(found.confidence > 0, MATCHED, 0)).all()
+    there = found.confidence > 0
+    assert there.mean() > 0.5 * (true > 0).mean() and not there[:, 51:59, 101:119].any()
+    z = hand_eye.scale * np.stack(
+        [
+            apply(inverse(c), p)[..., 2]
+            for c, p in zip(mapped.recon_from_camera, found.points_in_recon, strict=True)
+        ]
+    )
+    off, sigma = (z - true)[there], hand_eye.scale * np.asarray(found.depth_std)[there]
+    assert abs(np.median(off / true[there])) < 3e-3  # 3 % before
+    assert (np.abs(off) < sigma).mean() > 0.6 and (np.abs(off) < 3 * sigma).mean() > 0.97
+
+
+def test_what_several_images_show_stays_where_the_depth_camera_shows_otherwise(measured: tuple):
+    capture, reconstruction, hand_eye, true = measured
+    hand_eye = with_depth(capture, reconstruction, hand_eye)
+    # A sheet that depth cameras see through: half of the matched depth lies 10 cm nearer; filled planes elsewhere.
+    nearer = true.copy()
+    nearer[:, :, : WIDTH // 2] -= 0.1
+    matched = (true > 0.2).astype(float)
+    points = np.stack(
+        [
+            apply(c, d[..., None] / SCALE * rays(INTRINSICS))
+            for c, d in zip(reconstruction.recon_from_camera, nearer, strict=True)
+        ]
+    )
+    reason = np.where(matched > 0, MATCHED, 0).astype(np.uint8)
+    reason[:, :20] = np.where(matched[:, :20] > 0, PRIOR, 0)
+    std = np.full(true.shape, 5e-4 / SCALE)
+    dense = replace(
+        reconstruction.dense, points_in_recon=points, confidence=matched, reason=reason, depth_std=std
+    )
+    mapped, notes = with_measured_depth(
+        capture, replace(reconstruction, pointmaps=dense), hand_eye.depth_check, hand_eye.scale
+    )
+    found = mapped.dense
+    assert notes and "differ" in notes[0]
+    left = np.zeros(true.shape, bool)
+    left[:, 20:, : WIDTH // 2] = matched[:, 20:, : WIDTH // 2] > 0
+    assert (found.points_in_recon == points)[left].mean() > 0.99
+    given_way = (found.reason == MATCHED) & (reason == PRIOR)
+    assert given_way.sum() > 0.5 * (reason == PRIOR).sum()
+    assert (np.asarray(found.depth_std) <= std + 1e-12)[(reason == MATCHED)].all()
+
+
+def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
+    capture, reconstruction, hand_eye, _ = measured
+    check = depth_check(capture, reconstruction, hand_eye)
+    assert check is not None
+    found, notes = with_measured_depth(
+        capture, reconstruction, replace(check, off_percent=900.0), hand_eye.scale
+    )
+    assert found is reconstruction and "+900 % off by the robot" in notes[0]
+    _, notes = with_measured_depth(capture, reconstruction, hand_eye.depth_check, hand_eye.scale)
+    assert "the robot cannot tell" in notes[0]
+
+
+def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
+    folder = tmp_path / "capture"
+    frames = []
+    for k in range(4):
+        write_bytes(folder / f"images/{k}.png", encode_png(np.full((20, 30, 3), 50 * k, np.uint8)))
+        write_bytes(folder / f"depth/{k}.png", encode_png(np.full((20, 30), 700 + k, np.uint16)))
+        pose = transform(rotation_exp(np.array([0, 0.1 * k, 0])), np.array([0.1 * k, 0, 0.3]))
+        frames.append(
+            {"image": f"images/{k}.png", "base_from_gripper": pose.tolist(), "depth": f"depth/{k}.png"}
+        )
+    del frames[3]["depth"]
+
+    def written(**changed: object) -> Path:
+        content = {"frames": [frames[0] | changed, *frames[1:]], "intrinsics": None}
+        (folder / "capture.json").write_text(json.dumps(content))
+        return folder
+
+    capture = read_capture(written())
+    assert capture.depths == ("depth/0.png", "depth/1.png", "depth/2.png", None)
+    assert read_depth_images(folder / "depth/2.png", (30, 20))[5, 5] == pytest.approx(0.702)
+    left = read_capture(written(depth=5))
+    assert left.images == tuple(f"images/{k}.png" for k in (1, 2, 3))
+    assert any("frame 0" in note and "depth: Input should be a valid string" in note for note in left.notes)
+    for wrong, said in (("../x.png", "depth of frame 0.*leads out of"), ("depth/9.png", "not there")):
+        with pytest.raises(InputError, match=said):
+            read_capture(written(depth=wrong))
+    with pytest.raises(InputError, match="16 bits"):
+        read_depth_images(folder / "images/0.png", (30, 20))
+    with pytest.raises(InputError, match="align depth"):
+        read_depth_images(folder / "depth/0.png", (60, 40))
+    (folder / "capture.json").unlink()
+    rows = "\n".join(",".join([f"{k}.png", *map(str, [0.1 * k, 0, 0.3, 0, 0.1 * k, 0])]) for k in range(4))
+    (folder / "poses.csv").write_text("image,x,y,z,roll,pitch,yaw\n" + rows + "\n")
+    table = read_capture(folder)
+    assert table.depths == tuple(f"depth/{k}.png" for k in range(4))

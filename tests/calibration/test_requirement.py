@@ -7,21 +7,16 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.options import GRASPING, CalibrateOptions
 from jcr.calibration.record import Calibration, validated
-from jcr.calibration.requirement import advised, assumptions_of_poses
-from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.calibration.words import summary
-from jcr.capture.read import read_capture
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run import show, show_calibration
-from jcr.errors import InputError
 from jcr.estimation.point_uncertainty import within_95
 from jcr.findings import sentence
 from jcr.geometry import step_between
-from jcr.pipeline import run
 from jcr.records import PosePairs
 from jcr.report.html import report_html
-from jcr.result import RunOptions, RunResult
+from jcr.result import RunResult
 from scenes import pairs_of
 from simulation.problems import hand_eye_problem
 
@@ -38,7 +33,7 @@ def page(of: PosePairs, hand_eye: Calibration) -> str:
     return report_html(RunResult("out", capture=of, calibration=hand_eye, reconstruction=of))
 
 
-@pytest.mark.parametrize("spread", [(1, 1, 1), (3, 1, 0.1), (1, 0, 0), (10, 1, 1)])
+@pytest.mark.parametrize("spread", [(3, 1, 0.1), (1, 0, 0)])
 def test_95_percent_of_errors_are_below_the_length(spread: tuple[float, float, float]):
     errors = np.random.default_rng(0).normal(size=(100_000, 3)) * spread
     length = within_95(np.diag(np.square(spread).astype(float)))
@@ -82,20 +77,6 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
 
 
-def test_a_scale_that_was_known_is_not_promised_again():
-    problem = hand_eye_problem(np.random.default_rng(5), 8, robot_noise=NOISE)
-    cameras = problem.recon_from_camera.copy()
-    cameras[:, :3, 3] *= problem.scale
-    given = pairs_of(problem.base_from_gripper, cameras, images=tuple("abcdefgh"), is_metric=True)
-    asked = CalibrateOptions(next_poses=2)
-    known = calibrate_pose_pairs(given, asked)
-    gripper = given.base_from_gripper
-    assumptions = assumptions_of_poses(known, gripper)
-    free = advised(known, gripper, asked, errors_of(gripper), assumptions)
-    first, other = (found.next_poses[0].expected_std for found in (known, free))
-    assert 1.02 * other[6] < first[6] and first[6] > 0.95 * np.sqrt(known.covariance[6, 6])
-
-
 @pytest.mark.slow
 def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pytest.CaptureFixture[str]):
     given, _ = pairs(12, 12)
@@ -120,27 +101,3 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
             verdict, cause, remedy, *_ = said.out.splitlines()
             assert verdict.startswith("REJECTED (limit 0.5 mm, 0.1° not met). ")
             assert "0.5 mm and 0.1° are asked for" in cause and remedy.startswith("Remedy ")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (CalibrateOptions(require=(-1.0, 2.0)), "--require -1 2: give two positive numbers"),
-        (
-            CalibrateOptions(robot_noise=(0.5, float("nan"))),
-            "--robot-noise 0.5 nan: give two positive numbers",
-        ),
-        (CalibrateOptions(scale=0.0), "--scale 0: give a positive number"),
-        (CalibrateOptions(known_height=float("inf")), "--known-height inf: give millimetres"),
-        (CalibrateOptions(robot="ur99"), "robot ur99: not known"),
-    ],
-)
-def test_options_that_cannot_be_are_refused_before_any_work(
-    options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(
-        "jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("images were reconstructed")
-    )
-    with pytest.raises(InputError, match=message):
-        run.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
-    assert not (tmp_path / "out").exists()

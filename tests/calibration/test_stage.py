@@ -1,17 +1,29 @@
-"""The calibration stage on simulated observations: how many of them it adjusts, and in how many steps."""
+"""The calibration stage: a rejected fit is replaced, and errors of given intrinsics are considered and named."""
 
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
+from jcr.calibration.adjust import with_intrinsics_considered
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
+from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
-from jcr.geometry import retract, step_between
+from jcr.estimation.intrinsics_prior import camera_with_prior
+from jcr.estimation.problem import scale_prior
+from jcr.estimation.robot_noise import smooth_errors
+from jcr.geometry import inverse, retract, step_between, transform
+from jcr.records import Capture, Intrinsics, Reconstruction
 from places import ROOT
+from scenes import capture_of, reconstruction_of
 from simulation.faults import faulty_capture, reconstructed
+from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
 
 
 def test_the_adjustment_replaces_a_rejected_fit_from_poses():
@@ -38,3 +50,99 @@ def test_a_regular_tiling_is_repetitive_and_a_table_with_objects_is_not():
     assert share_of_twins(tiled.clip(0, 255).astype(np.uint8)) > REPETITIVE
     table = read_image(ROOT / "examples/tabletop/images/00.jpg")
     assert share_of_twins(table) < 0.5
+
+
+@pytest.mark.slow
+def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_once_it_is_considered():
+    without, considered = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)))
+        tracks = observed(problem, rng, 120, 0.1)
+        values = parameters(INTRINSICS)
+        values[:2] *= 1 + 0.005 * rng.normal()
+        values[2:4] += 0.005 * INTRINSICS.width * rng.normal(size=2)
+        given = with_parameters(INTRINSICS, values)
+        k = np.array([[given.fx, 0, given.cx], [0, given.fy, given.cy], [0, 0, 1.0]])
+        camera = []
+        for row in range(10):
+            seen = tracks.image == row
+            _, rotation, translation = cv2.solvePnP(
+                tracks.points_in_recon[tracks.point[seen]], tracks.x_px[seen], k, np.array(given.distortion)
+            )
+            camera.append(inverse(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
+        solved = solve_hand_eye(problem.base_from_gripper, camera, scale=problem.scale, scale_std=1e-3)
+        whole = with_intrinsics_considered(
+            solved,
+            problem.base_from_gripper,
+            np.array(camera),
+            tracks,
+            camera_with_prior(given),
+            (scale_prior(problem.scale, 1e-3),),
+            smooth_errors(problem.base_from_gripper),
+        )
+        off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
+        without.append(np.abs(off / np.sqrt(np.diag(solved.covariance)[:6])).max())
+        considered.append(np.abs(off / np.sqrt(np.diag(whole.covariance)[:6])).max())
+    assert max(considered) < 3 < np.median(without)
+    assert np.median(considered) > 0.3
+
+
+def pictured(
+    seed: int, images: int, intrinsics: Intrinsics | None, **motion
+) -> tuple[HandEyeProblem, Capture, Reconstruction]:
+    """Images of a camera with INTRINSICS, calibrated with `intrinsics` as given; None: none are given."""
+    rng = np.random.default_rng([seed, images])
+    problem = hand_eye_problem(
+        rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
+    )
+    tracks = observed(problem, rng, 250, 0.5)
+    capture = capture_of(problem.base_from_gripper, intrinsics=intrinsics)
+    reconstruction = reconstruction_of(
+        problem.recon_from_camera, intrinsics=intrinsics or INTRINSICS, tracks=tracks
+    )
+    return problem, capture, reconstruction
+
+
+def calibrated(
+    seed: int, images: int, intrinsics: Intrinsics | None, options: CalibrateOptions | None = None, **motion
+) -> tuple[HandEyeProblem, Calibration]:
+    problem, capture, reconstruction = pictured(seed, images, intrinsics, **motion)
+    return problem, calibrate_reconstruction(capture, reconstruction, options)
+
+
+def scaled(factor: float) -> Intrinsics:
+    return replace(INTRINSICS, fx=INTRINSICS.fx * factor, fy=INTRINSICS.fy * factor)
+
+
+def said(hand_eye: Calibration) -> str:
+    """What is said of the intrinsics."""
+    return next((text for text in hand_eye.warnings if text.startswith("the images show ")), "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("images", "motion"),
+    [(3, {}), (5, {"pattern": "translation", "deviation": np.radians(6.0)})],
+)
+def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
+    assert said(calibrated(0, images, INTRINSICS, **motion)[1]) == ""
+
+
+@pytest.mark.slow
+def test_a_wrong_focal_length_is_named_with_the_right_one() -> None:
+    factor = 1.05
+    problem, hand_eye = calibrated(0, 10, scaled(factor))
+    found = re.match(
+        r"the images show focal lengths of \(([\d.]+), [\d.]+\) ± \S+ px where \(([\d.]+), ", said(hand_eye)
+    )
+    assert found is not None
+    assert float(found[1]) == pytest.approx(INTRINSICS.fx, rel=0.01)
+    assert float(found[2]) == pytest.approx(INTRINSICS.fx * factor, abs=0.5)
+    assert hand_eye.warnings[0] == said(hand_eye)
+    # The calibration is that of the intrinsics which the images show.
+    assert hand_eye.intrinsics is not None and hand_eye.intrinsics.fx == pytest.approx(
+        INTRINSICS.fx, rel=0.01
+    )
+    off = error(problem, hand_eye.gripper_from_camera, hand_eye.scale)
+    assert (np.abs(off) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()

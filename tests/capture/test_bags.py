@@ -12,10 +12,9 @@ import capture_writers as writers
 import jcr
 from jcr.capture.images import encode_png, read_depth_images, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.recording import Recording, best_frames, capture_of_recording
+from jcr.capture.recording import best_frames
 from jcr.capture.ros import image_of, read_ros_depth
 from jcr.files import write_bytes
-from jcr.progress import silent
 from jcr.records import Capture
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
@@ -210,24 +209,6 @@ def test_the_best_frames_are_still_sharp_and_spread():
     # Only where the arm never stops are moving frames taken, and said to be.
     rows, notes = best_frames(poses, speed + 0.05, np.ones(400, bool), lambda rows: sharp[rows], 8)
     assert len(rows) == 8 and "stands still at 0 different views where 8" in notes[-1]
-
-
-def test_images_that_the_index_lists_and_the_recording_lacks_are_counted(tmp_path: Path):
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    recording = Recording(
-        source=Path("scan.mcap"),
-        options=ReadOptions(frames=6),
-        names=[str(row) for row in range(12)],
-        base_from_gripper=hand_eye_problem(np.random.default_rng(1), 12).base_from_gripper,
-        speed=np.tile([0.0, 0.1], 6),
-        gap_ns=np.zeros(12, np.int64),
-        images_of_rows=lambda rows: ((row, image, ".png") for row in rows[:-2].tolist()),
-        intrinsics_of_size=lambda size: None,
-    )
-    with pytest.raises(
-        jcr.InputError, match="scan.mcap: 2 of 6 images that it lists are not where its index"
-    ):
-        capture_of_recording(recording, tmp_path, silent)
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "bayer_gbrg8", "yuv422_yuy2"])

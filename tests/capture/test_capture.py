@@ -75,15 +75,6 @@ def test_standard_deviations_that_are_stated_are_read_and_written_again(capture:
     np.testing.assert_array_equal(jcr.read_capture(capture).intrinsics_std, expected)
 
 
-@pytest.mark.parametrize(
-    "given", [{"fx": -1}, {"focal": 2}, {"distortion": "none"}, {"cx": "2"}, [1, 2], {"fx": True}]
-)
-def test_standard_deviations_of_intrinsics_that_cannot_be_are_refused(capture: Path, given):
-    edit(capture, lambda content: content.update(intrinsics_std=given))
-    with pytest.raises(jcr.InputError, match="intrinsics_std"):
-        jcr.read_capture(capture)
-
-
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_images_are_rotated_as_their_exif_tag_says_with_a_note(capture: Path, orientation: int):
     exif = Image.Exif()

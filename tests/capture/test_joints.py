@@ -74,24 +74,9 @@ def test_a_joint_that_mimics_another_follows_it(tmp_path: Path):
     np.testing.assert_allclose(arm.poses(np.hstack([pan, lift])), expected, atol=1e-12)
 
 
-CHAINED = MIMIC.replace(
-    f'<axis xyz="0 1 0"/>{LIMIT}</joint>\n  <joint name="roll"',
-    f'<axis xyz="0 1 0"/>{LIMIT}<mimic joint="pan"/></joint>\n  <joint name="roll"',
-)
-"""Joint roll mimics lift, which mimics pan."""
-
-
-@pytest.mark.parametrize(
-    ("text", "leader"),
-    [
-        (MIMIC.replace('mimic joint="lift"', 'mimic joint="roll"'), "roll"),
-        (MIMIC.replace('mimic joint="lift"', 'mimic joint="nose"'), "nose"),
-        (CHAINED, "lift"),
-    ],
-    ids=["itself", "unknown", "mimic of a mimic"],
-)
-def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, text: str, leader: str):
-    assert text != MIMIC
+@pytest.mark.parametrize("leader", ["roll", "nose"])
+def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, leader: str):
+    text = MIMIC.replace('mimic joint="lift"', f'mimic joint="{leader}"')
     with pytest.raises(jcr.InputError, match=f"mimics {leader}, which is not an independent joint"):
         arm_of(tmp_path, text)
 

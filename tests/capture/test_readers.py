@@ -306,9 +306,6 @@ FAULTS: dict[str, tuple[Spoil, str, str]] = {
     "metres for millimetres": (
         lambda f: scaled(f, "rpy", RPY, 1, 57.3), "xarm", "too near for this convention's millimetres"
     ),
-    "radians for degrees": (
-        lambda f: scaled(f, "rpy", RPY, 1e3), "xarm", "too small for this convention's degrees"
-    ),
     "columns for rows": (
         lambda f: scaled(f, "franka", "image," + ",".join(CONVENTIONS["matrix"].columns)), "auto", "transposed"
     ),
@@ -337,10 +334,6 @@ FAULTS: dict[str, tuple[Spoil, str, str]] = {
 }  # fmt: skip
 """Changes of a table or its folder, and the convention with which it is read."""
 ROW_FAULTS: dict[str, tuple[int, Spoil, str]] = {
-    "word for a number": (
-        1, lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",here"),
-        "row 2, column qw: 'here' is not a number",
-    ),
     "quaternion not of unit length": (
         0, lambda f: edit_line(f, 1, lambda line: ",".join([*line.split(",")[:4], "1", "1", "0", "0"])),
         r"pose 1: its quaternion has length 1\.414",
@@ -349,9 +342,6 @@ ROW_FAULTS: dict[str, tuple[int, Spoil, str]] = {
         1,
         lambda f: edit_line(f, 2, lambda line: ",".join([*line.split(",")[:3], "812.5", *line.split(",")[4:]])),
         "pose 2 is 812.5 m from the base",
-    ),
-    "image not there": (
-        0, lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]), "99.jpg: no such image"
     ),
 }  # fmt: skip
 """Faults of one row alone, and the index of that row."""

@@ -9,32 +9,23 @@ import numpy as np
 import pytest
 
 import jcr
-from benchmarks.cameras import answered, cell_of, wanted
-from jcr.calibration.checks.camera import CameraAdjustment
-from jcr.calibration.checks.effects import effects
+from benchmarks.cameras import answered, wanted
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import added_camera
-from jcr.cell.carried import eye_to_hand, refined
-from jcr.cell.images import CellImages
 from jcr.cell.placement import (
     CameraPlacement,
-    CamerasFile,
     CellPlacement,
-    ImageUse,
-    TransformUncertainty,
     read_cameras,
     write_cameras,
 )
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.cell.stage import place_cameras
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, Reconstruction
-from jcr.sfm.colmap import reconstruct_colmap
 from jcr.sfm.register import Registration
 from scenes import reconstruction_of
 from simulation.cells import FIXED_CAMERA, Kind, cell_problem
@@ -102,22 +93,7 @@ def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated,
 
 
 @pytest.mark.slow
-def test_a_fixed_camera_is_calibrated_by_what_the_gripper_carries(tabletop: Path, tmp_path: Path):
-    """With poses exchanged, a wrist camera before a table is a fixed camera before a table that the gripper carries."""
-    capture = jcr.read_capture(tabletop).of_rows(range(OLD))
-    carried = replace(
-        capture, base_from_gripper=inverse(capture.base_from_gripper), mount="base", joints=None, robot=None
-    )
-    seen = eye_to_hand(carried, tmp_path)
-    made = reconstruct_colmap(seen)
-    found = refined(carried, made, calibrate_reconstruction(seen, made))
-    error = step_between(found.base_from_camera, read_truth(tabletop).gripper_from_camera)
-    assert found.converged and len(made.image_index) == len(capture)
-    assert error @ np.linalg.solve(found.covariance[:6, :6], error) < 16.8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", [{"fx": 1.009, "fy": 1.009}, {"fx": 1.03, "fy": 1.03}, {"cx": 1.125}])
+@pytest.mark.parametrize("wrong", [{"fx": 1.009, "fy": 1.009}, {"fx": 1.03, "fy": 1.03}])
 def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_used(
     tabletop: Path, calibrated, wrong: dict[str, float]
 ):
@@ -153,7 +129,7 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
         )
         return placed(calibrated, camera).cameras[0]
 
-    for one in (second(5), second(4), second(4, 4)):
+    for one in (second(5), second(4, 4)):
         assert not one.converged and one.findings[0].kind is FindingKind.ONE_GRIPPER_POSE
     assert second(4, 5).findings[0].kind is FindingKind.NOT_RIGID
     both = second(4, 6)
@@ -181,42 +157,11 @@ def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(tabletop: Path,
     assert np.linalg.norm(off[:3]) < 0.01 and np.degrees(np.linalg.norm(off[3:])) < 1.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("zoom", [1.0, 1.03])
-def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_is_none(zoom: float):
-    problem = cell_problem("wrists", "white", COUNT, seed=1, points=150)
-    seen, camera = problem.observations, problem.cameras[1]
-    zoomed_from = COUNT + COUNT // 2
-    late = (seen.camera[seen.image] == 1) & (seen.image >= zoomed_from)
-    centre = np.array([camera.cx, camera.cy])
-    x_px = np.where(late[:, None], centre + zoom * (seen.x_px - centre), seen.x_px)
-    own, other = (camera_with_prior(one) for one in problem.cameras)
-    cell, state = cell_of(problem, [own, replace(other, mount_free=True)])
-    images = CellImages(problem=cell, state=state, observations=replace(seen, x_px=x_px))
-    answer, place = images.solved(), wanted(problem)["gripper_from_second"]
-    second = CameraAdjustment(
-        adjusted=answer,
-        adjust=lambda _, free, bent: images.with_freed(1, free, None, bent).solved(),
-        arm=None,
-        names=[f"{k}.png" for k in range(COUNT)],
-        is_given=True,
-        prior=images.problem.cameras[1],
-        std=np.sqrt(np.diag(answer.transform(place)[1])),
-        camera=1,
-        place=place,
-    )
-    _, found = effects(second)
-    assert [(one.kind, one.images) for one in found] == [(FindingKind.ZOOM, ("3.png", "4.png"))] * (zoom != 1)
-    for one in found:
-        assert one.value == pytest.approx(zoom - 1, abs=0.004) and one.shift is not None
-
-
 @pytest.mark.parametrize(
     ("faults", "kind", "size"),
     [
         (Faults(), None, 0.0),
         (Faults(slip=(0.005, 0.0)), FindingKind.SLIP, 0.005),
-        (Faults(slip=(0.012, 0.07)), FindingKind.SLIP, 0.012),
         (Faults(delay_s=0.05, view_s=1.0), FindingKind.DELAY, 0.05),
     ],
 )
@@ -360,31 +305,3 @@ def test_cameras_that_cannot_be_are_refused_in_one_line(
     with pytest.raises(jcr.InputError, match=message) as refusal:
         read(folder)
     assert "\n" not in str(refusal.value)
-
-
-def test_images_of_a_capture_that_changed_keep_their_places_by_name():
-    """An image that was put before the others moves none of them to another gripper pose."""
-    poses = {row: transform(np.eye(3), np.array([0.1 * row, 0.0, 0.0])) for row in range(3)}
-    images = [
-        ImageUse(image=name, used=name != "b", points=9, reprojection_px=None, reason=None) for name in "abc"
-    ]
-    found = CameraPlacement(
-        name="wrist2",
-        mount="gripper",
-        arm=None,
-        gripper_from_camera=np.eye(4),
-        uncertainty=TransformUncertainty.of(1e-6 * np.eye(6)),
-        pictures=images,
-        verdict="accepted",
-        converged=True,
-        warnings=[],
-    )
-    camera = CellCamera(
-        name="wrist2",
-        mount="gripper",
-        images=("new", "a", "c"),
-        image_size=(640, 480),
-        frame=np.array([2, 0, 1]),
-    )
-    placed = CamerasFile(cameras=[found], arms=[], version="0").base_from_camera(camera, found, poses)
-    assert [pose[0, 3] for pose in placed] == [0.0, 0.1]

@@ -12,7 +12,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
 from jcr.capture.images import encode_png
-from jcr.depth.densify import choose_neighbours, dense_pointmaps, densify, sweep_planes
+from jcr.depth.densify import (
+    choose_neighbours,
+    dense_pointmaps,
+    densify,
+    sweep_planes,
+)
+from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.depth.options import DepthOptions
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
@@ -120,18 +126,8 @@ def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None)
     return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
 
 
-def test_the_number_of_threads_changes_no_bit(
-    scene: Scene, dense: Pointmaps, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", 1)
-    tight = _dense(scene, scene.recon_from_camera, scene.tracks)
-    for name in ("points_in_recon", "confidence", "reason", "depth_std"):
-        np.testing.assert_array_equal(getattr(tight, name), getattr(dense, name))
-
-
-@pytest.mark.parametrize("threads", [1, 2])
 def test_memory_that_ends_in_a_worker_thread_ends_the_stage(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, threads: int
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The buffers of the threads are fewer than the images: one that is not returned blocks the stage for ever."""
 
@@ -139,7 +135,7 @@ def test_memory_that_ends_in_a_worker_thread_ends_the_stage(
         raise MemoryError("Unable to allocate 5.62 MiB")
 
     monkeypatch.setattr("jcr.depth.matched.peaks", exhausted)
-    monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", threads)
+    monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", 2)
     with pytest.raises(MemoryError, match="Unable to allocate"):
         _dense(scene, scene.recon_from_camera, scene.tracks)
 
@@ -240,3 +236,11 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
         np.testing.assert_array_equal(getattr(made.dense, name)[by_name], getattr(dense, name))
     assert densify(capture, made) is made
+    # Its file gives it back.
+    file = tmp_path / "depth.npz"
+    write_depth(file, made, "a")
+    assert is_made_from(file, "a") and not is_made_from(file, "b")
+    found = read_depth(file, sparse, capture)
+    for name in ("points_in_recon", "confidence", "reason", "depth_std", "colors"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(made.dense, name))
+    assert (read_depth(file, sparse, None).colors == 128).all()

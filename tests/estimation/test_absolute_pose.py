@@ -52,7 +52,7 @@ def test_half_of_the_points_may_be_wrong():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("point_std", "noise_px"), [(0.0, 0.5), (2e-4, 0.3)])
+@pytest.mark.parametrize(("point_std", "noise_px"), [(2e-4, 0.3)])
 def test_the_covariance_holds_with_that_of_the_points(point_std: float, noise_px: float):
     """Squared distances from the truth in the stated covariance have the mean of chi squared with 6 degrees."""
     rng = np.random.default_rng(3)

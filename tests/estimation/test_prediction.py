@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.coverage import FACTOR, predicted
+from in_process import run_jcr
 from jcr.calibration.record import read_calibration
 from jcr.calibration.requirement import better_poses, next_poses, predictions
 from jcr.calibration.robot_errors import errors_of
 from jcr.estimation.prediction import assumed, predict, typical_camera
-from jcr.pipeline.check import check_capture
+from jcr.pipeline.check import Examination, check_capture
 from jcr.records import Intrinsics, NextPose
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -27,9 +29,20 @@ def test_what_is_expected_is_what_is_reported():
 
 
 @pytest.mark.slow
-def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Path, done: Path):
-    uncertainty = read_calibration(done).uncertainty
-    found = check_capture(tabletop).expected
+def test_check_finds_the_bundled_capture_good_and_expects_what_its_run_reports(
+    tabletop: Path, done: Path, monkeypatch: pytest.MonkeyPatch
+):
+    kept: list[Examination] = []
+
+    def noted(*arguments: Any, **options: Any) -> Examination:
+        kept.append(check_capture(*arguments, **options))
+        return kept[-1]
+
+    monkeypatch.setattr("jcr.pipeline.check.check_capture", noted)
+    good = run_jcr("check", tabletop, "--quiet", "--suggest", 1)
+    assert good.returncode == 0 and good.stdout.startswith("ACCEPTED") and not good.stderr
+    assert "good to calibrate" in good.stdout and "\nAdd pose 1  " in good.stdout
+    uncertainty, found = read_calibration(done).uncertainty, kept[0].expected
     assert uncertainty is not None and uncertainty.seen is not None
     assert found is not None and found.seen is not None
     assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN

@@ -1,7 +1,9 @@
-"""The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
+"""The calibration from poses: known answers, gauges of the closed form, outliers, coverage, degenerate motions."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import chi2
 
 import jcr
@@ -10,7 +12,7 @@ from jcr.estimation.closed_form import closed_form
 from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
 from jcr.findings import FindingKind
-from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
@@ -53,7 +55,7 @@ def test_the_order_of_images_does_not_matter_to_the_last_bit():
 
 @pytest.mark.parametrize(
     ("count", "wrong"),
-    [(10, 3), pytest.param(15, 4, marks=pytest.mark.slow), pytest.param(20, 6, marks=pytest.mark.slow)],
+    [(10, 3), pytest.param(20, 6, marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
 def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
@@ -86,7 +88,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
     inside, larger = np.zeros(2), []
-    runs = 100
+    runs = 60
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
         solved = solve_hand_eye(
@@ -116,7 +118,7 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
 
 @pytest.mark.slow
 def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
-    given, inside, runs = (1e-4, np.radians(0.02)), 0, 50
+    given, inside, runs = (1e-4, np.radians(0.02)), 0, 30
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([8, seed]), 6, "varied", given, NOISE)
         solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
@@ -125,8 +127,8 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         # Whether at random or alike, six images hardly tell.
         assert min(np.divide(solved.robot_noise.together, given)) > 1.5
         assert any("more than the given robot noise" in warning for warning in solved.warnings)
-    # Binomial: 47.5 ± 1.5; none where the given noise is believed.
-    assert inside >= 42
+    # Binomial: 28.5 ± 1.2; none where the given noise is believed.
+    assert inside >= 25
 
 
 def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
@@ -183,8 +185,6 @@ UNSEEN = {
     [
         ((0.0, 0.0), 0.0),
         (NOISE, 3.0),
-        pytest.param((0.0, 0.0), 3.0, marks=pytest.mark.slow),
-        pytest.param(NOISE, 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
@@ -276,3 +276,78 @@ def test_growing_errors_are_weighed_and_in_the_uncertainty():
         squared.append(float(off @ np.linalg.solve(solved.covariance[:6, :6], off)))
     assert np.median(metres[True]) < 0.5 * np.median(metres[False])
     assert np.median(squared) < 12.6 and max(squared) < 25
+
+
+repeatable = settings(derandomize=True, deadline=None, max_examples=30)
+seeds = st.integers(0, 2**32 - 1)
+counts = st.integers(3, 9)
+angles = st.sampled_from([0.0, 1e-9, 0.7, np.pi - 1e-9, np.pi]) | st.floats(0, np.pi)
+
+
+def noisy(seed: int, count: int):
+    """Gripper and camera poses that belong together up to the robot pose noise, and the generator for what follows."""
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count, robot_noise=(1e-4, 2e-4))
+    return problem.base_from_gripper, problem.recon_from_camera, rng
+
+
+def any_rigid(rng: np.random.Generator, angle: float):
+    """A transform that rotates by `angle` about some axis."""
+    axis = rng.normal(size=3)
+    return transform(rotation_exp(angle * axis / np.linalg.norm(axis)), rng.normal(size=3))
+
+
+def assert_same(found, expected, tolerance: float = 1e-7):
+    (x, scale, z), (x_expected, scale_expected, z_expected) = found, expected
+    assert np.abs(step_between(x, x_expected)).max() < tolerance
+    assert scale == pytest.approx(scale_expected, rel=tolerance)
+    assert np.abs(step_between(z, z_expected)).max() < 10 * tolerance
+
+
+@repeatable
+@given(seeds, counts, angles)
+def test_another_base_moves_base_from_recon_alone(seed, count, angle):
+    gripper, camera, rng = noisy(seed, count)
+    x, scale, z = closed_form(gripper, camera)
+    other = any_rigid(rng, angle)
+    assert_same(closed_form(other @ gripper, camera), (x, scale, other @ z))
+
+
+@repeatable
+@given(seeds, counts, angles)
+def test_another_frame_on_the_gripper_moves_x_alone(seed, count, angle):
+    # Without noise: the least squares weigh errors where the gripper's origin is.
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    x, scale, z = closed_form(gripper, camera)
+    tool = any_rigid(rng, angle)
+    assert_same(closed_form(gripper @ tool, camera), (inverse(tool) @ x, scale, z))
+
+
+@repeatable
+@given(seeds, st.integers(4, 9), st.sampled_from([0.0, 1e-12, 1e-7, 1e-3]))
+def test_half_rotates_between_images_are_like_any_other_motion(seed, count, short_of):
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, count)
+    gripper, x = problem.base_from_gripper.copy(), problem.gripper_from_camera
+    for k in range(1, count, 2):
+        gripper[k] = gripper[k - 1] @ any_rigid(rng, np.pi - short_of)
+    z = any_rigid(rng, 1.0)
+    camera = scale_translation(inverse(z) @ gripper @ x, 1 / problem.scale)
+    assert_same(closed_form(gripper, camera), (x, problem.scale, z), 1e-6)
+
+
+@repeatable
+@given(seeds)
+def test_half_rotates_alone_are_solved(seed):
+    """About axes at right angles, which makes all motions rotations by 180°: the sines of all vanish together."""
+    rotations = np.pi * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    rng = np.random.default_rng(seed)
+    gripper = any_rigid(rng, 1.0) @ transform(rotation_exp(rotations), rng.normal(size=(3, 3)))
+    x, z = any_rigid(rng, rng.uniform(0, np.pi)), any_rigid(rng, 1.0)
+    camera = inverse(z) @ gripper @ x
+    gripper = retract(gripper, 1e-6 * rng.normal(size=(3, 6)))
+    found, _, base = closed_form(gripper, camera)
+    # A rotation by 180° has an axis without a sign: an answer must explain the rotations, and may be another.
+    assert np.abs((gripper @ found - base @ camera)[:, :3, :3]).max() < 5e-6

@@ -180,26 +180,10 @@ def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path)
         np.testing.assert_allclose(robot.get_transform(child, parent), PARENT_FROM_CHILD, atol=1e-9)
 
 
-def test_easy_handeye2_of_a_fixed_camera_names_its_base_and_effector(done: Path, tmp_path: Path):
-    content = json.loads((done / "calibration.json").read_text())
-    moved = {"base_from_camera": "gripper_from_camera", "gripper_from_object": "base_from_recon"}
-    fixed = {"mount": "base", "with_given_intrinsics": None} | {
-        new: content.pop(old) for new, old in moved.items()
-    }
-    (tmp_path / "calibration.json").write_text(json.dumps(content | fixed))
-    frames = {"parent_frame": "flange", "base_frame": "arm_base"}
-    written = yaml.safe_load(export_run(tmp_path, "easy_handeye2", options=frames).read_text())
-    named = written["parameters"]
-    assert named["calibration_type"] == "eye_on_base"
-    assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("arm_base", "flange")
-    position = [written["transform"]["translation"][axis] for axis in "xyz"]
-    assert position == [row[3] for row in fixed["base_from_camera"][:3]]
-
-
-@pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"])
-def test_names_that_are_no_frames_are_refused(name: str):
-    with pytest.raises(InputError, match="frame"):
-        ros.CameraMount(parent="tool0", child=name, parent_from_child=PARENT_FROM_CHILD)
+def test_names_that_are_no_frames_are_refused():
+    for name in ("", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"):
+        with pytest.raises(InputError, match="frame"):
+            ros.CameraMount(parent="tool0", child=name, parent_from_child=PARENT_FROM_CHILD)
     with pytest.raises(InputError, match="different"):
         ros.CameraMount(parent="tool0", child="tool0", parent_from_child=PARENT_FROM_CHILD)
     with pytest.raises(InputError, match="root"):
@@ -305,20 +289,6 @@ def test_nerfstudio_cameras_see_the_points_where_the_images_do(
     np.testing.assert_allclose(np.asarray(first.vertices), cloud.points_in_base, atol=1e-6)  # pyright: ignore
 
 
-def test_images_rotated_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):
-    from jcr.export.views import write_colmap
-
-    tag = Image.Exif()
-    tag[0x0112] = 3
-    source = views.folder / views.images[0]
-    pixels = read_image(source)
-    Image.fromarray(pixels).save(source, exif=tag)
-    write_colmap(tmp_path / "model", views, provenance("base_link"), ExportOptions(link_images=True))
-    copied = tmp_path / "model" / "images" / "left_0.png"
-    assert not copied.is_symlink() and (copied.parent / "left_1.png").is_symlink()
-    np.testing.assert_array_equal(read_image(copied), pixels[::-1, ::-1])
-
-
 def export(done: Path, name: str, path: Path, *options: object) -> Path:
     assert dispatch(["export", str(done), name, str(path), *map(str, options)]) == 0
     return path
@@ -408,13 +378,13 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMa
     with np.load(export(done, "spheres", tmp_path / "spheres.npz")) as file:
         centers, radii, frame = file["centers"], file["radii"], str(file["frame"])
     assert frame == "base_link" and radii.min() > 0 and len(radii) < 3000
-    x = np.random.default_rng(3).uniform(*scene.box, (100_000, 3))
+    x = np.random.default_rng(3).uniform(*scene.box, (40_000, 3))
     distance = scene.query(x, "free").distance
     covered = np.zeros(len(x), bool)
     places = KDTree(x)
     for center, radius in zip(centers, radii, strict=True):
         covered[places.query_ball_point(center, radius)] = True
-    assert covered[distance <= 0].all() and (distance <= 0).sum() > 1000
+    assert covered[distance <= 0].all() and (distance <= 0).sum() > 400
     # The default excess is 2 cm; the interpolated distance changes a little faster than one goes.
     assert distance[covered].max() < 0.025
 
@@ -495,9 +465,7 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
     ("arguments", "words"),
     [
         (["fbx"], "'fbx'"),
-        (["glb"], "jcr map"),
         (["ply"], "jcr map"),
-        (["nerfstudio"], "jcr calibrate"),
         (["colmap"], "jcr calibrate"),
         (["urdf", "--child-frame", "tool0"], "different"),
         (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
@@ -521,7 +489,6 @@ def test_what_cannot_be_exported_is_one_line(
     ("options", "words"),
     [
         (["octomap", "x.bt", "--voxel-size", "0.0005"], "million"),
-        (["octomap", "x.bt", "--voxel-size", "-1"], "voxels of"),
         (["esdf", "x.npz", "--voxel-size", "5"], "voxels of"),
         (["spheres", "x.npz", "--excess", "0"], "voxels of"),
         (["esdf", ".", "--voxel-size", "0.05"], "folder"),

@@ -1,4 +1,4 @@
-"""Faults of folders and files at the command line: one line with a remedy, and results that were there stay.
+"""Faults of folders and files, and odd surroundings, at the command line: one line with a remedy, earlier results stay.
 
 Faults of captures are in tests/capture/test_capture.py, those of weights in tests/pointmaps/dust3r/test_weights.py.
 """
@@ -8,23 +8,34 @@ import json
 import os
 import re
 import shutil
+import signal
+import stat
 import subprocess
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from capture_writers import write_easy_handeye2
 from corpus import small_capture as noise_capture
+from in_process import run_jcr
 from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch
+from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
+from jcr.geometry import scale_translation
 from jcr.pipeline import stages
-from jcr.records import Reconstruction
+from jcr.records.npz import read_reconstruction
 from jcr.result import RunResult
+from simulation.problems import hand_eye_problem
+from waiting import until
+
+pytestmark = pytest.mark.slow
 
 COUNT = 6
 
@@ -98,11 +109,9 @@ def nothing(path: Path) -> None:
 CALIBRATE, TOO_LONG = "calibrate capture out --quiet", r"[45]\.\d ± \d\.\d % too long for a ur5e"
 QUERY = "query done points.csv"
 FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
-    "empty folder": ("capture", emptied, CALIBRATE, "no capture.json"),
     "no such folder": ("capture", shutil.rmtree, CALIBRATE, "no such"),
     "positions too long": ("capture/capture.json", too_long, CALIBRATE, f"{TOO_LONG}.*check the unit"),
     "positions too long, checked": ("capture/capture.json", too_long, "check capture --poses-only", TOO_LONG),
-    "no JSON": ("capture/capture.json", lambda p: p.write_text("frames: []"), CALIBRATE, "not JSON"),
     "output that nobody may write": (
         "out",
         nothing,
@@ -169,15 +178,6 @@ def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(
     assert state(copy) == before
 
 
-@pytest.mark.parametrize("name", ["calibration.json", "log.txt", "report.html", "run.json"])
-def test_a_folder_where_a_result_belongs_is_named(tmp_path: Path, sound: Path, capsys, name: str):
-    (tmp_path / "out" / name).mkdir(parents=True)
-    assert dispatch(["calibrate", str(sound), str(tmp_path / "out"), "--backend", "colmap", "--quiet"]) == 2
-    said = capsys.readouterr().err
-    assert f"{name}: Is a directory" in said and said.count("\n") == 1
-    assert not list((tmp_path / "out").rglob("*.part*"))
-
-
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, small_done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(small_done, out)
@@ -207,28 +207,11 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     assert not (out / "run.json").exists()
 
 
-ARRAYS = {
-    "jcr.reconstruction/9": {
-        "about", "image_index", "recon_from_camera", "tracks.image", "tracks.point", "tracks.points_in_recon",
-        "tracks.std_px", "tracks.x_px",
-    },
-    "jcr.depth/2": {"about", "confidence", "depth", "filled", "matched", "relative_std"},
-}  # fmt: skip
-
-
 def test_a_reconstruction_of_another_version_is_distinguished(tmp_path: Path, small_done: Path, capsys):
-    """And the name of the format changes with what it holds."""
+    out = shutil.copytree(small_done, tmp_path / "out")
     with np.load(small_done / "reconstruction.npz") as file:
         arrays = dict(file)
-    about = json.loads(str(arrays["about"]))
-    assert ARRAYS[about["format"]] == set(arrays)
-    assert set(about["reconstruction"]) == {field.name for field in fields(Reconstruction)}
-    with np.load(small_done / "depth.npz") as file:
-        assert ARRAYS[json.loads(str(file["about"]))["format"]] == set(file)
-    out = tmp_path / "out"
-    shutil.copytree(small_done, out)
-    del about["reconstruction"]["metric_std"]
-    old = json.dumps(about | {"format": "jcr.reconstruction/1"})
+    old = json.dumps(json.loads(str(arrays["about"])) | {"format": "jcr.reconstruction/1"})
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
@@ -256,3 +239,123 @@ def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, small_done: Path
         assert read_calibration(disk).converged
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+RESULTS = ("calibration.json", "log.txt")
+ODD = "a b'c\"d $HOME `x` *;&|<é>"
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is unusual, and how the command must end."""
+
+    status: int = 0
+    said: str = ""
+    shell: str = '"$@"'
+    """How it is started."""
+    without: tuple[str, ...] = ()
+    environment: dict[str, str] = field(default_factory=dict)
+    folder: str = "place"
+    check: Callable[[Path], bool] = lambda out: True
+
+
+def private(out: Path) -> bool:
+    return all(stat.S_IMODE((out / name).stat().st_mode) == 0o600 for name in RESULTS)
+
+
+CASES = {
+    "no HOME in locale C": Surroundings(
+        without=("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME"),
+        environment={"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ),
+    "paths with spaces and quotes, umask 077 and closed stdin": Surroundings(
+        shell='umask 077; "$@" <&-', folder=ODD, check=private
+    ),
+    "closed stdout": Surroundings(shell='"$@" >&-'),
+    "full stdout": Surroundings(2, "No space left", shell='"$@" >/dev/full'),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path: Path):
+    case = CASES[name]
+    problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=(3e-4, 1e-3))
+    samples = write_easy_handeye2(
+        tmp_path / ODD, problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale)
+    )
+    out = tmp_path / case.folder / "out"
+    environment = {key: value for key, value in os.environ.items() if key not in case.without}
+    command = [sys.executable, "-m", "jcr", "calibrate", str(samples), str(out)]
+    finished = subprocess.run(
+        ["sh", "-c", case.shell, "sh", *command],
+        env=environment | case.environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+    assert finished.returncode == case.status, finished.stderr
+    assert "Traceback" not in finished.stderr and case.said in finished.stderr
+    # What was found is kept, whatever became of the words about it.
+    assert read_calibration(out).converged and all((out / name).is_file() for name in RESULTS)
+    assert case.check(out) and not list(out.glob("*.part*"))
+
+
+MOMENTS: dict[str, Callable[[int, Path], bool]] = {
+    "while libraries load": lambda process, _: "pycolmap" in Path(f"/proc/{process}/maps").read_text(),
+    "while COLMAP works": lambda _, temporary: any(temporary.glob("jcr-colmap-*/*")),
+}
+"""Whether it has come: of the process's number and the folder of its temporary files. Both are after the lock."""
+
+
+@pytest.mark.parametrize(("moment", "number"), [*zip(MOMENTS, (signal.SIGINT, signal.SIGTERM), strict=True)])
+def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
+    moment: str, number: signal.Signals, small_capture: Path, tmp_path: Path
+):
+    out, temporary = tmp_path / "out", tmp_path / "temporary"
+    temporary.mkdir()
+    words = ["calibrate", str(small_capture), str(out), "--no-dense", "--quiet", "--json"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "jcr", *words],
+        env=os.environ | {"TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        until(lambda: running.poll() is not None or MOMENTS[moment](running.pid, temporary))
+        running.send_signal(number)
+        _, printed = running.communicate(timeout=60)
+    # Python itself ends by the signal, which shells show as 130, where it was interrupted in what it compiled from
+    # a string, as dataclasses are.
+    assert running.returncode in (-number, 128 + number, 130) and "Traceback" not in printed
+    if number is signal.SIGINT:
+        assert printed.startswith("error: interrupted") and printed.count("\n") == 1
+        assert not out.exists() and not list(temporary.iterdir()), "nothing came of it"
+    if moment == "while COLMAP works":
+        finished = run_jcr(*words)
+        assert finished.returncode == 0 and len(json.loads(finished.stdout)["images"]) == 5, finished.stderr
+        assert not list(out.glob(".*.part*"))
+
+
+def test_too_little_address_space_is_one_line(tmp_path: Path):
+    finished = subprocess.run(
+        ["sh", "-c", 'ulimit -v 1200000; "$@"', "sh", sys.executable, "-m", "jcr", "check", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert finished.returncode == 2 and finished.stderr.count("\n") == 1
+    assert finished.stderr.startswith("error: out of memory: ") and "ulimit -v" in finished.stderr
+
+
+def test_arrays_larger_than_the_memory_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Zeros pack 1000 to 1: a small file may unpack to more than the machine has."""
+    file = tmp_path / "reconstruction.npz"
+    np.savez_compressed(file, about=np.array("{}"), image_index=np.zeros(1_000_000))
+    assert file.stat().st_size < 20_000
+    monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}[name])
+    with pytest.raises(
+        InputError, match=r"reconstruction\.npz: unpacks to 0\.0 GB, this machine has 0\.0 GB"
+    ):
+        read_reconstruction(file)

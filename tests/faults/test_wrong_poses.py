@@ -64,10 +64,10 @@ def first_kinds(capture: Capture, reconstruction: Reconstruction) -> tuple[list[
     ("name", "what"),
     [
         ("cobotta_stage", "permuted"),
-        ("ur_snack_table", "of another capture"),
+        pytest.param("ur_snack_table", "of another capture", marks=pytest.mark.long),
         # Five of its poses are then permuted in one cycle, and the other ten images agree.
-        ("elephant_floor", "second half permuted"),
-        *(("cobotta_stage", mistake) for mistake in ("inverses", "w first", "Euler order")),
+        pytest.param("elephant_floor", "second half permuted", marks=pytest.mark.long),
+        *(("cobotta_stage", mistake) for mistake in ("inverses", "Euler order")),
     ],
 )
 def test_the_first_message_names_the_poses(real_captures: Path, name: str, what: str):

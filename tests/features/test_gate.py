@@ -1,14 +1,19 @@
-"""Two-view geometries and X's rotation by the robot: right pairs pass, wrong ones do not, planes have two readings."""
+"""Pairs of images: two-view geometries, agreement with the robot's motions, rotation of X, and which are matched."""
 
 import numpy as np
 import pytest
+from jaxtyping import Float, Int
+from numpy import ndarray
 
+from jcr.camera import project
 from jcr.estimation.closed_form import motions
-from jcr.features.gate import Pair, judge, rolls, rotation_of_x
-from jcr.features.matchers import hidden, still_cells
-from jcr.features.pairs import translation_of_x
+from jcr.features.gate import Pair, judge, rotation_of_x
+from jcr.features.matchers import hidden, matched, still_cells
+from jcr.features.pairs import near_pairs, translation_of_x, viewpoints
 from jcr.features.two_view import TwoViewMotion, readings
-from jcr.geometry import rotation_angle, rotation_exp, transform
+from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
+from jcr.records import Intrinsics
+from jcr.sfm.model import colmap_camera
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 N = 8
@@ -112,18 +117,6 @@ def test_the_second_reading_of_a_plane_is_tried():
     assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).readings[0] is right
 
 
-def test_rotated_upright_no_image_is_rotated_against_another():
-    rng = np.random.default_rng(0)
-    base_from_first = rotation_exp(np.array([np.pi, 0.0, 0.0]))  # looking down
-    rotation = rng.uniform(-np.pi, np.pi, 12)
-    about_axis = rotation_exp(np.outer(rotation, [0.0, 0.0, 1.0]))
-    upright = rolls(base_from_first @ about_axis)
-    back = rotation_exp(np.outer(upright, [0.0, 0.0, 1.0]))
-    # What image 0, rotated, sees at an angle, every other one, rotated, sees at the same.
-    relative = back[0] @ about_axis[0].T @ about_axis @ np.swapaxes(back, 1, 2)
-    assert np.degrees(np.asarray(rotation_angle(relative)).max()) < 1e-6
-
-
 def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
     rng = np.random.default_rng(0)
     fixed = rng.uniform([200, 300], [280, 470], (60, 2))
@@ -141,3 +134,64 @@ def test_one_axis_fixes_nothing():
     x = rotation_exp(np.array([0.3, -0.2, 1.0]))
     gripper = rotation_exp(np.linspace(0.2, 1.5, 10)[:, None] * np.array([0.0, 0.0, 1.0]))
     assert rotation_of_x(gripper, x.T @ gripper @ x, np.full(10, 0.02)) is None
+
+
+def repeated(places: int, repeats: int) -> np.ndarray:
+    """Return gripper poses of viewpoints on a line of 5 cm steps, each taken again and again within 0.1 mm."""
+    rng = np.random.default_rng(0)
+    x = np.column_stack([0.05 * np.arange(places), np.zeros((places, 2))])
+    x = np.tile(x, (repeats, 1)) + rng.normal(scale=1e-4, size=(places * repeats, 3))
+    return transform(rotation_exp(rng.normal(scale=1e-3, size=(places * repeats, 3))), x)
+
+
+def test_images_of_one_viewpoint_are_no_partners():
+    viewpoint = viewpoints(motions(repeated(16, 12)))
+    assert np.array_equal(viewpoint, np.tile(np.arange(16), 12))
+    pairs = np.array(near_pairs(motions(repeated(16, 12)), 4))
+    assert (viewpoint[pairs[:, 0]] != viewpoint[pairs[:, 1]]).all()
+    for image in range(16 * 12):
+        partners = pairs[(pairs == image).any(1)]
+        others = viewpoint[np.where(partners[:, 0] == image, partners[:, 1], partners[:, 0])]
+        assert len(set(others.tolist())) >= 4
+
+
+def test_all_repeats_are_tied_together_in_proportion_to_their_number():
+    pairs = near_pairs(motions(repeated(16, 12)), 4)
+    assert len(pairs) <= 4 * 16 * 12
+    group = np.arange(16 * 12)
+    for i, j in pairs:
+        group[group == group[j]] = group[i]
+    assert (group == group[0]).all()
+
+
+INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+
+
+def keypoints(seed: int) -> list[Float[ndarray, "400 2"]]:
+    """Of 400 points in two images; row k of one is row k of the other."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-0.5, -0.4, 0.9], [0.5, 0.4, 1.7], (400, 3))
+    second = transform(rotation_exp(np.array([0.05, 0.25, 0.1])), np.array([-0.3, 0.05, 0.0]))
+    return [
+        project(INTRINSICS, apply(inverse(pose), points)) + rng.normal(scale=0.5, size=(400, 2))
+        for pose in (np.eye(4), second)
+    ]
+
+
+def rows_of(right: int, seed: int) -> Int[ndarray, "400 2"]:
+    """Matches, the first `right` of them right."""
+    rows = np.repeat(np.arange(400)[:, None], 2, axis=1)
+    rows[right:, 1] = right + np.random.default_rng(seed).permutation(400 - right)
+    return rows
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_right_matches_of_ten_are_found_and_none_make_no_pair(seed: int):
+    x_px, camera = keypoints(seed), colmap_camera(INTRINSICS, True)
+    found = matched(x_px, camera, (0, 1), rows_of(120, seed), 0, True)
+    assert found is not None
+    inside = np.asarray(found.inlier_matches)[:, 0]
+    assert (inside < 120).sum() > 0.93 * 120
+    assert (inside >= 120).sum() < 0.06 * 280, "only by chance near their epipolar line"
+    nothing = matched(x_px, camera, (0, 1), rows_of(0, seed), 0, True)
+    assert nothing is None or len(nothing.inlier_matches) < 0.1 * 400

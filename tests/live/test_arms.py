@@ -119,19 +119,11 @@ class Device:
 def test_a_device_keeps_to_size_exposure_and_focus_or_shows_what_it_does_instead():
     device = Device({})
     apply_options(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
-    assert device.values == {
-        cv2.CAP_PROP_FRAME_WIDTH: 1280,
-        cv2.CAP_PROP_FRAME_HEIGHT: 720,
-        cv2.CAP_PROP_AUTOFOCUS: 0,
-        cv2.CAP_PROP_AUTO_EXPOSURE: 1,
-        cv2.CAP_PROP_EXPOSURE: 200.0,
-        cv2.CAP_PROP_FOCUS: 30.0,
-    }
+    properties = ["FRAME_WIDTH", "FRAME_HEIGHT", "AUTOFOCUS", "AUTO_EXPOSURE", "EXPOSURE", "FOCUS"]
+    values = [device.values[getattr(cv2, f"CAP_PROP_{name}")] for name in properties]
+    assert values == [1280, 720, 0, 1, 200.0, 30.0]
+    small = Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480})
     with pytest.raises(jcr.InputError, match="--camera-size 1280 720: camera 0 gives 640x480"):
-        apply_options(
-            Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}),
-            CameraOptions((1280, 720)),
-            "0",
-        )
+        apply_options(small, CameraOptions((1280, 720)), "0")
     with pytest.raises(jcr.InputError, match="--focus 30: camera 0 stays at 7"):
         apply_options(Device({cv2.CAP_PROP_FOCUS: 7.0}), CameraOptions(focus=30.0), "0")

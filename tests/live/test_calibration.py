@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 import jcr
+from conftest import shrunk_capture
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import rotation_exp, step_between, transform
@@ -20,16 +20,26 @@ from jcr.live.calibration import LiveCalibration
 from jcr.live.page import page_content
 from jcr.live.progress import Notation, Progress, next_lines
 from jcr.live.session import SessionState
+from jcr.records import Capture
 from scripted_capture import REQUIRED, still
 
 
 @pytest.fixture(scope="module")
-def grown(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
-    """The bundled capture fed image by image, and the state after each."""
-    capture = jcr.read_capture(tabletop)
+def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Nine images of the bundled capture, 320 pixels wide."""
+    return jcr.read_capture(shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 9, 320))
+
+
+def image_of(capture: Capture, k: int) -> np.ndarray:
+    return read_image(capture.folder / capture.images[k])
+
+
+@pytest.fixture(scope="module")
+def grown(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
+    """The capture fed image by image, and the state after each."""
     folder = tmp_path_factory.mktemp("live") / "capture"
     live = LiveCalibration(folder, intrinsics=capture.intrinsics, options={"require": REQUIRED})
-    states = [live.add(still(tabletop, k), pose) for k, pose in enumerate(capture.base_from_gripper)]
+    states = [live.add(image_of(capture, k), pose) for k, pose in enumerate(capture.base_from_gripper)]
     live.close()
     return folder, states
 
@@ -72,56 +82,46 @@ def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_e
 
 
 @pytest.mark.slow
-def test_the_end_is_the_batch_calibration(grown, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    folder = shutil.copytree(grown[0], tmp_path / "capture")
-    with closing(LiveCalibration(folder)) as live:
+def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_the_images(
+    small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    capture, batch = jcr.read_capture(small_capture), jcr.load_run(small_done)
+    with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
+        for k in (3, 0, 4, 2, 1):
+            live.add(image_of(capture, k), capture.base_from_gripper[k])
         result = live.finish()
-    batch = jcr.load_run(done)
-    assert result.verdict == batch.verdict and batch.covariance is not None
-    # The files round.
-    assert np.allclose(result.gripper_from_camera, batch.gripper_from_camera, rtol=0, atol=1e-7)
-    assert np.allclose(result.covariance, batch.covariance, rtol=1e-4, atol=0)
+    assert batch.covariance is not None and result.verdict == batch.verdict
+    away = step_between(result.gripper_from_camera, batch.gripper_from_camera)
+    assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-3, "the files round"
+    assert np.allclose(result.covariance, batch.covariance, rtol=1e-2, atol=0)
     # A run of the same folder begins with that reconstruction.
-    with monkeypatch.context() as patched:
-        patched.setattr("jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("made again"))
-        run = jcr.calibrate(folder, tmp_path / "run")
+    monkeypatch.setattr("jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("made again"))
+    run = jcr.calibrate(tmp_path / "capture", tmp_path / "run")
     assert np.allclose(run.gripper_from_camera, result.gripper_from_camera, rtol=0, atol=1e-9)
     assert (tmp_path / "run" / "reconstruction.npz").is_file()
 
 
 @pytest.mark.slow
-def test_the_end_depends_neither_on_names_nor_on_the_order_of_the_images(
-    small_capture: Path, small_done: Path, tmp_path: Path
+def test_a_place_that_shows_what_another_does_is_not_proposed_again(
+    resumed: LiveCalibration, capture: Capture
 ):
-    capture, batch = jcr.read_capture(small_capture), jcr.load_run(small_done)
-    with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
-        for k in (3, 0, 4, 2, 1):
-            live.add(read_image(small_capture / capture.images[k]), capture.base_from_gripper[k])
-        result = live.finish()
-    assert batch.covariance is not None
-    away = step_between(result.gripper_from_camera, batch.gripper_from_camera)
-    assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-3, "the files round"
-
-
-@pytest.mark.slow
-def test_a_place_that_shows_what_another_does_is_not_proposed_again(resumed: LiveCalibration, tabletop: Path):
     places = []
     for _ in range(3):
         pose = resumed.progress.next_pose
         assert pose is not None
         x = resumed.progress.hand_eye.gripper_from_camera  # pyright: ignore[reportOptionalMemberAccess]
         places.append((pose.base_from_gripper @ x)[:3, 3])
-        with pytest.raises(jcr.InputError, match="image 12: is the same as images/000.png, though"):
-            resumed.add(still(tabletop, 0), pose.base_from_gripper)
+        with pytest.raises(jcr.InputError, match="image 9: is the same as images/000.png, though"):
+            resumed.add(image_of(capture, 0), pose.base_from_gripper)
         resumed.propose_elsewhere(pose.base_from_gripper)
     assert all(np.linalg.norm(places[k] - places[j]) > 0.05 for k in range(3) for j in range(k))
 
 
 @pytest.mark.slow
 def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_an_image(
-    grown, resumed: LiveCalibration, tabletop: Path
+    grown, resumed: LiveCalibration, capture: Capture
 ):
-    before = grown[1][10]
+    before = grown[1][7]
     std = np.sqrt(np.diag(before.hand_eye.covariance)[:6])
 
     def sigmas(state: Progress) -> float:
@@ -133,8 +133,8 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_
     now, pose = resumed.progress, resumed.live.images[4].base_from_gripper
     assert now.registered == before.registered and now.images == before.images and sigmas(now) < 1
     resumed.remove(4)
-    after = resumed.add(still(tabletop, 4), pose)
-    assert len(after.images) == 11 and before.images[4] not in after.images
+    after = resumed.add(image_of(capture, 4), pose)
+    assert len(after.images) == 8 and before.images[4] not in after.images
     assert after.images[-1] == after.added and after.registered == after.images and sigmas(after) < 1
     assert jcr.read_capture(resumed.live.folder).images == after.images
     resumed.undo()
@@ -144,8 +144,8 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_
 
 
 @pytest.mark.slow
-def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibration, tabletop: Path):
-    pose, image = jcr.read_capture(tabletop).base_from_gripper[11], still(tabletop, 11)
+def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibration, capture: Capture):
+    pose, image = capture.base_from_gripper[8], image_of(capture, 8)
 
     def against(state: Progress) -> dict[FindingKind, Any]:
         return {one.kind: one for one in state.findings if one.images == (state.added,)}
@@ -154,11 +154,8 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     strange = resumed.add(noise, pose, time_s=10.0)
     assert against(strange)[FindingKind.NOT_REGISTERED].value == 0
     wrong = pose @ transform(rotation_exp(np.radians([3.0, 8.0, 0.0])), np.array([0.03, 0.0, 0.02]))
-    begun = time.process_time()
     contradicted = resumed.add(image, wrong, time_s=9.0)
-    # 3 s are asked of image 12 at 640x480 (docs/results/live.md); others use this machine, and shapes are checked.
-    assert len(contradicted.images) == 13 and time.process_time() - begun < 6
-    assert contradicted.added in contradicted.registered
+    assert len(contradicted.images) == 10 and contradicted.added in contradicted.registered
     found = against(contradicted)
     assert found[FindingKind.POSE_CONTRADICTS_IMAGE].details["rotation"] == pytest.approx(
         np.radians(8.5), rel=0.1
@@ -227,23 +224,18 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
         assert [file.name for file in (live.live.folder / "images").iterdir()] == ["000.png"]
 
 
-def test_all_images_may_be_removed_and_others_added(tmp_path: Path, tabletop: Path):
-    poses = jcr.read_capture(tabletop).base_from_gripper
-    with closing(LiveCalibration(tmp_path / "capture")) as live:
-        with pytest.raises(jcr.InputError, match="no image at index 0; the capture has 0"):
-            live.remove(0)
-        for _ in range(2):
-            live.add(still(tabletop, 0), poses[0])
-            assert len(live.add(still(tabletop, 1), poses[1]).images) == 2
-            live.remove(1)
-            assert live.remove(0).images == ()
-
-
-def test_grey_and_bgr_images_are_converted_and_lists_are_poses(tmp_path: Path, tabletop: Path):
+def test_grey_and_bgr_images_are_converted_lists_are_poses_and_all_images_may_be_removed(
+    tmp_path: Path, tabletop: Path
+):
     image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
     grey = np.asarray(cv2.cvtColor(still(tabletop, 1), cv2.COLOR_RGB2GRAY), np.uint8)
     with closing(LiveCalibration(tmp_path / "capture")) as live:
         live.add(image[..., ::-1], poses[0].tolist(), color="bgr")
         live.add(grey, poses[1].tolist())
         kept = [read_image(live.live.folder / name) for name in live.live.names]
+        live.remove(1)
+        assert live.remove(0).images == ()
+        with pytest.raises(jcr.InputError, match="no image at index 0; the capture has 0"):
+            live.remove(0)
+        assert len(live.add(still(tabletop, 2), poses[2]).images) == 1
     assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))

@@ -56,6 +56,7 @@ def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     assert np.mean((height > -0.01) & (height < 0.25)) > 0.8
 
 
+@pytest.mark.long
 def test_a_image_of_another_pose_is_left_out_and_named(plain):
     capture, truth = plain
     poses = capture.base_from_gripper.copy()
@@ -67,17 +68,6 @@ def test_a_image_of_another_pose_is_left_out_and_named(plain):
         replace(capture, base_from_gripper=poses), reconstruction
     ).gripper_from_camera
     assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
-
-
-def test_images_of_other_poses_are_refused(plain):
-    capture, truth = plain
-    mixed = replace(
-        capture,
-        base_from_gripper=np.roll(capture.base_from_gripper, 2, axis=0),
-        intrinsics=truth.intrinsics,
-    )
-    with pytest.raises(RejectedError, match="direct alignment"):
-        reconstruct_direct(mixed)
 
 
 def test_images_of_different_exposure_are_evened(plain):

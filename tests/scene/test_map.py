@@ -1,6 +1,8 @@
-"""The map against a scene whose every distance is known: a table with a box and a ball."""
+"""The map and a robot against a scene whose every distance is known: a table with a box and a ball."""
 
 import json
+import re
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +15,16 @@ from scipy.special import expit
 import analytic_scene
 from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance, warmth
 from jcr.errors import InputError
-from jcr.records import PointCloud
+from jcr.geometry import apply, transform
+from jcr.records import MATCHED, PRIOR, PointCloud
+from jcr.scene.cloud import write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
+from places import ROOT
 
 if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
+
 
 pytestmark = pytest.mark.slow
 
@@ -27,6 +33,19 @@ INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
 UNDER_TABLE = np.array([0.0, 0.0, -0.08])
 FREE_SPOT = np.array([0.0, 0.2, 0.15])
 OUTSIDE = np.array([2.0, 0.0, 0.1])
+
+
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return analytic_scene.cloud()
+
+
+@pytest.fixture(scope="module")
+def scene(cloud: PointCloud) -> "SceneMap":
+    """The map of the analytic scene with one more property."""
+    from jcr.scene.build import build_scene
+
+    return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
 
 
 def uniform(count: int, seed: int = 0) -> np.ndarray:
@@ -137,7 +156,7 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     )
     assert field.hidden.weight.shape == (256, 60)
 
-    fields = train_paper(cloud, steps=400)
+    fields = train_paper(cloud, steps=250)
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
     points = uniform(100_000)
     free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
@@ -173,21 +192,6 @@ def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
     np.testing.assert_allclose(expit(raw["occupancy"][seen, 0]), one.query(x).occupancy[seen], atol=1e-6)
     untrained = [build_scene(cloud, replace(coarse, map_seed=k, max_seconds=0.0)) for k in (0, 1)]
     assert not np.array_equal(untrained[0].query(x).color, untrained[1].query(x).color)
-
-
-def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCloud):
-    from jcr.scene.build import build_scene
-
-    wrong = np.random.default_rng(0).random(len(cloud.color)) < 0.4
-    stained = replace(
-        cloud,
-        color=np.where(wrong[:, None], 255, cloud.color).astype(np.uint8),
-        margin=np.where(wrong, 0.05, 0.0),
-    )
-    x = cloud.points_in_base[:10_000]
-    stain = np.abs(stained.color[:10_000] / 255 - analytic_scene.true_color(x)).mean()
-    color = build_scene(stained, OPTIONS).query(x).color
-    assert np.abs(color - analytic_scene.true_color(x)).mean() < 0.3 * stain
 
 
 def test_torch_differentiates_every_answer(scene: "SceneMap"):
@@ -241,12 +245,12 @@ def test_a_loaded_map_gives_eight_threads_the_answers_of_the_saved_one(scene: "S
                 assert np.array_equal(answer, right, equal_nan=answer.dtype.kind == "f")
 
 
-def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
+def test_questions_and_clouds_that_make_no_sense_are_refused(scene: "SceneMap", cloud: PointCloud):
+    from jcr.scene.build import build_scene
+
     for points, words in (
-        (np.zeros(3), r"\(n, 3\)"),
         (np.zeros((4, 2)), r"\(n, 3\)"),
         (np.array([[0.0, 0, 0], [0, np.nan, 0]]), "row 1 is not finite"),
-        (np.array([[np.inf, 0, 0]]), "row 0 is not finite"),
     ):
         # Past the shape checks of the test run, as a user's call comes.
         with pytest.raises(InputError, match=words):
@@ -260,20 +264,11 @@ def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
             scene.check_spheres(centers, radii)
     with pytest.raises(InputError, match="not finite"):
         scene.check_segments(np.zeros((1, 3)), np.full((1, 3), np.inf), 0.1)
-
-
-def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
-    from jcr.scene.build import build_scene
-
-    broken = cloud.points_in_base.copy()
-    broken[7, 1] = np.nan
-    damaged, nan = replace(cloud, points_in_base=broken), np.full((len(broken), 1), np.nan)
+    nan = np.full((len(cloud.points_in_base), 1), np.nan)
     inverted, far = (0.4, -0.4, 0.0, -0.4, 0.4, 0.6), (3.0, 3.0, 3.0, 4.0, 4.0, 4.0)
     for words, points, options, values in (
-        ("not finite", damaged, OPTIONS, None),
-        ("not finite", damaged, None, None),
+        ("not finite", replace(cloud, points_in_base=cloud.points_in_base + nan), OPTIONS, None),
         ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far), None),
-        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far, preset="paper"), None),
         ("minimum below", cloud, replace(OPTIONS, workspace=inverted), None),
         ("one finite row per point", cloud, OPTIONS, {"warmth": nan}),
     ):
@@ -301,3 +296,198 @@ def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Pa
     save_file({"a": torch.zeros(2)}, path, metadata={"format": "jcr.map/1", "about": json.dumps({})})
     with pytest.raises(InputError, match="damaged"):
         load_map(tmp_path)
+
+
+def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
+    from jcr.scene.seen import CROSSED, HIT, carve
+
+    side = np.linspace(-0.05, 0.05, 101)
+    wall = np.stack([*np.meshgrid(side, side), np.full((101, 101), 0.002)], -1).reshape(-1, 3)
+    center = np.array([[0.0, 0.0, 0.5]])
+    box = np.array([[-0.1, -0.1, -0.04], [0.1, 0.1, 0.3]])
+
+    def states(measured: bool) -> np.ndarray:
+        rows = np.zeros(len(wall), int)
+        seen = carve(wall, rows, center, box, 0.01, np.full(len(wall), measured))
+        return seen.state.numpy()[:, 10, 10]  # of the cells beside the axis, from z = -0.04 on
+
+    column = states(True)
+    assert column.tolist()[:4] == [0, 0, 0, HIT]  # half a cell behind the wall, and nothing farther behind
+    assert column[4] & HIT
+    assert (column[5:] & CROSSED).all()
+    assert not (states(False) & CROSSED).any() and (states(False) & HIT).any()
+
+
+def test_priors_make_surfaces_and_nothing_free() -> None:
+    from jcr.scene.build import build_scene
+    from jcr.scene.options import MapOptions
+    from jcr.scene.seen import CROSSED, HIT, carve
+
+    whole = analytic_scene.cloud(20_000)
+    left = whole.points_in_base[:, 0] < 0
+    reason = np.where(left, PRIOR, MATCHED).astype(np.uint8)
+    box = np.array([[-0.3, -0.3, -0.05], [0.3, 0.3, 0.45]])
+
+    def seen(rows: np.ndarray, reasons: np.ndarray) -> np.ndarray:
+        ends = whole.points_in_base[rows], whole.image[rows], whole.camera_centers_in_base
+        return carve(*ends, box, 0.01, reasons[rows] != PRIOR).state.numpy()
+
+    every = np.ones(len(left), bool)
+    mixed, measured_alone = seen(every, reason), seen(~left, reason)
+    assert not ((mixed & CROSSED) & ~(measured_alone & CROSSED)).any()
+    assert ((mixed & HIT) & ~(measured_alone & HIT)).any()
+
+    scene = build_scene(replace(whole, reason=reason), MapOptions(cell=0.02, max_seconds=5.0))
+    on_left = whole.points_in_base[left & (np.abs(whole.points_in_base).max(1) < 0.2)]
+    assert (scene.query(on_left, unknown="free").occupancy > 0.5).mean() > 0.3
+    only = replace(whole, reason=np.full(len(left), PRIOR, np.uint8))
+    x = np.random.default_rng(0).uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 0.4], (5000, 3))
+    nothing_free = build_scene(only, MapOptions(cell=0.02, max_seconds=0.5))
+    assert not (nothing_free.query(x, unknown="occupied").occupancy < 0.5).any()
+
+
+EXCESS = 0.01
+
+URDF = """<robot name="arm">
+  <link name="foot"><collision><geometry><box size="0.1 0.1 0.02"/></geometry></collision></link>
+  <link name="upper"><collision><origin xyz="0 0 0.075"/>
+    <geometry><cylinder radius="0.02" length="0.15"/></geometry></collision></link>
+  <link name="fore"><collision><origin xyz="0.1 0 0" rpy="0 1.5707963 0"/>
+    <geometry><cylinder radius="0.015" length="0.2"/></geometry></collision></link>
+  <link name="slide"><collision><geometry><mesh filename="wedge.stl" scale="0.001 0.001 0.001"/></geometry>
+    </collision></link>
+  <link name="tip"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
+  <link name="finger"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="foot"/><child link="upper"/><origin xyz="0 0 0.01"/>
+    <axis xyz="0 0 2"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="bend" type="continuous"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.15"/>
+    <axis xyz="0 1 0"/></joint>
+  <joint name="push" type="prismatic"><parent link="fore"/><child link="slide"/><origin xyz="0.2 0 0"/>
+    <axis xyz="1 0 0"/><limit lower="0" upper="0.1" effort="1" velocity="1"/></joint>
+  <joint name="fix" type="fixed"><parent link="slide"/><child link="tip"/><origin xyz="0.05 0 0"/></joint>
+  <joint name="follow" type="prismatic"><parent link="tip"/><child link="finger"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.1" effort="1" velocity="1"/><mimic joint="push" multiplier="0.5" offset="0.01"/>
+    </joint>
+</robot>"""
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("robot")
+    wedge = trimesh.convex.convex_hull(np.array([[0, -20, -20], [0, 20, -20], [0, 0, 20], [40, 0, 0]], float))
+    wedge.export(folder / "wedge.stl")
+    (folder / "arm.urdf").write_text(URDF)
+    return folder / "arm.urdf"
+
+
+def test_spheres_hold_the_shape_and_little_else():
+    import trimesh
+    from trimesh.creation import box
+
+    from jcr.scene.robot import spheres_of_shape
+
+    across = transform(np.eye(3), np.array([0.15, 0, 0.15]))
+    shape = trimesh.util.concatenate([box((0.3, 0.03, 0.03)), box((0.03, 0.03, 0.3), across)])
+    link_from_shape = transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.1, 0.2, 0.3]))
+    centers, radii = spheres_of_shape(shape, link_from_shape, EXCESS)
+    surface = shape.sample(3000, seed=0)
+    low, high = shape.bounds + [[-0.05], [0.05]]
+    around = np.random.default_rng(0).uniform(low, high, (5000, 3))
+    depth = trimesh.proximity.signed_distance(shape, around)
+    fixed = apply(link_from_shape, np.concatenate([surface, around[depth > 0]]))
+    gap = np.linalg.norm(fixed[:, None] - centers, axis=-1) - radii
+    assert gap.min(1).max() <= 1e-6
+    beyond = apply(link_from_shape, around[depth < -1.5 * EXCESS])
+    gap = np.linalg.norm(beyond[:, None] - centers, axis=-1) - radii
+    assert gap.min() > 0
+    assert len(radii) < 450
+
+
+def test_joints_move_the_spheres_as_in_yourdfpy(urdf: Path):
+    import yourdfpy
+
+    from jcr.scene.robot import load_robot
+
+    peer, robot = yourdfpy.URDF.load(str(urdf), load_meshes=False), load_robot(urdf)
+    assert robot.joint_names == ("turn", "bend", "push") and len(robot.links) == 6
+    q = np.array([[0.0, 0.0, 0.0], [np.pi / 2, 0.0, 0.0], [0.7, -1.1, 0.03], [0.0, 0.0, 0.04]])
+    for values, centers in zip(q, robot.centers(q), strict=True):
+        peer.update_cfg(values)
+        for name in robot.links:
+            mine = robot.link == robot.links.index(name)
+            expected = apply(peer.get_transform(name), robot.centers_in_link[mine])
+            np.testing.assert_allclose(centers[mine], expected, atol=1e-9)
+    by_name = robot.centers({"push": q[:, 2], "turn": q[:, 0], "bend": q[:, 1]})
+    assert np.array_equal(by_name, robot.centers(q))
+    assert robot.centers(q.reshape(2, 2, 3)).shape == (2, 2, len(robot.radii), 3)
+
+
+def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf: Path):
+    from jcr.scene.robot import load_robot
+    from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
+
+    # The foot stands on the table, behind the ball as seen along x.
+    base_from_robot = transform(np.eye(3), BALL_CENTER * [1, 1, 0] + [-0.13, 0, 0.01])
+
+    def ask(q: np.ndarray, unknown: str = "report", ignore: tuple[str, ...] = ("foot", "upper")) -> list:
+        return scene.check_robot(urdf, q, unknown, base_from_robot, ignore).tolist()
+
+    above, into = [0.0, 0.0, 0.0], [0.0, 0.75, 0.05]
+    assert ask(np.array([above, into])) == [FREE, OCCUPIED]
+    assert ask(np.array([above, into]), "occupied") == [False, True]
+    assert ask(np.array([above, into]), "free") == [False, True]
+    assert ask(np.array(above), ignore=()) == OCCUPIED  # the foot on the table
+    out_of_the_box = np.array([np.pi, 0.0, 0.1])
+    assert ask(out_of_the_box) == UNKNOWN
+    assert ask(out_of_the_box, "occupied") is True
+    assert ask(out_of_the_box, "free") is False
+    many = np.tile(above, (4, 5, 1))
+    assert scene.check_robot(load_robot(urdf), many, "free", base_from_robot, ("foot",)).shape == (4, 5)
+
+
+def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urdf: Path, tmp_path: Path):
+    from jcr.scene.robot import load_robot
+
+    robot = load_robot(urdf)
+    wrong = {
+        "no such URDF": (tmp_path / "none.urdf", np.zeros(3)),
+        r"expected \(…, 3\), for turn, bend, push": (robot, np.zeros(4)),
+        "elbow": (robot, {"turn": 0.0, "bend": 0.0, "push": 0.0, "elbow": 1.0}),
+        "push": (robot, {"turn": 0.0, "bend": 0.0}),
+        "not finite": (robot, np.array([0.0, np.nan, 0.0])),
+        "arm7": (robot, np.zeros(3), "occupied", None, ("arm7",)),
+        "base_from_robot": (robot, np.zeros(3), "occupied", np.diag([2.0, 2, 2, 1])),
+    }
+    for words, arguments in wrong.items():
+        with pytest.raises(InputError, match=words):
+            scene.check_robot(*arguments)
+    broken = tmp_path / "broken.urdf"
+    robots = {  # the second one's mesh is not beside it
+        "not a readable URDF": "<robot><link",
+        "mesh of link slide": URDF,
+        "no link has a <collision>": '<robot name="a"><link name="b"/></robot>',
+    }
+    for words, text in robots.items():
+        broken.write_text(text)
+        with pytest.raises(InputError, match=words):
+            load_robot(broken)
+
+
+def test_the_page_on_the_map_runs_as_printed(
+    scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    page = (ROOT / "docs" / "how-to" / "map.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len(blocks) == 4
+    scene.save(tmp_path / "out" / "table" / "map.safetensors")
+    write_cloud(tmp_path / "out" / "table" / "cloud.ply", analytic_scene.cloud())
+    for file in urdf.parent.iterdir():
+        shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert names["sample"].unknown.tolist() == [False, True, True]
+    assert "warmth" in names["warm"].properties

@@ -19,15 +19,12 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, scale_translation, transform
 from jcr.records import (
-    BOTH,
-    MATCHED,
-    PRIOR,
     Capture,
     Reconstruction,
     Tracks,
     Uncertainty,
 )
-from jcr.scene.cloud import LEAST_SURE, point_cloud
+from jcr.scene.cloud import point_cloud
 from jcr.scene.options import CloudOptions, MapOptions
 from scenes import hand_eye_of, maps_of, reconstruction_of
 from simulation.capture import SimulateOptions, simulate
@@ -146,32 +143,6 @@ def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
     return x @ thing.base_from_box[:3, :3].T + thing.base_from_box[:3, 3]
 
 
-def test_the_least_sure_matches_clear_nothing_but_in_added_images(
-    truth: Truth, capture: Capture, whole: list[View]
-):
-    made, hand_eye = known_reconstruction(truth, whole[:3])
-    draw = np.random.default_rng(0)
-    confidence = made.dense.confidence
-    pointmaps = replace(
-        made.dense,
-        reason=draw.choice(np.array([MATCHED, BOTH, PRIOR], np.uint8), confidence.shape),
-        confidence=confidence * draw.uniform(1, 2, confidence.shape),
-    )
-    made = replace(
-        made,
-        pointmaps=pointmaps,
-        image_index=np.array([0, 1, len(capture)]),
-    )
-    cloud = point_cloud(capture, made, hand_eye, options=CloudOptions(confidence_percentile=0.0))
-    added, alone = cloud.image == 2, cloud.reason == MATCHED
-    np.testing.assert_array_equal(cloud.cleared[added], cloud.reason[added] != PRIOR)
-    np.testing.assert_array_equal(cloud.cleared[~alone], cloud.reason[~alone] != PRIOR)
-    sure = cloud.cleared[alone & ~added]
-    assert sure.mean() == pytest.approx(1 - LEAST_SURE / 100, abs=0.001)
-    confidence = cloud.confidence[alone & ~added]
-    assert confidence[sure].min() >= confidence[~sure].max()
-
-
 def test_a_thing_that_was_taken_away_leaves_the_map(
     truth: Truth, capture: Capture, whole: list[View], tmp_path: Path
 ):
@@ -188,19 +159,6 @@ def test_a_thing_that_was_taken_away_leaves_the_map(
     assert (fresh.query(x, unknown="occupied").occupancy < 0.5).mean() > 0.8
     stayed = within(truth, "box")
     assert (fresh.query(stayed, unknown="occupied").occupancy > 0.5).mean() > 0.98
-
-
-def test_a_thing_that_was_put_down_enters_the_map(truth: Truth, capture: Capture, tmp_path: Path):
-    without = scene_of(truth, without="box")
-    rendered = list(render(without, truth.intrinsics, truth.base_from_camera[:6]))
-    before, hand_eye = known_reconstruction(truth, rendered)
-    places = np.concatenate([beside(truth, 0, 3), beside(truth, 5, 3)])
-    new = added_views(tmp_path, truth, capture, scene_of(truth), places)
-    after = extended(before, hand_eye, capture, new)
-    x, fresh = within(truth, "box"), mapped(truth, capture, after, hand_eye)
-    assert (fresh.query(x, unknown="occupied").occupancy > 0.5).mean() > 0.75
-    stayed = within(truth, "toolbox")
-    assert (fresh.query(stayed, unknown="occupied").occupancy > 0.5).mean() > 0.85
 
 
 def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(

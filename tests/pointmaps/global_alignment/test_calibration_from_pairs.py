@@ -1,6 +1,5 @@
 """Test the calibration from aligned pairs: accuracy, calibrated covariance, scale of metric networks."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -15,7 +14,7 @@ from jcr.camera import unproject
 from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
 from jcr.findings.finding import text
-from jcr.geometry import inverse, retract, rotation_exp, rotation_log, step_between, transform
+from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
@@ -93,53 +92,22 @@ def case(
     )
 
 
-@pytest.mark.slow
-def test_a_wrong_gripper_pose_is_left_out():
-    made = case(7, 1, NOISE)
-    poses = made.capture.base_from_gripper.copy()
-    poses[2, :3, 3] += [0.02, 0.0, 0.0]
-    wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
-    found = calibrate_reconstruction(wrong.capture, wrong.reconstruction())
-    assert found.inliers.tolist() == [True, True, False, True, True, True, True]
-    assert found.converged
-    error = made.error(found)
-    assert error @ np.linalg.solve(found.covariance, error) < 18.5  # 99 of 100 draws
-
-
 def slipped(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the poses under which the camera slips by 6 mm and 2° after the fifth image."""
     slip = transform(rotation_exp(np.radians([1.2, -1.2, 1.0])), np.array([0.004, -0.003, 0.003]))
     return np.concatenate([gripper[:5], gripper[5:] @ x @ inverse(x @ slip)])
 
 
-def late(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the poses as they were 5 % of the interval earlier."""
-    back = step_between(gripper[1:], gripper[:-1])
-    return np.concatenate([gripper[:1], retract(gripper[1:], 0.05 * back)])
-
-
-def shuffled(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the poses in another order."""
-    return gripper[np.random.default_rng(1).permutation(len(gripper))]
-
-
-@pytest.mark.parametrize(
-    ("spoil", "cause"),
-    [
-        (slipped, FindingKind.SLIP),
-        (late, FindingKind.DELAY),
-        (shuffled, FindingKind.POSES_CONTRADICT_IMAGES),
-    ],
-)
-def test_a_fault_of_the_poses_is_named_beside_a_wrong_focal_length(spoil: Callable, cause: FindingKind):
+def test_a_slip_is_named_beside_a_wrong_focal_length():
     made = case(12, 3, (1e-4, 3e-4), PairErrors(focal=0.03))
-    poses = spoil(made.capture.base_from_gripper, made.gripper_from_camera)
+    poses = slipped(made.capture.base_from_gripper, made.gripper_from_camera)
     wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
-    assert calibrate_reconstruction(wrong.capture, wrong.reconstruction()).findings[0].kind is cause
+    assert (
+        calibrate_reconstruction(wrong.capture, wrong.reconstruction()).findings[0].kind is FindingKind.SLIP
+    )
 
 
-@pytest.mark.parametrize("given", [True, False])
-@pytest.mark.parametrize("off", [0.03, -0.1])
+@pytest.mark.parametrize(("off", "given"), [(0.03, False), (-0.1, True)])
 def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool):
     made = case(6, 2, NOISE, PairErrors(focal=off))
     truth = made.capture.intrinsics
@@ -175,8 +143,8 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     assert std == pytest.approx(0.05 if not given else 0.1 if contradicts else 0.005, rel=0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", [pytest.param((0.0, 0.0), marks=pytest.mark.long), NOISE])
+@pytest.mark.long
+@pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
 def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     # With an exact robot the network's errors are all there is; the robot's own noise is not known beforehand.
     squared = []
@@ -194,7 +162,7 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "off_percent"), [(1.0, 0.0), (1.05, 5.0), (1000.0, 99900.0)])
+@pytest.mark.parametrize(("factor", "off_percent"), [(1.05, 5.0), (1000.0, 99900.0)])
 def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent: float):
     made = case(6, 3, (1e-4, 2e-4))
     network = replace(
@@ -211,11 +179,6 @@ def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent:
     assert abs(off - off_percent) < 4 * std_percent * factor
     assert std_percent < 0.2
     assert any("check the unit of the gripper poses" in text for text in found.warnings) == (factor > 10)
-
-
-def test_a_network_without_a_metre_shows_nothing_of_the_scale():
-    made = case(4, 3, (1e-4, 2e-4))
-    assert calibrate_reconstruction(made.capture, made.reconstruction()).lengths == ()
 
 
 def test_evidence_survives_the_file(tmp_path: Path):
