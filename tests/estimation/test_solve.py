@@ -266,15 +266,35 @@ def drifting(seed: int, count: int = 40) -> tuple[HandEyeProblem, np.ndarray]:
 
 
 def test_growing_errors_are_weighed_and_in_the_uncertainty():
-    squared, metres = list[float](), dict[bool, list[float]]()
+    squared, metres = list[float](), dict[str, list[float]]()
     for seed in range(4):
         problem, camera = drifting(seed)
-        for in_sequence in (False, True):
-            solved = solve_hand_eye(problem.base_from_gripper, camera, in_sequence=in_sequence)
+        for errors in ("independent", "in sequence"):
+            solved = solve_hand_eye(problem.base_from_gripper, camera, camera_errors=errors)
             off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
-            metres.setdefault(in_sequence, []).append(float(np.linalg.norm(off[:3])))
+            metres.setdefault(errors, []).append(float(np.linalg.norm(off[:3])))
         squared.append(float(off @ np.linalg.solve(solved.covariance[:6, :6], off)))
-    assert np.median(metres[True]) < 0.5 * np.median(metres[False])
+    assert np.median(metres["in sequence"]) < 0.5 * np.median(metres["independent"])
+    assert np.median(squared) < 12.6 and max(squared) < 25
+
+
+@pytest.mark.slow
+def test_rotations_about_the_board_and_errors_of_depth_are_weighed_and_in_the_uncertainty():
+    squared, metres = list[float](), dict[bool, list[float]]()
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 9])
+        problem = hand_eye_problem(rng, 40, robot_noise=(2e-4, 5e-4))
+        tilt = rotation_exp(2e-3 * rng.normal(size=(40, 3)))
+        camera = transform(tilt, np.zeros((40, 3))) @ problem.recon_from_camera
+        depth = np.array([0.0, 0.0, 3e-3]) / problem.scale * rng.normal(size=(40, 1))
+        camera = camera @ transform(np.eye(3), depth)
+        exact = np.zeros((240, 240))
+        for covariance in (exact, None):
+            solved = solve_hand_eye(problem.base_from_gripper, camera, camera_covariance=covariance)
+            off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
+            metres.setdefault(covariance is None, []).append(float(np.linalg.norm(off[:3])))
+        squared.append(float(off @ np.linalg.solve(solved.covariance[:6, :6], off)))
+    assert np.median(metres[True]) < 0.7 * np.median(metres[False])
     assert np.median(squared) < 12.6 and max(squared) < 25
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.hypotheses import drift_covariance
+from jcr.estimation.camera_noise import camera_error_covariance
 from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
@@ -60,15 +61,15 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     joints: ArrayLike | None = None,
     robot: str | Arm | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
-    in_sequence: bool = True,
+    camera_errors: Literal["none", "independent", "in sequence"] = "in sequence",
     names: Sequence[str] | None = None,
 ) -> Calibration:
     """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
 
     Both are stacks (n,4,4), n ≥ 2, of poses at the same instants and in the same order: gripper poses in the base frame
     (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
-    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is needed if the errors of the
-    camera poses are not negligible: the covariance of steps of these poses (geometry.retract; recon axes).
+    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is the covariance
+    of steps of the camera poses (geometry.retract; recon axes) by their errors.
 
     `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
     base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
@@ -79,8 +80,10 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     `scale_std`; None: the scale is estimated. `offset` is a known coordinate of the camera, for motions that do not
     determine it: an axis in the gripper frame, the camera's position along it (m), and its standard deviation (m).
 
-    `in_sequence`: the camera poses may have been found one after the other, as by visual odometry or SLAM. Errors that
-    add up along their order are then tested and included. `names` are those of the poses, for the result's `images`.
+    `camera_errors` are tested, and included if the poses show them, unless there is a `camera_covariance`:
+    "independent" ones are rotations about the scene or about the origin of the given frame, where a board is, and
+    translations along the optical axis; "in sequence", the poses may also have been found one after the other, as by
+    visual odometry or SLAM, with errors that add up. `names` are those of the poses, for the result's `images`.
 
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
@@ -111,12 +114,15 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     if systematic is None:
         systematic = _systematic(gripper, robot, joints)
     fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, camera_covariance, systematic)
-    if in_sequence and camera_covariance is None:
+    if camera_covariance is None and camera_errors != "none":
         assert fit.problem.used is not None
         start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
-        drift = drift_covariance(gripper, camera, start, used, systematic, robot_noise)
-        if drift is not None:
-            fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, drift, systematic)
+        adding_up = camera_errors == "in sequence"
+        errors = camera_error_covariance(
+            gripper, camera, start, used, systematic, robot_noise, priors, adding_up
+        )
+        if errors is not None:
+            fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, errors, systematic)
     named = [f"pose {k}" for k in range(n)] if names is None else names
     return judged(_with_residuals(gripper, camera, fit, distinct, named))
 

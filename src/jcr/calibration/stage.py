@@ -128,7 +128,7 @@ def fit_poses(
         robot_noise=options.robot_noise_m_rad,
         camera_covariance=None if evidence is None else evidence.covariance,
         systematic=robot.systematic,
-        in_sequence=False,
+        camera_errors="none",
         names=[capture.images[row] for row in rows],
     )
     if options.known_length is not None:
@@ -186,7 +186,8 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
         robot_noise=options.robot_noise_m_rad,
         offset=None if height is None else height_cue(gripper, height / 1e3),
         systematic=robot.systematic,
-        in_sequence=not pairs.is_metric,  # each pose of a marker of known size is estimated independently
+        # Each pose of a marker of known size is estimated independently.
+        camera_errors="independent" if pairs.is_metric else "in sequence",
         names=pairs.images,
     )
     hand_eye = free = solve()

@@ -59,7 +59,7 @@ def refined(
     rows = reconstruction.image_index
     if not found.is_sound:
         on_gripper = solve_hand_eye(
-            capture.base_from_gripper[rows], reconstruction.recon_from_camera, in_sequence=False
+            capture.base_from_gripper[rows], reconstruction.recon_from_camera, camera_errors="none"
         )
         why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
         return (found.with_findings(why) if on_gripper.converged else found).on_fixed_camera()

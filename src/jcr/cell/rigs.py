@@ -290,7 +290,7 @@ def fit_views(
     `carrier` are these poses; poses are in metres, `scale_std` is the relative standard deviation of the scale between
     them. The second result is the findings on effects such as a slip.
     """
-    found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, in_sequence=False)
+    found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, camera_errors="none")
     known = (scale_prior(1.0, scale_std),)
     return found, effects_of_fit(carrier, seen.places, found, seen.names, priors=known)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import parameter_names
@@ -19,17 +19,12 @@ from jcr.distributions import f as f_distribution
 from jcr.estimation.elimination import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, image_evidence
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
-from jcr.estimation.pose_equations import PoseEquations, pose_by_pose, pose_equations, reported_poses
+from jcr.estimation.pose_equations import PoseEquations, pose_equations
 from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
-    ROTATION,
-    SCALE,
-    TRANSLATION,
     UNKNOWNS,
-    Start,
     State,
-    pose_problem,
     rows_of,
     spanned,
     with_free,
@@ -37,14 +32,13 @@ from jcr.estimation.problem import (
 from jcr.estimation.robot_noise import (
     Equations,
     LogSizes,
-    log_evidence,
     most_likely,
     over_sizes,
     solve_equations,
 )
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
-from jcr.geometry import Poses, Transform, by_similarity, skew
+from jcr.geometry import Poses, Transform, skew
 from jcr.records import Intrinsics, JointOffsets, RobotNoise
 
 CONFIRMED_AT_MOST = 3
@@ -494,77 +488,3 @@ def _step(
     right = free.T @ equations.right
     step = covariance @ right
     return step, float(right @ step), covariance
-
-
-FEWEST, MOST = 8, 50
-"""Smallest number of poses for a test of drift, and largest number used; more are sampled evenly."""
-SUSPICIOUS = 2.0
-"""Score test statistic of a growth, in standard deviations, from which the evidence is computed."""
-CLEAR = 3.0
-"""Gain of the log evidence from which drift of the camera poses is adopted: odds of 20 to 1."""
-
-
-def drift_covariance(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    fit: Start,
-    used: Bool[ndarray, " n"],
-    error_covariance: Float[ndarray, "s s"],
-    noise_floor: tuple[float, float] | None,
-) -> Float[ndarray, "s s"] | None:
-    """Return the covariance (6n,6n) of camera pose errors that accumulate along the sequence; None if they do not.
-
-    Errors accumulate as in visual odometry; a gain of log evidence above CLEAR decides, from the `used` poses. `fit` is
-    the estimate of (gripper_from_camera, scale, base_from_recon) without such errors. `error_covariance` and
-    `noise_floor` are those of the gripper poses in `pose_problem`.
-    """
-    rows = np.flatnonzero(used)
-    if len(rows) < FEWEST:
-        return None
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).round().astype(int))]
-    walks = random_walks(recon_from_camera, fit[1])
-    some = (6 * rows[:, None] + np.arange(6)).ravel()
-    among = np.ix_(some, some)
-    problem, state = pose_problem(
-        base_from_gripper[rows],
-        recon_from_camera[rows],
-        fit,
-        error_covariance=error_covariance[among],
-        noise_floor=noise_floor,
-    )
-    by_camera = reported_poses(problem, state)[2]
-    plain = pose_equations(problem, state, None).equations
-    parts = [pose_by_pose(by_camera, pose_by_pose(by_camera, walk[among]).T) for walk in walks]
-    before, size_information = most_likely(plain)
-    solution = solve_equations(plain, before)
-    left, by = solution.weighed_left, [solution.projection @ part for part in parts]
-    # Score test of each component at size 0, in standard deviations.
-    pull = [left @ part @ left - np.trace(one) for part, one in zip(parts, by, strict=True)]
-    if np.max(pull / np.sqrt([2 * (one * one.T).sum() for one in by])) < SUSPICIOUS:
-        return None
-    best, found = log_evidence(plain, solution, size_information) + CLEAR, None
-    for count in (2, 3):
-        free = replace(plain, walks=tuple(parts[:count]))
-        sizes, information = most_likely(free)
-        evidence = log_evidence(free, solve_equations(free, sizes), information)
-        if evidence > best:
-            best, found = evidence, np.tensordot(free.variances(sizes)[3:], walks[:count], 1)
-    return found
-
-
-def random_walks(recon_from_camera: Poses, scale: float) -> list[Float[ndarray, "s s"]]:
-    """Return three covariances (6n,6n) of the errors of n camera poses that accumulate as random walks.
-
-    Per image the standard deviation grows by 1 m of position, by 1 rad, and by 1 of log scale, respectively; `scale` is
-    in metres per unit of the reconstruction.
-    """
-    n, position = len(recon_from_camera), recon_from_camera[:, :3, 3]
-    moves = np.zeros((n, n - 1, 6, 7))
-    # Rotations are about each camera's centre; a scale error changes the translation from the previous camera.
-    moves[:, :, :3] = by_similarity(position[:, None] - position[1:])
-    moves[:, :, :3, 6] = position[:, None] - position[:-1]
-    moves[:, :, 3:, 3:6] = np.eye(3)
-    moves *= np.tril(np.ones((n, n)))[:, 1:, None, None]
-    moves[..., :3] /= scale
-    halves = (moves.swapaxes(1, 2)[..., one].reshape(6 * n, -1) for one in (TRANSLATION, ROTATION, SCALE))
-    return [half @ half.T for half in halves]

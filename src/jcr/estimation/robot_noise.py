@@ -63,8 +63,8 @@ TYPICAL = np.array([3e-4, np.radians(0.04), np.radians(0.1)])
 """Middle of the weak priors on σ_t (m), σ_r (rad) and σ_s (rad) of an arm."""
 FACTOR_STD = np.log([10.0, 10.0, 3.0])
 """Prior standard deviations of log σ_t, log σ_r, log σ_s (data sheets: 0.03 to 0.1°, servo arms 1 to 2°)."""
-TYPICAL_WALKS, WALK_FACTOR_STD = np.array([3e-4, 1e-3, 1e-3]), np.log(30.0)
-"""Weak prior on the growth of camera pose errors per image (m, rad, relative scale): middle, std of the logarithm."""
+CAMERA_FACTOR_STD = np.log(30.0)
+"""Prior standard deviation of the logarithm of each size of the camera pose errors, about its typical value 1."""
 GIVEN_SHARE = 0.3
 """Middle of the prior on random errors in addition to a given noise, as a share of it."""
 SHOWN = 1.1
@@ -84,7 +84,7 @@ AT_ONCE = 4e6
 SETTLED = 1e-4
 """Largest step of the log sizes at which the search of their mode ends."""
 LogSizes = Float[ndarray, "*k c"]
-"""c logarithms: random errors σ_t (m) and σ_r (rad), systematic error σ_s (rad), growths of camera pose errors."""
+"""c logarithms: random errors σ_t (m) and σ_r (rad), systematic error σ_s (rad), sizes of camera pose errors."""
 Each = Float[ndarray, "*k"] | np.floating
 Covariance = Float[ndarray, "s s"]
 Information = Float[ndarray, "c c"]
@@ -109,8 +109,8 @@ class Equations:
     """Covariance of the residuals from errors of the camera poses; None: exact camera poses."""
     given: tuple[float, float] | None = None
     """Lower bounds of the random errors σ_t (m) and σ_r (rad) that the user gave; None: none."""
-    walks: tuple[Covariance, ...] = ()
-    """Covariances of camera pose errors that add up along the sequence, each for a growth of 1 per image."""
+    camera_errors: tuple[Covariance, ...] = ()
+    """Covariances of the residuals from components of the camera pose errors, each for a typical size."""
     confirmed: Covariance | None = None
     """Covariance of errors by confirmed effects (a strain of the arm, ...); it does not depend on the sizes."""
 
@@ -128,13 +128,14 @@ class Equations:
 
         The last residual is that of log(σ_t / (REACH · σ_r)).
         """
-        typical, count = np.r_[TYPICAL, TYPICAL_WALKS], 3 + len(self.walks)
+        added = np.ones(len(self.camera_errors))
+        typical, count = np.r_[TYPICAL, added], 3 + len(added)
         if self.given is not None:
             typical[:2] = GIVEN_SHARE * self.least
-        std = np.r_[FACTOR_STD, np.full(3, WALK_FACTOR_STD)][:count]
+        std = np.r_[FACTOR_STD, CAMERA_FACTOR_STD * added]
         rows = np.concatenate([np.diag(1 / std), np.eye(1, count) - np.eye(1, count, 1)])
         rows[-1] /= RATIO_STD
-        return rows, np.r_[np.log(typical[:count]) / std, np.log(REACH) / RATIO_STD], std
+        return rows, np.r_[np.log(typical) / std, np.log(REACH) / RATIO_STD], std
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
@@ -154,12 +155,12 @@ class Equations:
             jacobian=self.jacobian[rows],
             systematic=part(self.systematic),
             known=part(self.known),
-            walks=tuple(map(part, self.walks)),
+            camera_errors=tuple(map(part, self.camera_errors)),
             confirmed=part(self.confirmed),
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), growths of camera errors.
+        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), sizes of camera errors.
 
         The random variances are σ_t² and σ_r² plus the squares of `least`.
         """
@@ -196,10 +197,10 @@ class Equations:
         )
 
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
-        """Return the covariance V (s,s) of the residuals for these log sizes."""
+        """Return the covariance V (s,s) of the residuals (m, rad) for one vector of c log sizes, or k of them."""
         covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
         variances = self.variances(log_sizes)[..., 2:]
-        for k, part in enumerate((self.systematic, *self.walks)):
+        for k, part in enumerate((self.systematic, *self.camera_errors)):
             covariance += variances[..., k, None, None] * part
         for part in (self.known, self.confirmed):
             if part is not None:
@@ -258,7 +259,7 @@ Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
     """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions.
 
-    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and growths of camera errors.
+    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and sizes of camera errors.
     """
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
@@ -386,7 +387,7 @@ def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, I
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])
-    parts = (equations.systematic, *equations.walks)
+    parts = (equations.systematic, *equations.camera_errors)
     by = [projection @ part for part in parts]
     beside = np.stack([masks @ (one * projection).sum(1) for one in by], axis=1)
     own = np.array([[(one * other.T).sum() for other in by] for one in by])

@@ -286,7 +286,7 @@ def _fits(
     fits = []
     for capture, options in read:
         gripper = capture.base_from_gripper[rows][found.image_index]
-        fit = solve_hand_eye(gripper, found.recon_from_camera, in_sequence=False)
+        fit = solve_hand_eye(gripper, found.recon_from_camera, camera_errors="none")
         # Residuals are used, because the noise of a rejected fit is an assumption and does not depend on the poses.
         residuals = [(one.translation_residual_mm, one.rotation_residual_deg) for one in fit.images]
         mm, deg = np.median(np.array(residuals, dtype=float), axis=0)

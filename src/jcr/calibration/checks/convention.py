@@ -164,7 +164,7 @@ def _better_adjusted(
             reported,
             case.recon_from_camera,
             systematic=systematic.systematic,
-            in_sequence=False,
+            camera_errors="none",
             names=case.names,
         )
         tried = replace(
@@ -201,7 +201,7 @@ def _solved(
 ) -> PoseConvention:
     """Return a candidate convention with the misfit of a calibration, which is `solved` or, if None, computed."""
     name, remedy, base_from_gripper, image = candidate
-    fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], in_sequence=False)
+    fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], camera_errors="none")
     return _reading(name, remedy, fit)
 
 

@@ -1,0 +1,141 @@
+"""Errors of given camera poses: components of their covariance, selected by evidence, with estimated sizes.
+
+Images determine a camera's pose relative to the scene worst in two ways: a rotation about the scene, and a translation
+along the optical axis. Visual odometry and SLAM add up errors along the sequence. Each of these components enters the
+covariance of the camera poses if the poses of gripper and camera together show it.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.linalg import block_diag
+
+from jcr.estimation.pose_equations import pose_by_pose, pose_equations, reported_poses
+from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, LinearPrior, Start, pose_problem
+from jcr.estimation.robot_noise import Equations, LogSizes, log_evidence, most_likely, solve_equations
+from jcr.geometry import Poses, by_similarity, nearest_to_lines
+
+FEWEST, MOST = 8, 50
+"""Smallest number of poses for a test of camera errors, and largest number used; more are sampled evenly."""
+CLEAR = 3.0
+"""Gain of the log evidence from which a component is included: odds of 20 to 1."""
+TYPICAL_M, TYPICAL_RAD, TYPICAL_WALK_M = 1e-3, 1e-3, 3e-4
+"""Typical sizes of camera pose errors: position (m), rotation (rad; also relative scale), growth of position (m)."""
+Part = Literal[
+    "rotation about the origin",
+    "rotation about the scene",
+    "depth",
+    "depth from a fixed camera",
+    "walk of position",
+    "walk of rotation",
+    "walk of scale",
+]
+"""Part of the camera pose errors. A board is at the origin of its frame; the scene is the point nearest to all optical
+axes. Depth is along the optical axis, for a fixed camera that observes a moving board along z of its frame."""
+INDEPENDENT: list[tuple[Part, ...]] = [
+    ("rotation about the origin",),
+    ("rotation about the scene",),
+    ("depth",),
+    ("depth from a fixed camera",),
+]
+"""Components of errors that are independent from image to image."""
+ADDING_UP: list[tuple[Part, ...]] = [("walk of position", "walk of rotation"), ("walk of scale",)]
+"""Components of errors that add up along the sequence."""
+WALKS = {
+    "walk of position": (TRANSLATION, TYPICAL_WALK_M),
+    "walk of rotation": (ROTATION, TYPICAL_RAD),
+    "walk of scale": (SCALE, TYPICAL_RAD),
+}
+"""Columns of a similarity (translation, rotation, log scale) and typical growth per image of each random walk."""
+
+
+def camera_error_covariance(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    fit: Start,
+    used: Bool[ndarray, " n"],
+    error_covariance: Float[ndarray, "s s"],
+    noise_floor: tuple[float, float] | None,
+    priors: tuple[LinearPrior, ...],
+    adding_up: bool,
+) -> Float[ndarray, "s s"] | None:
+    """Return the estimated covariance (6n,6n) of the errors of n camera poses; None if the poses show none.
+
+    Components are added one by one, each with the largest log evidence of the `used` poses, while the gain exceeds
+    CLEAR. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
+    `error_covariance`, `noise_floor` and `priors` are those of `pose_problem`; `adding_up` adds errors that accumulate.
+    """
+    rows = np.flatnonzero(used)
+    if len(rows) < FEWEST:
+        return None
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).round().astype(int))]
+    some = (6 * rows[:, None] + np.arange(6)).ravel()
+    problem, state = pose_problem(
+        base_from_gripper[rows],
+        recon_from_camera[rows],
+        fit,
+        error_covariance=error_covariance[np.ix_(some, some)],
+        noise_floor=noise_floor,
+        priors=priors,
+    )
+    by_camera = reported_poses(problem, state)[2]
+    components: dict[tuple[Part, ...], list[Float[ndarray, "s s"]]] = {}
+    # The scale of metric poses does not drift; where a camera hardly moves, its drift would explain any error.
+    is_metric = any(prior.row[SCALE].item() for prior in priors)
+    for parts in [*INDEPENDENT, *(ADDING_UP[: 1 if is_metric else 2] if adding_up else ())]:
+        of_cameras = (camera_error_part(part, recon_from_camera, fit[1], rows) for part in parts)
+        components[parts] = [pose_by_pose(by_camera, pose_by_pose(by_camera, one).T) for one in of_cameras]
+    equations, adopted = pose_equations(problem, state, None).equations, list[Part]()
+    sizes, information = most_likely(equations)
+    best = log_evidence(equations, solve_equations(equations, sizes), information)
+    while True:
+        found: list[tuple[float, Equations, LogSizes, tuple[Part, ...]]] = []
+        for parts, covariances in components.items():
+            tried = replace(equations, camera_errors=(*equations.camera_errors, *covariances))
+            at, information = most_likely(tried)
+            found.append((log_evidence(tried, solve_equations(tried, at), information), tried, at, parts))
+        likeliest = max(found, key=lambda one: one[0], default=None)
+        if likeliest is None or likeliest[0] < best + CLEAR:
+            break
+        best, equations, sizes, parts = likeliest
+        adopted += parts
+        del components[parts]
+    every, out = np.arange(len(recon_from_camera)), None
+    for part, variance in zip(adopted, equations.variances(sizes)[3:], strict=True):
+        covariance = variance * camera_error_part(part, recon_from_camera, fit[1], every)
+        out = covariance if out is None else out + covariance
+    return out
+
+
+def camera_error_part(
+    part: Part, recon_from_camera: Poses, scale: float, rows: Int[ndarray, " m"]
+) -> Float[ndarray, "s s"]:
+    """Return the covariance (6m,6m) of the errors of camera poses `rows` by one part, for its typical size.
+
+    The errors are steps of the poses (geometry.retract; recon axes). `scale` is in metres per unit of the
+    reconstruction; random walks run over all n poses of `recon_from_camera`.
+    """
+    n, position, axis = len(recon_from_camera), recon_from_camera[:, :3, 3], recon_from_camera[:, :3, 2]
+    if part in WALKS:
+        moves = np.zeros((len(rows), n - 1, 6, 7))
+        # Rotations are about each camera's centre; a scale error changes the translation from the previous camera.
+        moves[:, :, :3] = by_similarity(position[rows, None] - position[1:])
+        moves[:, :, :3, 6] = position[rows, None] - position[:-1]
+        moves[:, :, 3:, 3:6] = np.eye(3)
+        moves *= (rows[:, None] > np.arange(n - 1))[..., None, None]
+        columns, size = WALKS[part]
+        half = moves[..., columns].swapaxes(1, 2).reshape(6 * len(rows), -1)
+        return (size / scale if part == "walk of position" else size) ** 2 * half @ half.T
+    halves = np.zeros((len(rows), 6, 3))
+    if part == "depth":
+        halves[:, :3, 0] = TYPICAL_M / scale * axis[rows]
+    elif part == "depth from a fixed camera":
+        halves[:, 2, 0] = TYPICAL_M / scale
+    else:
+        centre = np.zeros(3) if part == "rotation about the origin" else nearest_to_lines(position, axis)
+        halves[:, :3] = TYPICAL_RAD * by_similarity(position[rows] - centre)[:, :, ROTATION]
+        halves[:, 3:] = TYPICAL_RAD * np.eye(3)
+    return np.asarray(block_diag(*(halves @ halves.swapaxes(1, 2))))
