@@ -13,7 +13,7 @@ from jcr.errors import InputError
 from jcr.estimation.kinematics import Arm
 from jcr.geometry import Transform, transform
 
-Limits = Sequence[tuple[float, float]]
+Limits = Sequence[tuple[float, float]] | Float[ndarray, "n 2"]
 Numbers = Sequence[float | int]
 TWICE = (-2 * pi, 2 * pi)
 """Limits (rad) of a joint with a full rotation in each direction."""
@@ -109,6 +109,8 @@ XARM7 = """
 0 0 0 0 0 0"""
 
 
+# Unitree Z1: robots/z1_description/xacro of unitreerobotics/unitree_ros, link dimensions of its z1.urdf; the gripper is
+# where its own is mounted (gripperStator), x forward.
 Z1 = """
 0 0 0.0585 0 0 0
 0 0 0.045 0 0 0
@@ -119,34 +121,15 @@ Z1 = """
 0.051 0 0 0 0 0"""
 
 
-def _z1() -> Arm:
-    """Return a Unitree Z1; the gripper is where its own is mounted (gripperStator), x forward.
-
-    Source: robots/z1_description/xacro of unitreerobotics/unitree_ros, link dimensions of its z1.urdf.
-    """
-    degrees = ((-150, 150), (0, 170), (-165, 0), (-87, 87), (-77, 77), (-160, 160))
-    limits = [(float(np.radians(low)), float(np.radians(high))) for low, high in degrees]
-    arm = _arm("z1", Z1, limits, (0.0, 1.6, -1.2, 0.9, 0.0, 0.0))
-    return replace(arm, axes=np.eye(3)[[2, 1, 1, 1, 2, 0]], forward=np.array([1.0, 0.0, 0.0]))
-
-
+# SO-101 follower, five joints without the jaw: Simulation/SO101/so101_new_calib.urdf of TheRobotStudio/SO-ARM100 (zero
+# in the middle of each range); the gripper is gripper_frame_link, at the jaw's tip.
+SO101_TIP = transform(np.diag([-1.0, 1.0, -1.0]), np.array([-0.0079, -0.000218121, -0.0981274]))
 SO101 = """
 0.0388353 0 0.0624 180 0 -180
 -0.0303992 -0.0182778 -0.0542 -90 -90 0
 -0.11257 -0.028 0 0 0 90
 -0.1349 0.0052 0 0 0 -90
 0 -0.0611 0.0181 90 2.789129898807091 180"""
-
-
-def _so101() -> Arm:
-    """Return an SO-101 follower, five joints without the jaw; the gripper is gripper_frame_link, at the jaw's tip.
-
-    Source: Simulation/SO101/so101_new_calib.urdf of TheRobotStudio/SO-ARM100 (zero in the middle of each range).
-    """
-    tip = transform(np.diag([-1.0, 1.0, -1.0]), np.array([-0.0079, -0.000218121, -0.0981274]))
-    ends = ((-1.91986, 1.91986), (-1.74533, 1.74533), (-1.69, 1.69), (-1.65806, 1.65806), (-2.74385, 2.84121))
-    return _arm("so101", SO101, ends, (0.0, -0.8, 0.5, 1.25, 0.0), tip)
-
 
 RobotName = Literal[
     "ur3e", "ur5e", "ur10e", "panda", "fr3", "iiwa7", "iiwa14", "xarm6", "xarm7", "z1", "so101"
@@ -157,6 +140,8 @@ _PANDA = [(-2.8973, 2.8973), (-1.7628, 1.7628), (-2.8973, 2.8973), (-3.0718, -0.
           (-0.0175, 3.7525), (-2.8973, 2.8973)]
 _FR3 = [(-2.7437, 2.7437), (-1.7837, 1.7837), (-2.9007, 2.9007), (-3.0421, -0.1518), (-2.8065, 2.8065),
         (0.5445, 4.5169), (-3.0159, 3.0159)]
+_Z1 = np.radians([(-150, 150), (0, 170), (-165, 0), (-87, 87), (-77, 77), (-160, 160)])
+_SO101 = [(-1.91986, 1.91986), (-1.74533, 1.74533), (-1.69, 1.69), (-1.65806, 1.65806), (-2.74385, 2.84121)]
 _XARM6 = [TWICE, (-2.059, 2.0944), (-3.927, 0.19198), TWICE, (-1.69297, pi), TWICE]
 _XARM7 = [TWICE, (-2.059, 2.0944), TWICE, (-0.19198, 3.927), TWICE, (-1.69297, pi), TWICE]
 # fmt: on
@@ -170,8 +155,12 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
     "iiwa14": lambda: _iiwa("iiwa14", 0.36, 0.42, 0.4),
     "xarm6": lambda: _arm("xarm6", XARM6, _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
     "xarm7": lambda: _arm("xarm7", XARM7, _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
-    "z1": _z1,
-    "so101": _so101,
+    "z1": lambda: replace(
+        _arm("z1", Z1, _Z1, (0.0, 1.6, -1.2, 0.9, 0.0, 0.0)),
+        axes=np.eye(3)[[2, 1, 1, 1, 2, 0]],
+        forward=np.array([1.0, 0.0, 0.0]),
+    ),
+    "so101": lambda: _arm("so101", SO101, _SO101, (0.0, -0.8, 0.5, 1.25, 0.0), SO101_TIP),
 }
 ROBOT_NAMES: tuple[RobotName, ...] = get_args(RobotName)
 CHOICES = f"{{{','.join(ROBOT_NAMES)}}}"

@@ -9,8 +9,8 @@ Measured sizes: ten real boards of 100 to 250 mm have 0.05 to 0.25 mm rms about 
 included (docs/results/real.md). Sheets bend by up to 3.6 mm, which the corners show to a few hundredths.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,7 @@ from numpy import ndarray
 from numpy.polynomial.legendre import legvander2d
 
 from jcr.estimation.elimination import Derivatives
-from jcr.geometry import Transform, apply, fit_similarity, skew
+from jcr.geometry import apply, fit_similarity, skew
 from jcr.records import Boards
 
 CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
@@ -61,17 +61,6 @@ class BoardShapes:
     def rig(self) -> Int[ndarray, " c"]:
         """Rig number of each corner's body (board or tag)."""
         return self.first_rig + self.body
-
-    def of_points(self, kept: Int[ndarray, " p"]) -> "BoardShapes":
-        """Return the shape prior after all points but those of the rows `kept` (ascending) are removed."""
-        rows = np.flatnonzero(np.isin(self.point, kept))
-        return replace(
-            self,
-            point=np.searchsorted(kept, self.point[rows]),
-            body=self.body[rows],
-            x_in_body=self.x_in_body[rows],
-            by_shape=self.by_shape[rows],
-        )
 
     def residual(
         self,
@@ -121,19 +110,6 @@ class BoardShapes:
             residual=residual.reshape(-1, 2),
         )
 
-    def point_information(
-        self, world_from_rig: Float[ndarray, "m 4 4"], shape: Float[ndarray, " s"], points: int
-    ) -> Float[ndarray, "p 3 3"]:
-        """Return the information matrix (inverse covariance) of each of p points by the prior, for exact body poses.
-
-        The matrix is 0 for a point that is not a corner; `points` is the number p.
-        """
-        whitened = np.exp(-shape[0]) * np.swapaxes(world_from_rig[self.rig, :3, :3], 1, 2)
-        whitened /= CORNER_STD_M[:, None]
-        out = np.zeros((points, 3, 3))
-        out[self.point] = np.swapaxes(whitened, 1, 2) @ whitened
-        return out
-
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
         """Return the height of each corner above the plane of its body, in the unit of `x_in_body`."""
         return self.by_shape[:, 2] @ shape
@@ -147,7 +123,15 @@ def shapes_of(
     A body is a board or tag; its rig has a number from `first_rig` on. Only corners that are `seen`, and bodies with at
     least four of them, are used. The prior is None without bodies.
     """
-    bodies = [] if boards is None else list(_seen_bodies(boards, points_in_world, seen))
+    bodies = []
+    for body in () if boards is None else boards.bodies:
+        rows = np.flatnonzero(seen[body.point])
+        x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
+        if len(rows) < FEWEST_CORNERS or np.linalg.matrix_rank(x - x.mean(0), tol=0.1 * np.ptp(x)) < 2:
+            continue
+        pose, size = fit_similarity(there, x)
+        if np.abs(apply(pose, size * x) - there).max() < size * np.ptp(x):
+            bodies.append((body.point[rows], x, pose, size))
     if not bodies:
         return None, np.zeros((0, 4, 4))
     points, x_in_body, poses, sizes = zip(*bodies, strict=True)
@@ -171,23 +155,6 @@ def shapes_of(
         unit=unit,
     )
     return shapes, np.stack(poses)
-
-
-def _seen_bodies(
-    boards: Boards, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"]
-) -> Iterator[tuple[Int[ndarray, " c"], Float[ndarray, "c 3"], Transform, float]]:
-    """Yield each body with enough seen corners: point rows and printed positions of the corners, world_from_body, size.
-
-    The size is the length of one stated metre, in units of the world.
-    """
-    for body in boards.bodies:
-        rows = np.flatnonzero(seen[body.point])
-        x, there = body.x_in_body[rows], points_in_world[body.point[rows]]
-        if len(rows) < FEWEST_CORNERS or np.linalg.matrix_rank(x - x.mean(0), tol=0.1 * np.ptp(x)) < 2:
-            continue
-        pose, size = fit_similarity(there, x)
-        if np.abs(apply(pose, size * x) - there).max() < size * np.ptp(x):
-            yield body.point[rows], x, pose, size
 
 
 def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:

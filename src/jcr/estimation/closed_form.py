@@ -31,8 +31,21 @@ def closed_form(
     """
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
     rotation, base_rotation = rotations(of_gripper, of_camera, rounds)
-    x, scale, z = _translations(base_from_gripper, recon_from_camera, base_rotation)
-    return transform(rotation, x), scale, transform(base_rotation, z)
+    # Least squares of R_G t_X + t_G = λ R_Z t_C + t_Z; the paper prints t_c^e for t_C in its d_i(λ).
+    center, position = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, 3]
+    in_base = center @ np.swapaxes(base_rotation, -1, -2)
+    rows = np.concatenate([of_gripper, -in_base[..., None], -position[..., None]], axis=-1)
+    rows = rows - rows.mean(-3, keepdims=True)
+    # The scale's column is normalised, so that the cut of singular values does not depend on the reconstruction's unit.
+    # Camera centres that differ by rounding only count as equal.
+    size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
+    unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
+    rows[..., 3] /= unit[..., None, None]
+    rows = rows.reshape(*rows.shape[:-3], -1, 5)
+    solution = np.linalg.pinv(rows[..., :4], rcond=RELATIVE_CUT) @ rows[..., 4:]
+    translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
+    gap = (of_gripper @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * in_base
+    return transform(rotation, translation), scale, transform(base_rotation, gap.mean(-2))
 
 
 def initial_estimate(
@@ -115,28 +128,3 @@ def _polished(
             break
     gap = gripper @ rotation[:, None] - base[:, None] @ camera
     return rotation, base, (gap**2).sum((-1, -2, -3))
-
-
-def _translations(
-    base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations
-) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
-    """Return t_X, λ and t_Z by linear least squares from R_G t_X + t_G = λ R_Z t_C + t_Z.
-
-    X is gripper_from_camera, Z base_from_recon with rotation R_Z = `base_rotation`, λ the scale, G base_from_gripper
-    and C recon_from_camera. The paper prints t_c^e for t_C in its d_i(λ).
-    """
-    center, rotation = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
-    in_base = center @ np.swapaxes(base_rotation, -1, -2)
-    position = base_from_gripper[..., :3, 3]
-    rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
-    rows = rows - rows.mean(-3, keepdims=True)
-    # The scale's column is normalised, so that the cut of singular values does not depend on the reconstruction's unit.
-    # Camera centres that differ by rounding only count as equal.
-    size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
-    unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
-    rows[..., 3] /= unit[..., None, None]
-    rows = rows.reshape(*rows.shape[:-3], -1, 5)
-    solution = np.linalg.pinv(rows[..., :4], rcond=RELATIVE_CUT) @ rows[..., 4:]
-    translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
-    gap = (rotation @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * in_base
-    return translation, scale, gap.mean(-2)

@@ -24,7 +24,7 @@ from jcr.estimation.robot_noise import (
     over_sizes,
     solve_equations,
 )
-from jcr.records import Budget, RobotNoise
+from jcr.records import Budget
 
 COVERED = 0.99
 """Probability of the ellipsoid that the enlarged covariance must contain."""
@@ -60,7 +60,15 @@ def posterior(
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
         """Return the covariance of the unknowns by systematic robot errors, which differ at other poses."""
         part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
-        return region.spread(_blocks_of_poses(part) if expected else _second_moment(solution, part))
+        second_moment = blocks_of_poses(part)
+        if expected:
+            return region.spread(second_moment)
+        # E[e eᵀ] of each pose's systematic error e, given the residuals of all poses.
+        for sign, whitened in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
+            columns = np.moveaxis(whitened.reshape(*whitened.shape[:-1], -1, 6), -2, -3)
+            second_moment = second_moment + sign * np.swapaxes(columns, -1, -2) @ columns
+        mean = (part @ solution.weighed_left[..., None]).reshape(*part.shape[:-2], -1, 6)
+        return region.spread(second_moment + mean[..., :, None] * mean[..., None, :])
 
     found = over_sizes(equations, mode, information, density)
     groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
@@ -74,30 +82,6 @@ def posterior(
     return step, covariance, _budget(equations, mode, at_mode, covariance)
 
 
-def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Region) -> Square:
-    """Return the predicted covariance (p,p) of the unknowns if the error sizes are exactly those of `noise`.
-
-    The covariance includes `region.spread`. The function is faster than `posterior`.
-    """
-    mode = equations.log_sizes_of(noise)
-    part = equations.variances(mode)[2] * equations.systematic
-    return solve_equations(equations, mode).covariance + region.spread(_blocks_of_poses(part))
-
-
-def _second_moment(solution: LinearSolution, part: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return E[e eᵀ] of each of m poses' systematic errors e, given the residuals of all poses.
-
-    `part` is the prior covariance (s,s) of the errors, s = 6m, for each of k error sizes.
-    """
-    expected = (part @ solution.weighed_left[..., None])[..., 0]
-    own = _blocks_of_poses(part)
-    for sign, root in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
-        columns = np.moveaxis(root.reshape(*root.shape[:-1], -1, 6), -2, -3)
-        own = own + sign * np.swapaxes(columns, -1, -2) @ columns
-    expected = expected.reshape(*expected.shape[:-1], -1, 6)
-    return own + expected[..., :, None] * expected[..., None, :]
-
-
 def _whitened_and_fitted(
     solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
@@ -106,7 +90,7 @@ def _whitened_and_fitted(
     return lower(solution.root, matrix), fitted
 
 
-def _blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
+def blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
     """Return the diagonal block (6,6) of each of m poses from a covariance (s,s) of all poses, s = 6m."""
     m = covariance.shape[-1] // 6
     each = np.arange(m)

@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.estimation.boards import CORNER_STD_M
 from jcr.estimation.elimination import Normal, cholesky, inverse_of, over, with_fixed_points, without_points
 from jcr.estimation.intrinsics_prior import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
-from jcr.estimation.problem import Problem, State, similarities, similarities_of_rigs, stepped
+from jcr.estimation.problem import Problem, State, similarities_of_rigs, stepped
 from jcr.estimation.projection import (
     ProjectedObservations,
     by_points,
     derivatives,
-    shape_residuals,
     view_of,
 )
 from jcr.geometry import step_between
@@ -114,9 +114,14 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
         noise = pixel_noise(layout, residual_px, depth, np.ones(layout.groups))
     else:
         by, known = by_points(problem, state, view), None
-        if problem.boards is not None:
-            shape = state.camera_steps[problem.columns.boards]
-            known = problem.boards.point_information(state.world_from_rig, shape, len(state.points_in_world))
+        if (boards := problem.boards) is not None:
+            # Information of each corner's point by the shape of its board, for exact poses of the boards.
+            size = np.exp(-state.camera_steps[problem.columns.boards.start])
+            whitened = (
+                size * np.swapaxes(state.world_from_rig[boards.rig, :3, :3], 1, 2) / CORNER_STD_M[:, None]
+            )
+            known = np.zeros((len(state.points_in_world), 3, 3))
+            known[boards.point] = np.swapaxes(whitened, 1, 2) @ whitened
         noise = refined_noise(layout, before, residual_px, depth, by, problem.seen.starts, known)
     return replace(state, pixel_noise=noise)
 
@@ -175,8 +180,11 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
         # The rigs of cameras fix the unit of the world; boards do not, for λ would then depend on their size.
         boards, first = problem.boards, problem.columns.first_rig
         rigs = slice(first, len(information) if boards is None else first + 6 * boards.first_rig)
-        by_similarity = similarities(problem, state)
-        by_similarity[problem.columns.boards] = by_similarity[rigs.stop :] = 0.0
+        by_similarity = np.zeros((len(information), 7))
+        by_similarity[rigs] = similarities_of_rigs(state.world_from_rig)[: rigs.stop - first]
+        for mount, columns in zip(state.rig_from_camera, problem.columns.mounts, strict=True):
+            if columns is not None:
+                by_similarity[columns.start : columns.start + 3, 0] = mount[:3, 3]
         information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
     found = ImageEvidence(
         problem=problem, state=state, view=view, information=information, gradient=-normal.right
@@ -190,14 +198,13 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
     The model error is the distortion that the camera model cannot express. The second result is the largest absolute
     change of the logarithm of a size.
     """
-    state, columns = images.state, [c for c in images.problem.columns.model_error if c.stop > c.start]
+    state, change, sizes = images.state, 0.0, images.state.model_error_std.copy()
+    columns = {k: own for k, own in enumerate(images.problem.columns.model_error) if own.stop > own.start}
     if not columns:
         return images, 0.0
-    covariance, change = np.linalg.inv(images.information), 0.0
+    covariance = np.linalg.inv(images.information)
     information, gradient = images.information.copy(), images.gradient.copy()
-    sizes = state.model_error_std.copy()
-    cameras = [k for k, c in enumerate(images.problem.columns.model_error) if c.stop > c.start]
-    for k, own in zip(cameras, columns, strict=True):
+    for k, own in columns.items():
         steps, std = state.camera_steps[own], float(sizes[k])
         likeliest = steps - covariance[own] @ images.gradient
         sizes[k] = size_of(likeliest, covariance[own, own], std)
@@ -248,7 +255,11 @@ def _cost(
     """Return the cost in squared standard deviations: weighted residuals, priors, boards and `known` information."""
     total = float(weight @ (view.residual_px**2).sum(1))
     total += float(((state.camera_steps / problem.prior_std(state)) ** 2).sum())
-    total += float((shape_residuals(problem, state) ** 2).sum())
+    if problem.boards is not None:
+        shape = state.camera_steps[problem.columns.boards]
+        total += float(
+            (problem.boards.residual(state.world_from_rig, state.points_in_world, shape) ** 2).sum()
+        )
     for one in known:
         steps = one.steps(state)
         total += float(steps @ one.information @ steps + 2 * one.gradient @ steps)

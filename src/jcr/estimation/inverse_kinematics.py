@@ -68,7 +68,7 @@ class Posture:
 
     @property
     def fits(self) -> bool:
-        """Whether the arm reaches every pose."""
+        """Whether the arm reaches every pose with a misfit below FITS."""
         return bool((self.misfit < FITS).all())
 
 
@@ -131,7 +131,10 @@ def _posture(
     flange_from_tool: Transform,
     rng: np.random.Generator,
 ) -> Posture:
-    """Return joint angles for poses of a known tool: from solutions of many initial angles, the smoothest sequence."""
+    """Return the posture for n poses `base_from_tool` of a tool that is fixed on the flange by `flange_from_tool`.
+
+    Each pose is solved from STARTS initial angles, random ones by `rng`; `_path` chooses one solution of each.
+    """
     base_from_gripper = base_from_tool @ inverse(flange_from_tool)
     # The initial angles are the rest posture and random ones within the limits, at most ±180° about their middle.
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
@@ -179,7 +182,7 @@ def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n 
 def _change(
     arm: Arm, a: Float[ndarray, "... dof"], b: Float[ndarray, "... dof"]
 ) -> Float[ndarray, "... dof"]:
-    """Return the change from angles a to b; the shorter way for joints whose limits span a full rotation."""
+    """Return b − a for joint angles a and b (rad), in (−π, π] for joints whose limits span a full rotation."""
     return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, (b - a + np.pi) % (2 * np.pi) - np.pi, b - a)
 
 
@@ -259,12 +262,25 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """
     nominal = forward_kinematics(arm, joints)
     half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
-    tool, _, base = closed_form(base_from_gripper, nominal)
+    tool, scale, base = closed_form(base_from_gripper, nominal)
+    scale = float(scale)
     fits = [
         fit_known_scale(base_from_gripper, nominal, start, NOISE)
         for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_rotation), (tool, base))
     ]
-    _require_length(arm, base_from_gripper, nominal)
+    residual, j = pose_residuals(tool, scale, base, base_from_gripper, nominal)
+    metres, radians = _apart(residual)
+    if scale > 0 and metres <= AGREE[0] * arm.reach * scale and radians <= AGREE[1]:
+        left = max(6 * len(nominal) - j.shape[2], 1)
+        noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
+        j /= np.repeat(noise, 3)[:, None]
+        std = scale * float(np.sqrt(expected_covariance(np.einsum("nij,nik->jk", j, j))[6, 6]))
+        if abs(scale - 1) > max(ALIKE, SURE * std):
+            raise LengthError(
+                f"the gripper positions are {100 * abs(scale - 1):.1f} ± {100 * std:.1f} % too "
+                f"{'long' if scale > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "
+                "positions, and that this is the robot"
+            )
     best = min(fits, key=lambda fit: float(((fit.residual / np.repeat(NOISE, 3)) ** 2).sum()))
     metres, radians = _apart(best.residual)
     if metres > AGREE[0] * arm.reach or radians > AGREE[1]:
@@ -275,28 +291,6 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     frames = arm.parent_from_joint.copy()
     frames[0] = best.base_from_recon @ frames[0]
     return with_tool(replace(arm, parent_from_joint=frames), inverse(best.gripper_from_camera))
-
-
-def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
-    """Raise LengthError if the gripper positions are those of forward kinematics (`nominal`) times a factor."""
-    tool, scale, base = closed_form(base_from_gripper, nominal)
-    factor = float(scale)
-    if factor <= 0:  # unobservable
-        return
-    residual, j = pose_residuals(tool, factor, base, base_from_gripper, nominal)
-    metres, radians = _apart(residual)
-    if metres > AGREE[0] * arm.reach * factor or radians > AGREE[1]:
-        return
-    left = max(6 * len(nominal) - j.shape[2], 1)
-    noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
-    j /= np.repeat(noise, 3)[:, None]
-    std = factor * float(np.sqrt(expected_covariance(np.einsum("nij,nik->jk", j, j))[6, 6]))
-    if abs(factor - 1) > max(ALIKE, SURE * std):
-        raise LengthError(
-            f"the gripper positions are {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % too "
-            f"{'long' if factor > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "
-            "positions, and that this is the robot"
-        )
 
 
 def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:

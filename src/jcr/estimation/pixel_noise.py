@@ -42,10 +42,6 @@ class PixelNoise:
     common: float = 1.0
     """Share c of the variance that is equal for all observations; the share 1 − c varies as the matching states."""
 
-    def change(self, before: "PixelNoise") -> float:
-        """Return the largest absolute change of the logarithm of `sigma_px` from an earlier estimate."""
-        return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
-
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
         """Return the variance (px²) of each of k observations' coordinates, without the inflation."""
         return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
@@ -53,9 +49,10 @@ class PixelNoise:
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
     ) -> Float[ndarray, " k"]:
-        """Return the weights (1/px²): inverse inflated variances times the weight of the Cauchy loss.
+        """Return the weight (1/px²) of each of k observations: Cauchy weight of its residual over its variance.
 
-        Points behind a camera, or nearer than NEAREST of the median depth, have weight 0.
+        `depth` is the depth of each observed point; points behind a camera, or nearer than NEAREST of the median depth,
+        have weight 0.
         """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance

@@ -7,7 +7,7 @@ propagated (Kogan, mrcal, "Projection uncertainty").
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import (
@@ -90,7 +90,10 @@ def bounds_at(
     x_px: Float[ndarray, "2"],
     distance_m: float,
 ) -> Seen:
-    """Return the 95 % bounds of the error of a pixel's point: in total, across and along the ray, and in direction."""
+    """Return 95 % bounds of the error of the point at `distance_m` (m) along the ray of the pixel `x_px`.
+
+    The error is relative to the gripper. `x` is gripper_from_camera; `uncertainty` is that of `point_covariance`.
+    """
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
@@ -196,73 +199,41 @@ def scene_points(solution: Solution) -> ScenePoints:
     The first is the joint covariance of all points by the errors of the unknowns and rigs, the second that of each
     point by triangulation.
     """
-    likely, images = solution.most_likely, solution.images
-    count = len(images.state.points_in_world)
-    some = np.sort(np.random.default_rng(0).permutation(count)[:SCENE_POINTS])
-    base_from_world, scale = likely.z[0][:3, :3], likely.scale
-    in_base_axes = scale * images.state.points_in_world[some] @ base_from_world.T
-    by_column, own = _triangulation(solution, some)
-    by_column = scale * base_from_world @ by_column
-    by_unknown, column_covariance = _rigs_given_unknowns(solution)
-    j = by_column @ by_unknown
-    by_frame = by_similarity(in_base_axes)
-    j[:, :, BASE_TRANSLATION] += by_frame[:, :, :3]
-    j[:, :, BASE_ROTATION] += by_frame[:, :, 3:6]
-    j[:, :, SCALE] += by_frame[:, :, 6:]
-    j, by_column = j.reshape(3 * len(some), -1), by_column.reshape(3 * len(some), -1)
-    together = j @ solution.covariance @ j.T + by_column @ column_covariance @ by_column.T
-    together = together.reshape(len(some), 3, len(some), 3)
-    own = scale**2 * base_from_world @ own @ base_from_world.T
-    return in_base_axes + likely.z[0][:3, 3], together, own
-
-
-def _triangulation(
-    solution: Solution, some: Int[ndarray, " n"]
-) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
-    """Return the derivative of n points by d columns (cameras, boards, rigs), and each point's covariance.
-
-    The covariance is that by errors of the observations, for exact columns. `some` are the ascending numbers of the
-    points; the order of columns is that of `Problem.columns`.
-    """
-    images, problem = solution.images, solution.problem
+    problem, likely, images = solution.problem, solution.most_likely, solution.images
+    some = np.sort(np.random.default_rng(0).permutation(len(images.state.points_in_world))[:SCENE_POINTS])
+    base_from_world, scale, count = likely.z[0][:3, :3], likely.scale, len(some)
+    # Each point follows from its observations, given the columns (cameras, boards, rigs) of `Problem.columns`.
     _, rows_point, rows_rig, _ = problem.rows
     rows = np.flatnonzero(np.isin(rows_point, some))
-    point = np.searchsorted(some, rows_point[rows])
+    starts = np.flatnonzero(np.diff(rows_point[rows], prepend=-1))
     by = derivatives(problem, images.state, images.view, images.weight)
-    by_point = by.by_point[rows]
-    starts = np.flatnonzero(np.diff(point, prepend=-1))
+    by_point, first = by.by_point[rows], problem.columns.first_rig
     blocks = point_blocks(by_point, starts)
-    first = problem.columns.first_rig
-    columns = np.zeros((len(rows), 2, len(images.gradient)))
+    columns = np.zeros((len(rows), 2, problem.columns.count))
     columns[:, :, :first] = by.shared[rows]
     own = first + 6 * rows_rig[rows][:, None] + np.arange(6)
     columns[np.arange(len(rows))[:, None, None], np.arange(2)[:, None], own[:, None]] = by.own[rows]
     coupling = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ columns, starts)
-    return -np.linalg.solve(blocks, coupling), np.linalg.inv(blocks)
-
-
-def _rigs_given_unknowns(solution: Solution) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
-    """Return the derivative of the d `Problem.columns` by the p unknowns, and their covariance for exact unknowns.
-
-    The columns are cameras, boards and rigs. Only the covariance of the rigs that arms move is not zero; the other
-    columns are unknowns.
-    """
-    problem, equations, (follow, _, rig_covariance) = (
-        solution.problem,
-        solution.equations,
-        solution.images.rigs,
-    )
-    by_rig = reported_poses(problem, solution.most_likely)[2]
-    shown = pose_by_pose(by_rig, rig_covariance)
-    gain = over(cholesky(equations.covariance(solution.log_sizes)), shown).T
-    robots, columns, free, by_arm = problem.arm_unknowns, problem.columns.count, problem.free, problem.by_arm
-    by_unknown = np.zeros((columns, len(solution.covariance)))
+    by_column = -scale * base_from_world @ np.linalg.solve(blocks, coupling)
+    # The columns are unknowns, except the rigs that arms move; these follow from images and reported poses.
+    follow, _, rig_covariance = images.rigs
+    shown = pose_by_pose(reported_poses(problem, likely)[2], rig_covariance)
+    gain = over(cholesky(solution.equations.covariance(solution.log_sizes)), shown).T
+    robots, free, by_arm = problem.arm_unknowns, problem.free, problem.by_arm
+    by_unknown = np.zeros((problem.columns.count, problem.unknowns))
     by_unknown[free, robots + np.arange(len(free))] = 1.0
-    by_unknown[by_arm] = -gain @ equations.jacobian
+    by_unknown[by_arm] = -gain @ solution.equations.jacobian
     by_unknown[by_arm, robots:] -= follow
-    left = np.zeros((columns, columns))
-    left[np.ix_(by_arm, by_arm)] = rig_covariance - gain @ shown
-    return by_unknown, left
+    j = by_column @ by_unknown
+    in_base_axes = scale * images.state.points_in_world[some] @ base_from_world.T
+    by_frame = by_similarity(in_base_axes)
+    j[:, :, BASE_TRANSLATION] += by_frame[:, :, :3]
+    j[:, :, BASE_ROTATION] += by_frame[:, :, 3:6]
+    j[:, :, SCALE] += by_frame[:, :, 6:]
+    j, by_rig = j.reshape(3 * count, -1), by_column[:, :, by_arm].reshape(3 * count, -1)
+    together = j @ solution.covariance @ j.T + by_rig @ (rig_covariance - gain @ shown) @ by_rig.T
+    triangulated = scale**2 * base_from_world @ np.linalg.inv(blocks) @ base_from_world.T
+    return in_base_axes + likely.z[0][:3, 3], together.reshape(count, 3, count, 3), triangulated
 
 
 def _covariance(

@@ -90,23 +90,18 @@ class Region:
         E[e'e'ᵀ] (m,6,6) of the error e' of each pose that X and Z do not absorb. It is corrected for each pose's
         leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
         """
-        own, m = self._corrected, second_moment.shape[-3]
-        spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
-        out = np.zeros((*spread.shape[:-2], self.unknowns, self.unknowns))
-        rows = np.delete(np.arange(1 + self.by_unknown.shape[1]), SCALE)
-        out[..., rows[:, None], rows] = spread
-        return out
-
-    @cached_property
-    def _corrected(self) -> Float[ndarray, "m u 6"]:
-        """Derivative of the u unknowns X and Z by each pose's residual, divided by one minus the pose's leverage."""
-        m = len(self.by_unknown) // 6
-        u = self.by_unknown.shape[1]
+        m, u = second_moment.shape[-3], self.by_unknown.shape[1]
         own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
+        # The derivative of X and Z by each pose's residual is divided by one minus the pose's leverage.
         leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, u) @ own) / EFFECTIVE_WEIGHT
         values, vectors = np.linalg.eigh((leverage + leverage.swapaxes(1, 2)) / 2)
         vectors = vectors / EFFECTIVE_WEIGHT[:, None]
-        return own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))
+        own = own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))
+        spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
+        out = np.zeros((*spread.shape[:-2], self.unknowns, self.unknowns))
+        rows = np.delete(np.arange(1 + u), SCALE)
+        out[..., rows[:, None], rows] = spread
+        return out
 
 
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
@@ -159,19 +154,6 @@ def pose_residuals(
     if exchanged:
         return step_between(base_from_gripper, inverse(predicted)), by_inverse(predicted) @ j
     return step_between(base_from_gripper, predicted), j
-
-
-def residuals_by_camera(
-    x: Transform, scale: float, z: Transform, recon_from_camera: Poses, exchanged: bool = False
-) -> Float[ndarray, "n 6 6"]:
-    """Return the derivative of the residuals of `pose_residuals` by a step (6) of each image's recon_from_camera."""
-    base_from_recon = z[:3, :3]
-    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
-    j = np.zeros((len(lever), 6, 6))
-    j[:, :3, :3] = scale * base_from_recon
-    j[:, :3, 3:] = base_from_recon @ skew(lever)
-    j[:, 3:, 3:] = base_from_recon
-    return by_inverse(predicted_gripper_poses(x, scale, z, recon_from_camera)) @ j if exchanged else j
 
 
 def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"]) -> Float[ndarray, "r c"]:
@@ -261,7 +243,15 @@ def reported_poses(
         residual, by_unknown = pose_residuals(*at, arm.base_from_gripper, rigs, exchanged)
         # X, then the scale that all arms share, then Z.
         jacobian[begin : begin + len(rigs), :, np.insert(columns_of_arm(k), 6, SCALE.start)] = by_unknown
-        each.append((residual, residuals_by_camera(*at, rigs, exchanged)))
+        # Derivative of the residuals by a step of each rig.
+        base_from_world, x = state.z[k][:3, :3], state.x[k]
+        by_pose = np.zeros((len(rigs), 6, 6))
+        by_pose[:, :3, :3] = state.scale * base_from_world
+        by_pose[:, :3, 3:] = base_from_world @ skew(rigs[:, :3, :3] @ x[:3, :3].T @ x[:3, 3])
+        by_pose[:, 3:, 3:] = base_from_world
+        if exchanged:
+            by_pose = by_inverse(predicted_gripper_poses(*at, rigs)) @ by_pose
+        each.append((residual, by_pose))
         begin += len(rigs)
     residual, by_rig = (np.concatenate(part) for part in zip(*each, strict=True))
     return residual, jacobian, by_rig

@@ -13,14 +13,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, parameters, project, unproject, with_parameters
-from jcr.estimation.covariance import expected_covariance_at
+from jcr.estimation.covariance import blocks_of_poses
 from jcr.estimation.image_equations import image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import pose_equations, pose_residuals
 from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm, wrist_problem
-from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
+from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL, solve_equations
 from jcr.estimation.solve import Solution, uncertainty_of, with_covariance
 from jcr.geometry import (
     Poses,
@@ -140,16 +140,39 @@ def predict(
 
     `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad.
     """
-    camera, x = None, assumptions.gripper_from_camera
-    if assumptions.camera is None:
+    x, noise, camera = assumptions.gripper_from_camera, assumptions.noise, assumptions.camera
+    intrinsics = None
+    if camera is None:
         covariance = predict_covariance(assumptions, base_from_gripper, systematic)
         uncertainty = Uncertainty(covariance=covariance)
     else:
-        found = _predicted_solution(assumptions, assumptions.camera, base_from_gripper, systematic)
-        uncertainty, camera = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
+        # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
+        straight = parameters(camera.camera.intrinsics)
+        straight[4:] = 0.0
+        intrinsics = with_parameters(camera.camera.intrinsics, straight)
+        cameras = base_from_gripper @ x
+        problem, state = wrist_problem(
+            wrist_arm(base_from_gripper, systematic),
+            (x, 1.0, np.eye(4)),
+            cameras,
+            replace(camera.camera, intrinsics=intrinsics),
+            _observed_points(cameras, intrinsics, assumptions.distance_m),
+            noise=noise.given,
+        )
+        assert problem.observations is not None
+        per_image = len(problem.observations.point) / len(cameras)
+        state = replace(
+            state,
+            model_error_std=np.array([max(camera.model_error, LEAST_MODEL_ERROR)]),
+            pixel_noise=PixelNoise(np.array([np.sqrt(per_image / camera.information_per_px2)])),
+        )
+        images = image_evidence(problem, state)
+        images.information[np.diag_indices(len(images.information))] += UNCONNECTED
+        found = with_covariance(problem, state, images, expected=noise)
+        uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
     if assumptions.faults is not None:
         uncertainty = uncertainty.with_error(assumptions.faults)
-    return replace(uncertainty, seen=seen_points(x, uncertainty, camera, assumptions.distance_m))
+    return replace(uncertainty, seen=seen_points(x, uncertainty, intrinsics, assumptions.distance_m))
 
 
 def predict_covariance(
@@ -175,40 +198,10 @@ def predict_covariance(
     if averaged:
         return with_covariance(problem, state, None, expected=noise).covariance[:7, :7]
     poses = pose_equations(problem, state, None)
-    return expected_covariance_at(poses.equations, noise, poses.region)[:7, :7]
-
-
-def _predicted_solution(
-    assumptions: Assumptions,
-    camera: PredictedCamera,
-    base_from_gripper: Poses,
-    systematic: Float[ndarray, "s s"],
-) -> Solution:
-    """Return the predicted solution for images of a simulated scene; `systematic` is that of `predict`."""
-    # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
-    straight = parameters(camera.camera.intrinsics)
-    straight[4:] = 0.0
-    intrinsics = with_parameters(camera.camera.intrinsics, straight)
-    x, noise = assumptions.gripper_from_camera, assumptions.noise
-    cameras, count = base_from_gripper @ x, len(base_from_gripper)
-    problem, state = wrist_problem(
-        wrist_arm(base_from_gripper, systematic),
-        (x, 1.0, np.eye(4)),
-        cameras,
-        replace(camera.camera, intrinsics=intrinsics),
-        _observed_points(cameras, intrinsics, assumptions.distance_m),
-        noise=noise.given,
-    )
-    assert problem.observations is not None
-    per_image = len(problem.observations.point) / count
-    state = replace(
-        state,
-        model_error_std=np.array([max(camera.model_error, LEAST_MODEL_ERROR)]),
-        pixel_noise=PixelNoise(np.array([np.sqrt(per_image / camera.information_per_px2)])),
-    )
-    images = image_evidence(problem, state)
-    images.information[np.diag_indices(len(images.information))] += UNCONNECTED
-    return with_covariance(problem, state, images, expected=noise)
+    equations, log_sizes = poses.equations, poses.equations.log_sizes_of(noise)
+    systematic = equations.variances(log_sizes)[2] * equations.systematic
+    covariance = solve_equations(equations, log_sizes).covariance
+    return (covariance + poses.region.spread(blocks_of_poses(systematic)))[:7, :7]
 
 
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:

@@ -228,11 +228,6 @@ class Problem:
         return np.concatenate([own, self.freed], axis=1) if self.freed.size else own
 
     @cached_property
-    def images_differ(self) -> bool:
-        """Whether parameters of single images, or the thin prism, are free."""
-        return bool(self.directions[-OF_IMAGE * self.n_images - PRISM :].any())
-
-    @cached_property
     def model_error_counts(self) -> list[int]:
         """Number of distortion polynomials of each camera; 0 for exact intrinsics or too few observations."""
         counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
@@ -301,7 +296,7 @@ class Problem:
 
     @cached_property
     def camera_rows(self) -> list[Int[ndarray, "..."]]:
-        """Numbers of the observations of each camera."""
+        """For each camera the ascending indices of its observations among the k of `observations`."""
         return [np.flatnonzero(self.layout.camera == c) for c in range(len(self.cameras))]
 
     @cached_property
@@ -384,9 +379,19 @@ def with_observations(problem: Problem, state: State, observations: Observations
     count = np.bincount(observations.point[order], minlength=len(state.points_in_world))
     order = order[count[observations.point[order]] >= 2]
     kept, point = np.unique(observations.point[order], return_inverse=True)
+    boards = problem.boards
+    if boards is not None:
+        corners = np.flatnonzero(np.isin(boards.point, kept))
+        boards = replace(
+            boards,
+            point=np.searchsorted(kept, boards.point[corners]),
+            body=boards.body[corners],
+            x_in_body=boards.x_in_body[corners],
+            by_shape=boards.by_shape[corners],
+        )
     problem = replace(
         problem,
-        boards=None if problem.boards is None else problem.boards.of_points(kept),
+        boards=boards,
         observations=replace(
             observations,
             image=observations.image[order],
@@ -442,8 +447,8 @@ def freed(
 ) -> Problem:
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
-    `combinations` (e,p) has one direction per column; the e parameters are those of `hypotheses.Alternatives`. `images`
-    are the camera's m images among all `n_images`.
+    `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. `images` are the
+    numbers of the camera's m images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -557,20 +562,6 @@ def step_to(
             columns[of_mount] = step_between(state.rig_from_camera[c], other.rig_from_camera[c])
     columns[problem.columns.first_rig :] = step_between(state.world_from_rig, other.world_from_rig).ravel()
     return arms, columns
-
-
-def similarities(problem: Problem, state: State) -> Float[ndarray, "d 7"]:
-    """Return the derivative of the d `Problem.columns` by a similarity of the world: log scale, translation, rotation.
-
-    The d columns are cameras, boards and rigs. Images do not determine these seven directions.
-    """
-    out = np.zeros((problem.columns.count, 7))
-    out[problem.columns.first_rig :] = similarities_of_rigs(state.world_from_rig)
-    out[problem.columns.boards, 0][:1] = 1.0  # the logarithm of their size
-    for c, columns in enumerate(problem.columns.mounts):
-        if columns is not None:
-            out[columns.start : columns.start + 3, 0] = state.rig_from_camera[c, :3, 3]
-    return out
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:

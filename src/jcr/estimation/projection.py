@@ -63,7 +63,7 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
         centre[rows] = camera.cx, camera.cy
         from_centre[rows] = project(camera, in_camera[rows]) - centre[rows]
     projected, own_map = centre + from_centre, None
-    if problem.images_differ:
+    if problem.directions[problem.parameters_of[-1].stop :].any():
         off = problem.displacement(state)[problem.parameters_of[-1].stop :]
         of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
         per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
@@ -124,14 +124,6 @@ def derivatives(
     )
     both, order = [vars(of_images), vars(of_boards)], problem.rows[0]
     return Derivatives(**{name: np.concatenate([part[name] for part in both])[order] for name in both[0]})
-
-
-def shape_residuals(problem: Problem, state: State) -> Float[ndarray, "c 3"]:
-    """Return the residual of each board corner from its board's shape, in standard deviations, along board axes."""
-    if problem.boards is None:
-        return np.zeros((0, 3))
-    shape = state.camera_steps[problem.columns.boards]
-    return problem.boards.residual(state.world_from_rig, state.points_in_world, shape)
 
 
 def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:

@@ -7,7 +7,7 @@ residuals; those of wrong poses may have any size (Box and Tiao, Biometrika 55, 
 therefore give a larger estimated noise rather than many rejected poses.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -83,28 +83,32 @@ def robust_fit(
     used = np.ones(n, dtype=bool)
     if n >= 5:
         fewest = least_trimmed(base_from_gripper, recon_from_camera)[0]
-        used = max(
-            _improved(fitted, used, _fewer), _improved(fitted, fewest, _more), key=lambda found: found[1]
-        )[0]
+        searches = _improved(fitted, used, adding=False), _improved(fitted, fewest, adding=True)
+        used = max(searches, key=lambda found: found[1])[0]
     fit = solve(replace(every, used=used), fitted(used).most_likely)
     scale, z = fit.state.scale / unit, fit.state.z[0]
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
     return replace(fit, state=replace(fit.state, scale=scale, z=z[None]))
 
 
-def _improved(
-    fitted: Callable[[Images], Solution],
-    used: Images,
-    changes: Callable[[Solution, Images], Iterator[Images]],
-) -> tuple[Images, float]:
+def _improved(fitted: Callable[[Images], Solution], used: Images, adding: bool) -> tuple[Images, float]:
     """Return the mask of used images with the largest log evidence, by a greedy search from `used`, and that evidence.
 
-    `fitted` returns the fit for a mask; `changes` yields the masks to try next, from a fit and its mask.
+    `fitted` returns the fit for a mask. `adding`: each step adds all images that are more likely right than wrong, or
+    else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error, down to four images.
     """
     fit = fitted(used)
     best = _evidence(fit, used)
     while True:
-        for changed in changes(fit, used):
+        if adding:
+            _, spread = np.linalg.slogdet(fit.leave_one_out[1])
+            likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
+            joining = () if used.all() else (likelier > 0, likelier == likelier.max())
+            changes = [used | some for some in joining if some.any()]
+        else:
+            worst = np.arange(len(used)) == np.where(used, _distance(fit), -np.inf).argmax()
+            changes = [used & ~worst] if used.sum() > 4 else []
+        for changed in changes:
             tried = fitted(changed)
             evidence = _evidence(tried, changed)
             if evidence > best:
@@ -112,20 +116,6 @@ def _improved(
                 break
         else:
             return used, best
-
-
-def _more(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield masks with more images: with all that are more likely right than wrong, then with the likeliest one only."""
-    _, spread = np.linalg.slogdet(fit.leave_one_out[1])
-    likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
-    if not used.all():
-        yield from (used | joining for joining in (likelier > 0, likelier == likelier.max()) if joining.any())
-
-
-def _fewer(fit: Solution, used: Images) -> Iterator[Images]:
-    """Yield one mask, without the used image of the largest leave-one-out error; none if only four images are used."""
-    if used.sum() > 4:
-        yield used & (np.arange(len(used)) != np.where(used, _distance(fit), -np.inf).argmax())
 
 
 def _evidence(fit: Solution, used: Images) -> float:

@@ -325,7 +325,9 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         arms, columns, std = _joint_step(images, equations, log_sizes)
         last_step = float(np.abs(arms / std[:robots]).max())
         assert before is not None and state.pixel_noise is not None
-        change = max(change, resized, state.pixel_noise.change(before))
+        change = max(
+            change, resized, float(np.abs(np.log(state.pixel_noise.sigma_px / before.sigma_px)).max())
+        )
         if change < SIZES_SETTLED and last_step < STEP_SETTLED:
             return state, images, True, count, last_step
         share = share_within_limits(arms)

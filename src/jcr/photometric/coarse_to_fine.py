@@ -121,9 +121,10 @@ def align_photometrically(
 def _after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Return cameras and points after damped Gauss-Newton steps along the columns of `directions`.
+    """Return cameras and points that minimise the robust photometric cost of an image level, from given initial values.
 
-    With 7 rows of `directions`, all cameras move as one. `sigma` is the scale of the robust cost.
+    The p camera unknowns (order of `after_step`) move only along the q columns of `directions`; with p = 7 all cameras
+    move as one rigid body. `sigma` is the scale of the robust cost, in units of the image intensity.
     """
 
     def step(
@@ -147,9 +148,10 @@ def _after_descent(
 
 
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
-    """Return the cameras after a step: translation and rotation in camera axes, last the change of log focal length.
+    """Return the cameras moved by a step: translation (m) and rotation (rad) in camera axes, then log focal length.
 
-    The step has six numbers for all cameras together, or six for each.
+    `step` has p = 7 numbers, a motion (6) that all cameras make and the change of the log focal length, or p = 6n + 1,
+    a motion of each of n cameras and that change.
     """
     pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(

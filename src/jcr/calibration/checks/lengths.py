@@ -122,7 +122,7 @@ def check_lengths(case: Case) -> Case:
 
 
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with its `depth_check`, and all known lengths compared with the robot's positions."""
+    """Return the calibration with `depth_check` set, and the log ratio of the robot's length to each known length."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     size_std = None if boards is None or hand_eye.source == "poses" else boards.size_std
