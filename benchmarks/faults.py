@@ -45,7 +45,9 @@ MOVED = frozenset({FindingKind.SLIP, FindingKind.DRIFT})
 ORDER = frozenset({FindingKind.POSE_CONVENTION, FindingKind.DELAY, FindingKind.POSES_SWAPPED})
 ONE_POSE = frozenset({FindingKind.POSES_SWAPPED, FindingKind.POSE_CONTRADICTS_IMAGE})
 ROBOT = kinds_of("strain") | {FindingKind.JOINT_OFFSETS}
-BOARD = frozenset({FindingKind.BOARD_SIZE, FindingKind.BOARD_MOVED, FindingKind.BOARD_STRETCHED})
+BOARD = frozenset(
+    {FindingKind.BOARD_SIZE, FindingKind.BOARD_MOVED, FindingKind.BOARD_STRETCHED, FindingKind.BOARD_BENT}
+)
 SCENE = frozenset({FindingKind.BASE_MOVED, FindingKind.REPETITIVE})
 SCALE_ALONE = "positions 1 % too long"
 """Fault that no image shows: scale comes from the robot."""
@@ -126,6 +128,10 @@ RENDERED = (
     _case("images of half the resolution", INTRINSICS, change=make.halved),
     _case("mirrored images", ORDER, change=make.mirrored),
     _case("images sorted by name as text", ORDER, change=make.sorted_as_text),
+    *(
+        replace(_case(f"poses {what}, no intrinsics", ORDER, change=change), given=False)
+        for what, change in (("inverted", make.inverted), ("in reverse order", make.reversed_poses))
+    ),
     _case("one pose 5 mm 1° off", ONE_POSE, change=make.one_off(5.0, 1.0, 4), wrong=(4,)),
     _case("two poses exchanged", ONE_POSE, change=make.reordered(EXCHANGED), wrong=(3, 6)),
     _case("a frame that is repeated", ONE_POSE, change=make.repeated(4, (5,)), wrong=(5,)),
@@ -151,6 +157,8 @@ class Outcome:
     accepted: bool
     kinds: frozenset[FindingKind] = frozenset()
     """Kinds of the findings that warn or reject."""
+    remarks: frozenset[FindingKind] = frozenset()
+    """Kinds of the findings that only inform, because the result allows for them."""
     left_out: frozenset[int] = frozenset()
     """Rows of images that the result does not use."""
     mm: float = np.nan
@@ -181,7 +189,9 @@ class Outcome:
         """Return whether the answer names the fault, or leaves the wrong images out."""
         wrong = case.fault.wrong if isinstance(case.fault, ImageFault) else ()
         return (
-            self.refused or bool(self.kinds & case.named_by) or (bool(wrong) and self.left_out >= set(wrong))
+            self.refused
+            or bool((self.kinds | self.remarks) & case.named_by)
+            or (bool(wrong) and self.left_out >= set(wrong))
         )
 
 
@@ -249,9 +259,9 @@ def _judged(
         for one in hand_eye.findings
         if one.severity != "informs" and one.kind is not FindingKind.NOT_EXACT_ENOUGH
     )
-    return Outcome(
-        hand_eye.converged, kinds, left_out, *mm_deg(step), float(np.abs(step / std).max()), joint_p
-    )
+    remarks = frozenset(one.kind for one in hand_eye.findings if one.severity == "informs")
+    sigmas = float(np.abs(step / std).max())
+    return Outcome(hand_eye.converged, kinds, remarks, left_out, *mm_deg(step), sigmas, joint_p)
 
 
 Rows = dict[Case, list[Outcome]]

@@ -248,6 +248,16 @@ def sorted_as_text(drawn: Drawn, rng: np.random.Generator) -> Drawn:
     return replace(drawn, images=images, names=names)
 
 
+def inverted(drawn: Drawn, rng: np.random.Generator) -> Drawn:
+    """Report gripper_from_base as the gripper poses."""
+    return replace(drawn, base_from_gripper=inverse(drawn.base_from_gripper))
+
+
+def reversed_poses(drawn: Drawn, rng: np.random.Generator) -> Drawn:
+    """Report the poses in the reverse order of the images."""
+    return replace(drawn, base_from_gripper=drawn.base_from_gripper[::-1])
+
+
 # Single poses.
 
 

@@ -143,5 +143,6 @@ WRONG_BOARDS: dict[str, SceneChange] = {
     "2 % larger": PrintedBoard(size=0.02),
     "bent by 3 mm": PrintedBoard(bend_m=3e-3),
     "moved by 3 mm midway": PrintedBoard(moved_m=3e-3),
+    "moved by 1 mm midway": PrintedBoard(moved_m=1e-3),
     "held by the robot": PrintedBoard(held=True),
 }

@@ -109,7 +109,11 @@ def test_a_board_that_is_wrong_is_named_and_leaves_the_result_as_it_is_without(
 ):
     alone = calibrated_alone(1)
     hand_eye, x = calibrated(sheet, seed=1)
-    assert of_kind(hand_eye, kind).severity == ("informs" if kind is FindingKind.BOARD_BENT else "warns")
+    named = of_kind(hand_eye, kind)
+    if kind is FindingKind.BOARD_STRETCHED:
+        assert named.value is not None and named.std is not None
+        assert named.value == pytest.approx(sheet.stretch, abs=3 * named.std) and named.std < 1e-3
+    assert named.severity == ("informs" if kind is FindingKind.BOARD_BENT else "warns")
     # The shape of a bent board, and the corners of a moved one in most images, are still good.
     is_used = kind in {FindingKind.BOARD_BENT, FindingKind.BOARD_MOVED}
     assert hand_eye.converged and any(one.used for one in hand_eye.lengths) == is_used

@@ -7,7 +7,7 @@ import numpy as np
 
 from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case, with_findings
-from jcr.calibration.checks.boards import check_boards, check_moved_boards
+from jcr.calibration.checks.boards import check_board_shapes, check_boards
 from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
 from jcr.calibration.checks.convention import better_reading, check_convention, convention_finding
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
@@ -32,7 +32,7 @@ CHECKS = (
     check_registered,
     check_convention,
     check_pairing,
-    check_moved_boards,
+    check_board_shapes,
     check_effects,
     check_pieces,
     check_predicted_focal,

@@ -25,6 +25,8 @@ CORNER_STD_M = np.array([5e-5, 5e-5, 1e-4])
 """Standard deviation of a single corner along each axis of its body."""
 STRETCH_STD = 1e-3
 """Prior standard deviation of the relative stretch of a printed board's x axis over its y axis."""
+STRETCHED_STD = 0.1
+"""Prior standard deviation of the stretch of a board that is known to be stretched; large, to have no influence."""
 BEND_STD_M = {2: 3e-4, 3: 1e-4}
 """Prior standard deviation of a board's bend (m rms) by each polynomial of degree 2, and of degree 3."""
 SIZE_STD = 10.0
@@ -137,7 +139,9 @@ def shapes_of(
     points, x_in_body, poses, sizes = zip(*bodies, strict=True)
     corners = [len(point) for point in points]
     unit = float(np.average(sizes, weights=corners))
-    ways, std = zip(*(_deformations(unit * x) for x in x_in_body), strict=True)
+    assert boards is not None
+    stretch_std = STRETCHED_STD if boards.is_stretched else STRETCH_STD
+    ways, std = zip(*(_deformations(unit * x, stretch_std) for x in x_in_body), strict=True)
     each = np.split(np.arange(sum(corners)), np.cumsum(corners)[:-1])
     by_shape, column = np.zeros((sum(corners), 3, 1 + sum(map(len, std)))), 1
     for rows, own in zip(each, ways, strict=True):
@@ -157,7 +161,9 @@ def shapes_of(
     return shapes, np.stack(poses)
 
 
-def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
+def _deformations(
+    x: Float[ndarray, "c 3"], stretch_std: float
+) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
     """Return w deformations of a body with corners printed at `x` (m), and the prior standard deviation of each.
 
     Each is a displacement of the c corners: a relative stretch of x over y, then bends in z with an rms of 1.
@@ -166,7 +172,7 @@ def _deformations(x: Float[ndarray, "c 3"]) -> tuple[Float[ndarray, "c 3 w"], Se
         return np.zeros((len(x), 3, 0)), ()
     across = x[:, :2] - x[:, :2].mean(0)
     stretch = np.column_stack([across[:, 0] / 2, -across[:, 1] / 2, np.zeros(len(x))])
-    ways, std = [stretch], [STRETCH_STD]
+    ways, std = [stretch], [stretch_std]
     u, v = (2 * across / np.ptp(across, axis=0)).T
     every = legvander2d(u, v, [3, 3]).reshape(-1, 4, 4)
     degree = np.add.outer(np.arange(4), np.arange(4))

@@ -35,9 +35,10 @@ from jcr.features.pairs import (
     near_pairs,
     repeats,
     seen_in_common,
+    translation_of_x,
 )
 from jcr.features.two_view import starting_motions
-from jcr.geometry import rotation_angle
+from jcr.geometry import Transform, rotation_angle
 from jcr.records import Intrinsics
 
 WORTH_SAYING = 0.1
@@ -67,6 +68,8 @@ class Matched:
     """Two-view geometries for the mapper, by pair."""
     intrinsics: Intrinsics
     """Intrinsics at the working size, given or estimated from the gripper's angles."""
+    x: Transform | None = None
+    """Rough estimate of gripper_from_camera by the confirmed pairs; None if they do not determine it."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     """Notes and warnings for records.Reconstruction."""
@@ -239,6 +242,7 @@ def match_with_robot(
     if found.of_x is None:
         search.match(dict.fromkeys(everything, as_taken))
         found = search.gate()
+    x = None
     if found.of_x is None:
         kept, notes, warnings = {key: one for key, (_, one) in search.pairs.items()}, (), ()
     else:
@@ -250,13 +254,15 @@ def match_with_robot(
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
         kept, notes, warnings = _believed(search, found, names)
+        x = translation_of_x(found, motion)
     if matcher.still is not None:
         percent = 100 * matcher.still.mean()
         notes += (
             f"{percent:.0f} % of the image do not move while the gripper does, fingers or a logo: left out",
         )
     report(1.0)
-    return Matched(geometries=kept, intrinsics=search.view.intrinsics, notes=notes, warnings=warnings)
+    intrinsics = search.view.intrinsics
+    return Matched(geometries=kept, intrinsics=intrinsics, x=x, notes=notes, warnings=warnings)
 
 
 def _believed(

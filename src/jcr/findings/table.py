@@ -232,7 +232,8 @@ class FindingKind(StrEnum):
         "there are two",
         "its corners there count little or not at all; keep one board of a kind, and keep it still")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
-        "{board} is {percent:!.1f} % longer along one side than along the other: it was not printed at its size",
+        "{board} is {percent:!.1f} ± {std_percent:~} % longer along one side than along the other: it was not printed "
+        "at its size",
         "print it without scaling (jcr board) and measure both sides; its size is not used for the scale")
     BOARD_BENT = "board bent", KindRow("lengths",
         "{board} is bent: its highest corner is {mm:.1f} mm above its lowest one; its shape is estimated",

@@ -38,6 +38,8 @@ class Boards:
     corners are not in the tracks."""
     proposed: str | None = None
     """Value of `--board` that fits the images if no body was found; None if no other board is visible."""
+    is_stretched: bool = False
+    """Whether a calibration found the print stretched, so that its stretch and size have no prior; not stored."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
 from jcr.features.stage import Matched, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
-from jcr.sfm.missing_images import model_near_cameras, with_missing_images
+from jcr.sfm.missing_images import model_near_cameras, nearer_to_robot, with_missing_images
 from jcr.sfm.model import (
     ENOUGH,
     adjust_robustly,
@@ -234,6 +234,8 @@ def map_images(
             model = _map_incrementally(database, some, matcher, report, model)
         if model is not None and model.num_reg_images() < matching:
             model = with_missing_images(database, model, base_from_gripper, matcher)
+        if model is not None and matched.x is not None:
+            model = nearer_to_robot(database, model, base_from_gripper, matched.x, matcher)
     return matched, model
 
 

@@ -16,9 +16,9 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from jcr.camera import HALF_PIXEL
-from jcr.estimation.robust import robust_fit
+from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.features.matchers import Matcher
-from jcr.geometry import inverse
+from jcr.geometry import Transform, inverse
 from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated_model
 
 PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
@@ -37,6 +37,37 @@ RATIO = 0.85
 """Largest ratio of the descriptor distances to the best and the second-best keypoint near the projection."""
 LARGEST_PX = 4.0
 """Reprojection error, px, above which an observation is a mismatch, as in COLMAP."""
+
+CONTRADICTED = 5e-3
+"""rms error (m) of the better part of the gripper poses from which a map is compared with one near their cameras."""
+BETTER = 3.0
+"""Ratio of the errors of both maps from which the one near the predicted cameras is used."""
+
+
+def nearer_to_robot(
+    database: Path,
+    model: pycolmap.Reconstruction,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    x: Transform,
+    matcher: Matcher,
+) -> pycolmap.Reconstruction:
+    """Return a map near the cameras that the gripper poses predict, if it agrees with them much better than `model`.
+
+    The mapper goes astray if its first two images show one plane, whose matches have two solutions, or if objects moved
+    while the images were taken. `x` is a rough estimate of gripper_from_camera; matches that contradict the predicted
+    cameras are left out.
+    """
+    rows = rows_of(model)
+    error = least_trimmed(base_from_gripper[rows], poses_of(model, rows))[1]
+    if len(rows) < LEAST_MAPPED or error < CONTRADICTED:
+        return model
+    predicted = dict(enumerate(base_from_gripper @ x))
+    nearer = model_near_cameras(database, model.camera(1), predicted, matcher.known)
+    if (now := rows_of(nearer)) and len(now) >= len(rows):
+        _complete_images(nearer, {row + 1 for row in now}, matcher)
+        after = least_trimmed(base_from_gripper[now], poses_of(nearer, now))[1]
+        return nearer if BETTER * after < error else model
+    return model
 
 
 def with_missing_images(
@@ -65,15 +96,19 @@ def with_missing_images(
     larger = model_near_cameras(database, model.camera(1), cameras, matcher.known, rows)
     if larger.num_reg_images() <= len(rows):
         return model
-    images = {row + 1 for row in rows_of(larger) if row not in rows}
-    filters = pycolmap.ObservationManager(larger)
+    _complete_images(larger, {row + 1 for row in rows_of(larger) if row not in rows}, matcher)
+    return larger
+
+
+def _complete_images(model: pycolmap.Reconstruction, images: set[int], matcher: Matcher) -> None:
+    """Match the images of these numbers with the points near their cameras, and adjust all cameras and points."""
+    filters = pycolmap.ObservationManager(model)
     for radius_px in RADII_PX:
         for image_id in sorted(images):
-            _complete(larger, image_id, matcher, radius_px)
+            _complete(model, image_id, matcher, radius_px)
         filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
-        adjust_robustly(larger, matcher.known, ROUGHLY, PASSES[-1][2])
+        adjust_robustly(model, matcher.known, ROUGHLY, PASSES[-1][2])
         filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
-    return larger
 
 
 def model_near_cameras(

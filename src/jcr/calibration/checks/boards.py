@@ -10,15 +10,16 @@ from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case
 from jcr.calibration.hand_eye import JUDGED
 from jcr.distributions import f as f_distribution
-from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD
+from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD, STRETCHED_STD
 from jcr.estimation.projection import by_points
 from jcr.estimation.solve import Solution, size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, skew
-from jcr.records import BoardFound, Boards
+from jcr.records import BoardFound, Boards, Tracks
 
-STRETCHED = 4.0
-"""Estimated stretch of a board, in standard deviations of a printer's stretch, from which its size counts as wrong."""
+LIKELY, STRETCHED = 2.0, 4.0
+"""Stretch of a board, in standard deviations of a printer's stretch, from which it is estimated without a prior; and the
+estimate, in its standard deviations together with the printer's, from which the board counts as stretched (p = 6e-5)."""
 LOG_P_MOVED = float(np.log(1e-6))
 """Logarithm of the p-value up to which a board counts as moved."""
 LEAST_MOVED_PX = 0.3
@@ -45,10 +46,11 @@ def check_boards(case: Case) -> Case:
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
         return case.after(tuple(findings))
-    found, stretch = board_found(case.adjusted, boards), abs(stretch_of(case.adjusted))
-    if stretch > STRETCHED * STRETCH_STD:
-        stretched = Finding.of(FindingKind.BOARD_STRETCHED, "warns", "none", value=stretch, board=boards.spec)
-        findings.append(stretched)
+    found = board_found(case.adjusted, boards)
+    if boards.is_stretched:
+        stretch, std = stretch_of(case.adjusted)
+        size = {"value": abs(stretch), "std": std, "board": boards.spec}
+        findings.append(Finding.of(FindingKind.BOARD_STRETCHED, "warns", "none", **size))
     if found.bend_mm > 1e3 * BENT_M:
         height = {"value": 1e-3 * found.bend_mm, "board": boards.spec}
         findings.append(Finding.of(FindingKind.BOARD_BENT, "informs", "none", **height))
@@ -58,30 +60,41 @@ def check_boards(case: Case) -> Case:
     return case.after(tuple(findings), replace(hand_eye, board=found))
 
 
-def check_moved_boards(case: Case) -> Case:
-    """Return the case without the corners of boards that moved, in the fewer images before or after the motion.
+def check_board_shapes(case: Case) -> Case:
+    """Return the case without the corners of boards that moved, and without the prior on the shape of stretched ones.
 
-    The images are then adjusted again. `check_boards` reports these images (`Boards.elsewhere`).
+    The corners of a moved board are left out in the fewer images before or after the motion (`Boards.elsewhere`). The
+    images are then adjusted again. `check_boards` reports both errors.
     """
     for _ in range(MOST_MOTIONS):
-        made, adjusted = case.reconstruction, case.adjusted
-        if adjusted is None or adjusted.problem.boards is None:
+        tracks, adjusted = case.reconstruction.tracks, case.adjusted
+        if adjusted is None or adjusted.problem.boards is None or tracks.boards is None:
             return case
         away = case.used[images_of_motion(adjusted)]
         if not len(away):
-            return case
-        tracks, boards = made.tracks, made.tracks.boards
-        assert boards is not None
+            break
         rest = tracks.only(~(tracks.on_board[tracks.point] & np.isin(tracks.image, away)))
-        elsewhere = tuple(sorted({*boards.elsewhere, *away.tolist()}))
-        made = replace(made, tracks=replace(rest, boards=replace(boards, elsewhere=elsewhere)))
-        changed = replace(
-            case, reconstruction=made, hand_eye=case.pose_fit, fit=None, chosen_tracks=None, adjusted=None
-        )
-        changed = with_adjusted_images(changed)
-        kinds = JUDGED | {one.kind for one in changed.hand_eye.findings} | {FindingKind.NOT_SETTLED}
-        case = changed.after(tuple(one for one in case.hand_eye.findings if one.kind not in kinds))
-    return case
+        elsewhere = tuple(sorted({*tracks.boards.elsewhere, *away.tolist()}))
+        case = _adjusted_again(case, replace(rest, boards=replace(tracks.boards, elsewhere=elsewhere)))
+    tracks, adjusted = case.reconstruction.tracks, case.adjusted
+    if tracks.boards is None or adjusted is None or abs(stretch_of(adjusted)[0]) < LIKELY * STRETCH_STD:
+        return case
+    free = _adjusted_again(case, replace(tracks, boards=replace(tracks.boards, is_stretched=True)))
+    if free.adjusted is None:
+        return case
+    stretch, std = stretch_of(free.adjusted)
+    return free if abs(stretch) > STRETCHED * float(np.hypot(std, STRETCH_STD)) else case
+
+
+def _adjusted_again(case: Case, tracks: Tracks) -> Case:
+    """Return the case with other tracks after bundle adjustment; findings of the checks before stay."""
+    made = replace(case.reconstruction, tracks=tracks)
+    changed = replace(
+        case, reconstruction=made, hand_eye=case.pose_fit, fit=None, chosen_tracks=None, adjusted=None
+    )
+    changed = with_adjusted_images(changed)
+    kinds = JUDGED | {one.kind for one in changed.hand_eye.findings} | {FindingKind.NOT_SETTLED}
+    return changed.after(tuple(one for one in case.hand_eye.findings if one.kind not in kinds))
 
 
 def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:
@@ -131,13 +144,17 @@ def _misfit(information: Float[ndarray, "n 6 6"], pull: Float[ndarray, "n 6"]) -
     return own - float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
 
 
-def stretch_of(adjusted: Solution) -> float:
-    """Return the largest relative excess of a board's first side over its second; 0 if boards are not adjusted."""
-    shapes = adjusted.problem.boards
-    if shapes is None:
-        return 0.0
-    shape = adjusted.state.camera_steps[adjusted.problem.columns.boards]
-    return float(max(shape[shapes.shape_std == STRETCH_STD].tolist(), key=abs, default=0.0))
+def stretch_of(adjusted: Solution) -> tuple[float, float]:
+    """Return the largest relative excess of a board's first side over its second, and its standard deviation.
+
+    Both are 0 if no board is adjusted.
+    """
+    shapes, columns = adjusted.problem.boards, adjusted.problem.columns.boards
+    if shapes is None or not (ways := np.isin(shapes.shape_std, (STRETCH_STD, STRETCHED_STD))).any():
+        return 0.0, 0.0
+    shape, own = adjusted.state.camera_steps[columns], adjusted.camera_unknowns(columns)
+    k = int(np.where(ways, np.abs(shape), -1.0).argmax())
+    return float(shape[k]), float(np.sqrt(adjusted.covariance[own, own][k, k]))
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:

@@ -15,12 +15,10 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
-from jcr.calibration.checks.boards import STRETCHED, stretch_of
 from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_depth_images
-from jcr.estimation.boards import STRETCH_STD
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
 from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import Solution, size_of_boards, with_priors
@@ -125,13 +123,9 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     """Return the calibration with `depth_check` set, and the log ratio of the robot's length to each known length."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
-    size_std = None if boards is None or hand_eye.source == "poses" else boards.size_std
-    if (
-        adjusted is not None
-        and adjusted.problem.boards is not None
-        and size_std is not None
-        and abs(stretch_of(adjusted)) <= STRETCHED * STRETCH_STD
-    ):
+    is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
+    size_std = boards.size_std if boards is not None and is_known else None
+    if adjusted is not None and adjusted.problem.boards is not None and size_std is not None:
         off, by_unknown = size_of_boards(adjusted)
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
         of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
