@@ -29,13 +29,13 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
     """Four and five small images of the table, one folder with a broken image, one with no features."""
     root = tmp_path_factory.mktemp("captures")
     folders = [
-        shrunk_capture(tabletop, root / name, count, 320)
+        shrunk_capture(tabletop, root / name, count, 200)
         for name, count in (("a", 4), ("b", 5), ("broken", 4), ("plain", 4))
     ]
     for name in ("01.jpg", "02.jpg"):  # two that are left are too few
         (root / "broken" / "images" / name).write_bytes(b"no picture")
     for k, image in enumerate((root / "plain" / "images").iterdir()):
-        image.write_bytes(encode_png(np.full((240, 320, 3), 90 + 8 * k, np.uint8)))
+        image.write_bytes(encode_png(np.full((150, 200, 3), 90 + 8 * k, np.uint8)))
     return folders
 
 

@@ -142,6 +142,19 @@ def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
     monkeypatch.setattr(convention, "better_reading", lambda *_: None)
     monkeypatch.setattr(selection, "view_findings", lambda _: ())
+    monkeypatch.setattr(selection, "calibrate_reconstruction", calibrated_once)
+
+
+KNOWN: dict[object, Calibration] = {}
+
+
+def calibrated_once(capture: Capture, made: Reconstruction, options: CalibrateOptions) -> Calibration:
+    """Calibrate; the same poses, which come again and again, once."""
+    poses = capture.base_from_gripper.tobytes(), made.recon_from_camera.tobytes()
+    key = poses, made.backend, len(made.tracks.image), options
+    if key not in KNOWN:
+        KNOWN[key] = calibration_stage.calibrate_reconstruction(capture, made, options)
+    return KNOWN[key]
 
 
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
