@@ -66,11 +66,16 @@ def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) ->
     assert rotation_between_deg(relative, measured).max() < 0.1
 
 
-def test_tracks_reproject_within_a_tenth_of_a_pixel(found: Reconstruction) -> None:
+def test_tracks_reproject_within_a_tenth_of_a_pixel(capture: Capture, found: Reconstruction) -> None:
     error = _reprojection_errors(found)
     assert np.median(np.linalg.norm(error, axis=1)) < 0.06  # keypoints: 0.15
     assert np.abs(np.median(error, axis=0)).max() < 0.05
     assert np.bincount(found.tracks.point).min() >= 2 and len(found.tracks.points_in_recon) > 500
+    # They are where the features are, in pixels whose first has its centre at (0, 0).
+    (features,) = SiftFeatures([read_image(capture.folder / capture.images[0])], (640, 480), 1, silent).x_px
+    own = found.tracks.x_px[found.tracks.image == 0]
+    away = own - features[np.linalg.norm(own[:, None] - features, axis=2).argmin(1)]
+    assert np.abs(np.median(away, axis=0)).max() < 0.05
 
 
 def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
