@@ -122,6 +122,16 @@ def test_pixels_without_confidence_do_not_count(network):
     assert result.confidence[:, :, 28:].mean() > nothing + 0.1
 
 
+def test_pixels_beside_edges_that_lie_nowhere_are_outvoted():
+    predictions, truth = synthetic_pairs(complete_pairs(4), SMALL)
+    draw = np.random.default_rng(0)
+    for points in (predictions.pts3d, predictions.pts3d_in_other_view):
+        astray = draw.random(points.shape[:3]) < 0.1
+        points[astray] *= draw.uniform(1.0, 2.0, (astray.sum(), 1)).astype(np.float32)
+    mm, deg = errors(global_align(predictions), truth)
+    assert mm < 1 and deg < 0.1
+
+
 def test_predictions_that_are_noise_are_called_useless():
     predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
     try:
