@@ -1,8 +1,8 @@
 """Camera models of OpenCV: projection with derivatives, unprojection, resizing, cropping, undistortion of images.
 
 Models: pinhole with five distortion coefficients, rational with eight, rational with thin prism with twelve ("Camera
-Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_distorted`,
-`_slopes`, `_by_coefficients` and, for the fisheye, `_fisheye_rays` depend on the model.
+Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_radial`,
+`_distorted`, `_slopes`, `by_parameters` and, for the fisheye, `_fisheye_rays` depend on the model.
 Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
 precision: float32 points give float32 pixels.
 """
@@ -113,11 +113,28 @@ def by_parameters(
 ) -> Float[ndarray, "*batch 2 p"]:
     """Return the derivatives (...,2,p) of the pixel of `project` by the p numbers of `parameters(camera)`."""
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
+    r2, xy, none = x * x + y * y, 2 * x * y, np.zeros_like(x)
     out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
     out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
     out[..., 0, 2] = out[..., 1, 3] = 1.0
-    by_coefficients = _by_coefficients(camera, x, y)
-    out[..., 0, 4:], out[..., 1, 4:] = camera.fx * by_coefficients[0], camera.fy * by_coefficients[1]
+    # Derivatives of the distorted coordinates by the distortion coefficients:
+    if camera.model == "fisheye":
+        r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
+        shares = [np.arctan(r) ** power / r for power in (3, 5, 7, 9)]
+        of_x, of_y = [x * share for share in shares], [y * share for share in shares]
+    else:
+        above, below = [r2, r2**2, r2**3], []
+        if camera.model in ("rational", "thin_prism"):
+            k4, k5, k6 = list(camera.distortion)[5:8]
+            denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            above = [power / denominator for power in above]
+            below = [-_radial(camera, r2)[0] * power for power in above]
+        of_x = [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)]
+        of_y = [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)]
+        if camera.model == "thin_prism":
+            of_x += [r2, r2 * r2, none, none]
+            of_y += [none, none, r2, r2 * r2]
+    out[..., 0, 4:], out[..., 1, 4:] = camera.fx * np.stack(of_x, -1), camera.fy * np.stack(of_y, -1)
     return out
 
 
@@ -173,31 +190,6 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
     k4, k5, k6 = more[:3]
     below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     return radial / below, (slope - radial / below * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
-
-
-def _by_coefficients(
-    camera: Intrinsics, x: Coordinate, y: Coordinate
-) -> tuple[Float[ndarray, "*batch c"], Float[ndarray, "*batch c"]]:
-    """Return the derivatives (...,c) of the two distorted coordinates, x then y, by the c distortion coefficients."""
-    r2, xy = x * x + y * y, 2 * x * y
-    if camera.model == "fisheye":
-        r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
-        shares = [np.arctan(r) ** power / r for power in (3, 5, 7, 9)]
-        return np.stack([x * share for share in shares], -1), np.stack([y * share for share in shares], -1)
-    above = [r2, r2**2, r2**3]
-    below = []
-    if camera.model in ("rational", "thin_prism"):
-        k4, k5, k6 = list(camera.distortion)[5:8]
-        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        above = [power / denominator for power in above]
-        below = [-_radial(camera, r2)[0] * power for power in above]
-    of_x = [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)]
-    of_y = [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)]
-    if camera.model == "thin_prism":
-        none = np.zeros_like(r2)
-        of_x += [r2, r2 * r2, none, none]
-        of_y += [none, none, r2, r2 * r2]
-    return np.stack(of_x, axis=-1), np.stack(of_y, axis=-1)
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:

@@ -79,7 +79,13 @@ def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> P
         path = folder / name
         if not path.is_file():
             raise InputError(f"{hub_id}: the hub has no {name} of it; ask for another --revision")
-        if not _is_as_published(path):
+        # The hub's client names a file by its checksum (SHA-256, or git's SHA-1 for a small file), but not on systems
+        # without symbolic links.
+        published, blob = path.resolve().name, f"blob {path.stat().st_size}\0".encode()
+        digest = hashlib.sha256() if len(published) == 64 else hashlib.sha1(blob, usedforsecurity=False)
+        with path.open("rb") as content:
+            found = hashlib.file_digest(content, digest.copy).hexdigest()
+        if found != published and re.fullmatch("[0-9a-f]{64}|[0-9a-f]{40}", published):
             path.resolve().unlink()
             path.unlink()
             raise InputError(
@@ -87,21 +93,3 @@ def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> P
                 "ask who runs the mirror or proxy in between"
             )
     return folder
-
-
-def _is_as_published(path: Path) -> bool:
-    """Test whether a cached file has the checksum in its name: SHA-256, or git's SHA-1 for a small file.
-
-    Return True for a file without a checksum in its name, as on systems without symbolic links.
-    """
-    published = path.resolve().name
-    if re.fullmatch("[0-9a-f]{64}", published):
-        digest = hashlib.sha256()
-    elif re.fullmatch("[0-9a-f]{40}", published):
-        digest = hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False)
-    else:
-        return True
-    with path.open("rb") as content:
-        while block := content.read(1 << 22):
-            digest.update(block)
-    return digest.hexdigest() == published

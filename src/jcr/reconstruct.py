@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float, Int
-from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
@@ -274,7 +272,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a capture with the back end that `options` select; for `auto`, the first candidate.
 
-    Raises InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
+    The reconstruction does not depend on the order of the images and has them in the order of the capture. Raises
+    InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
     """
     options = options or ReconstructOptions()
     row = BACKENDS[candidates(options)[0]]
@@ -285,35 +284,22 @@ def reconstruct(
         )
     if row.needs and getattr(options, row.needs) is None:
         raise InputError(f"--backend {row.name}: name {NEEDED[row.needs]}")
-    order = np.arange(len(capture)) if row.keeps_order else order_by_pose(capture.base_from_gripper)
+    # Matching, RANSAC and the initial pair depend on the order of the images: with other names, calibrations differed by
+    # up to 1.7 standard deviations. Images are therefore sorted by their poses: position, x first, then rotation. Adding
+    # zero turns -0 into 0; equal poses keep their order.
+    pose = np.round(capture.base_from_gripper, DECIMALS) + 0.0
+    keys = np.concatenate([pose[:, :3, 3], pose[:, :3, :3].reshape(-1, 9)], axis=1)
+    order = np.arange(len(capture)) if row.keeps_order else np.lexsort(keys.T[::-1])
     in_order = capture.of_rows(order)
     made = row.reconstruct(in_order, replace(options, backend=row.name), progress)
     if options.board is not None and row.name != MARKER:
         from jcr.boards.corners import with_boards
 
         made = with_boards(in_order, made, options.board, progress)
-    return _of_capture(made, order)
-
-
-def order_by_pose(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, " n"]:
-    """Return the indices that sort images by gripper pose, so that the reconstruction does not depend on image names.
-
-    Matching, RANSAC and the initial pair depend on the order: with other names, calibrations differed by up to 1.7
-    standard deviations. Equal poses keep their order.
-    """
-    # Adding zero turns -0 into 0. Poses are sorted by position, x first, then by rotation.
-    pose = np.round(base_from_gripper, DECIMALS) + 0.0
-    keys = np.concatenate([pose[:, :3, 3], pose[:, :3, :3].reshape(-1, 9)], axis=1)
-    return np.lexsort(keys.T[::-1])
-
-
-def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """Return a reconstruction of sorted images in the order of the capture; sorted image k is its row order[k]."""
-    image_index = order[reconstruction.image_index]
+    image_index = order[made.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
-    tracks, evidence = reconstruction.tracks, reconstruction.evidence
-    boards = tracks.boards
+    boards, evidence = made.tracks.boards, made.evidence
     if boards is not None:
         boards = replace(boards, elsewhere=tuple(sorted(row_of[list(boards.elsewhere)].tolist())))
     if evidence is not None:
@@ -322,11 +308,11 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
             evidence.recon_from_camera[rows], evidence.covariance[np.ix_(numbers, numbers)]
         )
     return replace(
-        reconstruction,
+        made,
         image_index=image_index[rows],
-        recon_from_camera=reconstruction.recon_from_camera[rows],
-        pointmaps=None if reconstruction.pointmaps is None else reconstruction.pointmaps.of_rows(rows),
-        tracks=replace(tracks, image=row_of[tracks.image], boards=boards),
+        recon_from_camera=made.recon_from_camera[rows],
+        pointmaps=None if made.pointmaps is None else made.pointmaps.of_rows(rows),
+        tracks=replace(made.tracks, image=row_of[made.tracks.image], boards=boards),
         evidence=evidence,
     )
 
@@ -380,29 +366,22 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
     For `auto`: COLMAP with SIFT, then with learned features if these are installed; the best network that processes
     pairs of views, and the best that processes all views; direct alignment. Raises InputError as `candidates` does.
     """
-    names = candidates(options)
-    all_views, pairs = (
-        [name for name in names if BACKENDS[name].hub_id and BACKENDS[name].sees_all_views is kind]
-        for kind in (True, False)
-    )
-    made = []
-    for one in (for_backend(options, name) for name in names if name not in (*all_views[1:], *pairs[1:])):
-        made.append(one)
-        if (
-            one.backend == "colmap"
-            and one.features == "auto"
-            and options.backend == "auto"
-            and xfeat_is_installed()
-        ):
-            made[-1:] = [replace(one, features="sift"), replace(one, features="xfeat")]
+    given, made = _given_options(options), list[ReconstructOptions]()
+    defaults = {field.name: field.default for field in fields(options) if field.name in given}
+    networks = set[
+        bool
+    ]()  # kinds of networks among the attempts: whether for all views or for pairs of views
+    for name in candidates(options):
+        row = BACKENDS[name]
+        if row.hub_id and row.sees_all_views in networks:
+            continue
+        networks |= {row.sees_all_views} if row.hub_id else set()
+        unused = {option: value for option, value in defaults.items() if option not in row.options}
+        one = replace(options, backend=name, **unused)
+        learned = options.backend == "auto" and name == "colmap" and one.features == "auto"
+        features = ("sift", "xfeat") if learned and xfeat_is_installed() else (one.features,)
+        made += [replace(one, features=kind) for kind in features]
     return made
-
-
-def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:
-    """Return the options for one back end, with options that it does not use set to their defaults."""
-    unused = _given_options(options).keys() - set(BACKENDS[name].options)
-    defaults = {field.name: field.default for field in fields(options) if field.name in unused}
-    return replace(options, backend=name, **defaults)
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:

@@ -61,8 +61,8 @@ def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, uni
     stamps = np.array([0, 10_000_000])
     pan, still = np.array([0.49, -0.49]) * turn, np.zeros(2)
     samples = [(stamps, pan), (stamps, still), (stamps, still)]
-    poses, gap = arm.poses_at(samples, np.array([5_000_000]))
-    np.testing.assert_allclose(poses, arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
+    recorded, gap = arm.interpolated(samples, np.array([5_000_000]))
+    np.testing.assert_allclose(arm.poses(recorded), arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
     assert gap.tolist() == [10_000_000]
 
 

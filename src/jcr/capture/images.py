@@ -34,7 +34,7 @@ ONE_VIEW = 0.25
 fourteen real captures the ratio is below 0.1 for images of one place with noise of 6 levels, 0.35 where the robot holds
 a board that fills a third of them, and above 0.75 between places."""
 USUAL_GREY = 2.0
-"""Smallest contrast (grey levels) by which `_detail` normalises. Noise of 4 levels has a contrast of 0.6 after its
+"""Smallest contrast (grey levels) by which details are normalised. Noise of 4 levels has a contrast of 0.6 after its
 Gaussian filter."""
 DEPTH = "depth"
 """Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
@@ -153,20 +153,16 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
 
     After a motion by a few pixels, the details (structures of a few pixels) of two images have nothing in common.
     """
-    one, two = (_detail(image) for image in (first, other))
+    details = []
+    for image in (first, other):
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
+        # The filter suppresses noise and shading; the division keeps a printed board in front of the camera from
+        # outweighing the scene behind the board.
+        band = cv2.GaussianBlur(grey, (0, 0), 2.0) - cv2.GaussianBlur(grey, (0, 0), 8.0)
+        details.append(band / (np.abs(band) + max(float(np.median(np.abs(band))), USUAL_GREY)))
+    one, two = details
     return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
-
-
-def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
-    """Return the band-pass filtered grey levels b of an image, reduced to 640 px, as b / (|b| + c): between -1 and 1.
-
-    c is the median of |b|, but at least 2 grey levels. The filter suppresses noise and shading; the division keeps a
-    printed board in front of the camera from outweighing the scene behind the board.
-    """
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
-    band = cv2.GaussianBlur(grey, (0, 0), 2.0) - cv2.GaussianBlur(grey, (0, 0), 8.0)
-    return band / (np.abs(band) + max(float(np.median(np.abs(band))), USUAL_GREY))
 
 
 def exposure_fault(brightness: float) -> str | None:

@@ -63,7 +63,8 @@ def read_source(
 ) -> Capture | PosePairs:
     """Return the capture at a path, or PosePairs if the file has camera poses but no images.
 
-    The arguments are those of `read_capture`.
+    The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the frames of the same
+    files and options already.
     """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
@@ -75,13 +76,22 @@ def read_source(
             f"--frames {options.frames}: at least {MIN_FRAMES} frames are needed, 8 to 15 are good"
         )
     name = format_of(path, options) if options.format == "auto" else options.format
+    if name not in RECORDINGS:
+        found = FORMATS[name].read(path, options)
+    elif into is None:
+        raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
+    else:
+        into, made_from = Path(into), _origin(path, options)
+        file = into / capture_json.FILE
+        extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
+        if extra.get("made_from") == made_from:
+            return replace(capture_json.read(into), notes=tuple(extra["notes"]))
+        found = FORMATS[name].read(path, options, into, progress or silent)
+    if options.pose_inverted:
+        found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
     if name in RECORDINGS:
-        if into is None:
-            raise InputError(
-                f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER"
-            )
-        return _extracted(path, options, Path(into), FORMATS[name], progress or silent)
-    found = _inverted(FORMATS[name].read(path, options), options)
+        capture_json.write(into, found, notes=found.notes, made_from=made_from)
+        return replace(capture_json.read(into), notes=found.notes)
     require_frames(len(found), str(path), at_least)
     require_motion(found.base_from_gripper, str(path))
     if isinstance(found, Capture) and (rotated := how_rotated(found)) is not None:
@@ -113,29 +123,12 @@ def format_of(path: Path, options: ReadOptions | None = None) -> str:
     )
 
 
-def _inverted(found: Any, options: ReadOptions) -> Any:
-    """Return the capture `found` with its poses inverted if `options.pose_inverted` is set, otherwise unchanged."""
-    if not options.pose_inverted:
-        return found
-    return replace(found, base_from_gripper=inverse(found.base_from_gripper))
-
-
-def _extracted(path: Path, options: ReadOptions, into: Path, form: Any, progress: Progress) -> Capture:
-    """Return the capture that the format `form` (a module) extracts from the recording at `path` into the folder `into`.
-
-    A capture that is there already is returned if neither the recording's files nor the options changed since.
-    """
+def _origin(path: Path, options: ReadOptions) -> list[Any]:
+    """Return the entry made_from of an extracted capture: path of the recording, digest of its files, and options."""
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]
     states = [
         (str(file), (state := file.stat()).st_size, state.st_mtime_ns) for file in files if file.is_file()
     ]
     digest = hashlib.sha256(json.dumps(states).encode()).hexdigest()
-    made_from = [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]
-    file = into / capture_json.FILE
-    extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
-    if extra.get("made_from") != made_from:
-        capture = _inverted(form.read(path, options, into, progress), options)
-        extra = {"notes": capture.notes, "made_from": made_from}
-        capture_json.write(into, capture, **extra)
-    return replace(capture_json.read(into), notes=tuple(extra["notes"]))
+    return [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     import yourdfpy
 
 ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
-JointSamples = Sequence[tuple[Int[ndarray, " _"], Float[ndarray, " _"]]]
-"""Time stamps (ns, ascending) and recorded positions of each joint, one pair of arrays per joint."""
 
 
 def load_urdf(file: Path) -> "yourdfpy.URDF":
@@ -66,16 +64,12 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
     return chain
 
 
-def read_chain(file: Path, dof: int) -> Arm:
-    """Read the arm of `dof` rotating joints in a row from a URDF file; its gripper frame is the link after the last."""
-    return chain_of(load_urdf(file), dof, str(file))
+def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
+    """Return the arm of `dof` rotating joints in a URDF (file or its content); its gripper is the link after the last.
 
-
-def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str) -> Arm:
-    """Return the arm of `dof` rotating joints in a URDF; its gripper frame is the link after the last joint.
-
-    Raises InputError, begun with `where`, if there is no such chain or several, or if a joint does not rotate.
+    Raises InputError if the URDF has no such chain or several, or if a joint does not rotate.
     """
+    urdf = load_urdf(where) if isinstance(where, Path) else where
     chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
     # A chain ends with its last moving joint: links that are fixed to it belong to the gripper.
     chains = {
@@ -143,7 +137,7 @@ class RecordedArm:
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
         """Convert recorded positions (a column per joint) to joint angles (rad); None if not all joints rotate."""
         try:
-            chain_of(self.urdf, len(self.joints), "the URDF")
+            read_chain(self.urdf, len(self.joints))
         except InputError:
             return None
         return recorded * self.unit
@@ -164,23 +158,13 @@ class RecordedArm:
             pose[:] = self.urdf.get_transform(self.gripper, self.base)
         return poses
 
-    def poses_at(
-        self, samples: JointSamples, stamp_ns: Stamps
-    ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return base_from_gripper at time stamps (ns), and the largest gap (ns) between joint samples around each.
-
-        `samples` are the time stamps (ns) and recorded positions of each joint.
-        """
-        recorded, gap = self.interpolated(samples, stamp_ns)
-        return self.poses(recorded), gap
-
     def interpolated(
-        self, samples: JointSamples, stamp_ns: Stamps
+        self, samples: Sequence[tuple[Int[ndarray, " _"], Float[ndarray, " _"]]], stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
         """Return the joint positions at n time stamps (ns), and the largest gap (ns) between joint samples around each.
 
-        `samples` are the time stamps (ns) and recorded positions of each of the j joints. Positions are interpolated
-        linearly, in the recorded units; a joint turns the shorter way, also across ±π.
+        `samples` are the ascending time stamps (ns) and recorded positions of each of the j joints. Positions are
+        interpolated linearly, in the recorded units; a joint turns the shorter way, also across ±π.
         """
         rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
         for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):

@@ -6,15 +6,11 @@ a sharp border would produce features.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
-
-from jcr.capture.images import encode_png, read_image
-from jcr.files import write_bytes
 
 LEVELS = 14.0
 """Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
@@ -35,7 +31,10 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
     reduced = np.stack(
         [cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32) for image in images]
     )
-    background, known = _background(reduced)
+    # For each pixel, the number of images that have the same colour as each image (n,h,w), and the most frequent colour.
+    agreeing = np.stack([(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced])
+    background = np.take_along_axis(reduced, agreeing.argmax(0)[None, ..., None], axis=0)[0]
+    known = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(images))
     out = []
     for image, small_image in zip(images, reduced, strict=True):
         moves = (np.abs(small_image - background).max(-1) > LEVELS) | ~known
@@ -47,23 +46,3 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
         share = cv2.GaussianBlur(share, (0, 0), SOFT * width)[..., None]
         out.append(np.rint(GREY + share * (image.astype(np.float32) - GREY)).astype(np.uint8))
     return out
-
-
-def _background(reduced: Float[ndarray, "n h w 3"]) -> tuple[Float[ndarray, "h w 3"], ndarray]:
-    """Return for each pixel the most frequent colour of n images, and a mask of the pixels where enough images agree."""
-    agreeing = np.stack(
-        [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
-    )  # (n,h,w): number of images with the same colour as each image
-    best = agreeing.argmax(0)
-    rows, columns = np.indices(best.shape)
-    enough = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(reduced))
-    return reduced[best, rows, columns], enough
-
-
-def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
-    """Write images with the static background faded to grey to `folder`.
-
-    The images `names` of the folder `source` keep their names; the format is PNG whatever the name.
-    """
-    for name, image in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
-        write_bytes(folder / name, encode_png(image))

@@ -16,8 +16,10 @@ from jcr.calibration.hand_eye import judged, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
-from jcr.cell.background import write_moving_parts
+from jcr.capture.images import encode_png, read_image
+from jcr.cell.background import moving_parts
 from jcr.estimation.solve import recon_frame, uncertainty_of
+from jcr.files import write_bytes
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
 from jcr.records import Capture, Reconstruction
@@ -31,7 +33,9 @@ def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
     original images are used.
     """
     if moving is not None:
-        write_moving_parts(capture.folder, capture.images, moving)
+        images = moving_parts([read_image(capture.folder / name) for name in capture.images])
+        for name, image in zip(capture.images, images, strict=True):
+            write_bytes(moving / name, encode_png(image))  # PNG whatever the name
     return replace(
         capture,
         folder=moving or capture.folder,

@@ -141,23 +141,20 @@ class CameraViews:
         return state.x[self.arm] @ scale_translation(state.rig_from_camera[self.number], state.scale)
 
 
-def known_images(case: Case) -> KnownImages:
-    """Return the used images of the capture's own camera with their features and their poses in metres."""
-    capture, reconstruction, used = case.capture, case.reconstruction, case.used
-    images = [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index[used]]
-    places = scale_translation(reconstruction.recon_from_camera[used], case.hand_eye.scale)
-    return KnownImages.of(images, reconstruction.intrinsics, places)
-
-
 class Rigs:
     """Poses of all rigs of a cell; a rig is a set of cameras that move together, at one time.
 
     There is one rig for each used image of the own camera, then those of other cameras. `case` is the calibration of
-    the own camera, `known` are its used images with poses in metres.
+    the own camera, `known` are its used images with features and poses in metres; None: they are read.
     """
 
-    def __init__(self, case: Case, known: KnownImages) -> None:
-        self.case, self.known, self.rows = case, known, case.reconstruction.image_index[case.used]
+    def __init__(self, case: Case, known: KnownImages | None = None) -> None:
+        self.case, self.rows, found = case, case.reconstruction.image_index[case.used], case.reconstruction
+        if known is None:
+            images = [read_image(case.capture.folder / case.capture.images[row]) for row in self.rows]
+            places = scale_translation(found.recon_from_camera[case.used], case.hand_eye.scale)
+            known = KnownImages.of(images, found.intrinsics, places)
+        self.known = known
         self.poses = list(known.recon_from_camera)
         self.arms: list[str] = []
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []

@@ -22,7 +22,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.capture.images import read_image
 from jcr.cell.images import CellImages, cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
-from jcr.cell.rigs import APART, CameraViews, Rigs, known_images, localise
+from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.solve import Solution
@@ -71,7 +71,7 @@ def place_cameras(
         priors=(),
         hand_eye=hand_eye,
     )
-    rigs = Rigs(case, known_images(case))
+    rigs = Rigs(case)
     found = {camera.name: list[tuple[Registration | None, int]]() for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress or silent, "other cameras", todo):

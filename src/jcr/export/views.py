@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import pinhole_inside, project, undistortion, unproject
+from jcr.camera import is_distorted, pinhole_inside, project, undistortion, unproject
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
@@ -52,11 +52,28 @@ def write_nerfstudio(
 
     The matrices are base_from_camera with OpenGL's camera axes (x right, y up, z backward). nerfstudio rotates, shifts
     and scales the scene unless called with `--orientation-method none --center-method none --auto-scale-poses False`.
+    Raises InputError if nerfstudio does not support the distortion model.
     """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
+        if intrinsics.model in ("rational", "thin_prism"):
+            raise InputError(
+                f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort"
+            )
+        distortion = dict(zip(COEFFICIENTS[intrinsics.model], intrinsics.distortion, strict=True))
+        camera_model = "OPENCV_FISHEYE" if intrinsics.model == "fisheye" else "OPENCV"
+        if not is_distorted(intrinsics):
+            camera_model, distortion = "PINHOLE", {}
         content = {
-            **_nerfstudio_camera(intrinsics),
+            "camera_model": camera_model,
+            "fl_x": intrinsics.fx,
+            "fl_y": intrinsics.fy,
+            # The centre of the first pixel is (0, 0) here and (0.5, 0.5) in nerfstudio.
+            "cx": intrinsics.cx + 0.5,
+            "cy": intrinsics.cy + 0.5,
+            "w": intrinsics.width,
+            "h": intrinsics.height,
+            **distortion,
             "ply_file_path": "points.ply",
             "frames": [
                 {"file_path": f"images/{name}", "transform_matrix": (pose @ _OPENGL_FROM_OPENCV).tolist()}
@@ -66,31 +83,6 @@ def write_nerfstudio(
         }
         (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
         write_cloud(made / "points.ply", cloud, notes)
-
-
-def _nerfstudio_camera(intrinsics: Intrinsics) -> dict[str, str | float]:
-    """Return the entries of transforms.json for camera model and intrinsics (px).
-
-    Raises InputError if nerfstudio does not support the distortion model.
-    """
-    if intrinsics.model in ("rational", "thin_prism"):
-        raise InputError(f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort")
-    plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
-    return {
-        "camera_model": "PINHOLE"
-        if plain
-        else "OPENCV_FISHEYE"
-        if intrinsics.model == "fisheye"
-        else "OPENCV",
-        "fl_x": intrinsics.fx,
-        "fl_y": intrinsics.fy,
-        # The centre of the first pixel is (0, 0) here and (0.5, 0.5) in nerfstudio.
-        "cx": intrinsics.cx + 0.5,
-        "cy": intrinsics.cy + 0.5,
-        "w": intrinsics.width,
-        "h": intrinsics.height,
-        **({} if plain else dict(zip(COEFFICIENTS[intrinsics.model], intrinsics.distortion, strict=True))),
-    }
 
 
 def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], options: ExportOptions) -> None:

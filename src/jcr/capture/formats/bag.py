@@ -2,17 +2,16 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int, UInt16
+from jaxtyping import Float, Int, UInt16
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_yaml
-from jcr.capture.pose_track import TfTree, speed
+from jcr.capture.pose_track import Stamps, TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.ros import image_of, intrinsics_of_ros, read_ros_depth
 from jcr.capture.urdf_chain import read_arm
@@ -54,8 +53,12 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             arm.columns(list(bag.joints), str(path))
             ordered = [dict(sorted(bag.joints[name].items())) for name in arm.joints]
             samples = [(np.array([*one]), np.array([*one.values()])) for one in ordered]
-            poses_at = partial(arm.poses_at, samples)
             joints = arm.angles(arm.interpolated(samples, stamps)[0])
+
+            def poses_at(at: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+                recorded, gap = arm.interpolated(samples, at)
+                return arm.poses(recorded), gap
+
         poses, gap_ns = poses_at(stamps)
         recording = Recording(
             source=path,

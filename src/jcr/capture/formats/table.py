@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from jcr.capture.checks import checked_capture, require_frames
-from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
+from jcr.capture.controllers import CONVENTIONS, METRES, checked_rows, tolerated
 from jcr.capture.formats import pose_lists
 from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions, UnitsName
@@ -104,11 +104,7 @@ def find_table(path: Path) -> Path | None:
 
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """Read the poses of a file; raise InputError that names the faulty column or the option to add."""
-    if file.suffix in pose_lists.SUFFIXES:
-        header, rows = pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
-    else:
-        header, rows = _read_rows(file)
-    return pose_table(header, rows, options, str(file))
+    return pose_table(*_read_rows(file), options, str(file))
 
 
 def pose_table(
@@ -131,8 +127,6 @@ def pose_table(
         next((cells[name] for name in names if name in cells), None) for names in (_IMAGE, _STAMP)
     )
     require_frames(0 if image is None else len(image), where, 0)
-    if convention == "auto":
-        convention = _convention_of(cells, where)
     wanted = CONVENTIONS[convention].columns
     if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):
         cells = cells | {name: (cell,) * len(rows) for name, cell in _LAST_ROW.items()}
@@ -149,7 +143,7 @@ def pose_table(
             else:
                 text = f"{shown(cell)} is not a number; correct or drop the row"
                 texts.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
-    poses, faults = checked_rows(numbers, convention, _units_of(units, convention, options), where)
+    poses, faults = checked_rows(numbers, convention, units, where)
     faults |= texts
     if len(faults) > tolerated(len(rows)):
         raise InputError(faults[min(faults)])
@@ -178,62 +172,58 @@ def _convention_of(names: Collection[str], where: str) -> ConventionName:
     )
 
 
-def _units_of(named: Collection[str], convention: str, options: ReadOptions) -> UnitsName:
-    """Return the units of a pose table such as "mm-deg": those of the options, else those in its header, else "auto".
-
-    `named` are the units that the header states, such as {"mm", "deg"}.
-    """
-    if options.pose_units != "auto" or not named:
-        return options.pose_units
-    length, angle = CONVENTIONS[convention].units()
-    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
-    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
-    return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
-
-
 def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
-) -> tuple[dict[str, tuple[Any, ...]], set[str], ConventionName]:
-    """Return the columns of a table of poses, the units in its header, and the pose convention ("auto": unknown).
+) -> tuple[dict[str, tuple[Any, ...]], UnitsName, ConventionName]:
+    """Return the columns of a table of poses, and the units and convention of its poses, by the options or the header.
 
     The columns are a dictionary from name ("x", "qx", "image", …) to cells. Without a header, an image name or time
     stamp is expected first, then the columns of the convention. Messages of InputError begin with `where`.
     """
     columns, convention = [tuple(column) for column in zip(*rows, strict=True)], options.pose_convention
     if header is not None:
-        names, units = zip(*(_name_and_unit(cell) for cell in header), strict=True)
+        names, stated = zip(*(_name_and_unit(cell) for cell in header), strict=True)
         if twice := [name for name, count in Counter(names).items() if count > 1]:
             raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
         for cell in header if convention == "auto" else ():
             convention = _EXPLICIT.get(cell, convention)
-        return dict(zip(names, columns, strict=True)), {*units} - {"", "s", "ns"}, convention
+        if convention == "auto":
+            convention = _convention_of(names, where)
+        usual = CONVENTIONS[convention].units()
+        length = next((unit for unit in METRES if unit in stated), usual[0])
+        angle = next((unit for unit in ("deg", "rad") if unit in stated), usual[1])
+        units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
+        units = units if options.pose_units == "auto" and {*stated} - {"", "s", "ns"} else options.pose_units
+        return dict(zip(names, columns, strict=True)), units, convention
     named = dict[str, tuple[Any, ...]]()
     if number_of(columns[0][0]) is None:
         named["image"] = columns.pop(0)
-    known = convention
-    if known == "auto":
+    if convention == "auto":
         # Eight numbers are TUM's: timestamp tx ty tz qx qy qz qw.
-        known = {8: "quat-xyzw", 12: "matrix", 16: "matrix"}.get(len(columns))
-    if known is None:
+        guesses: dict[int, ConventionName] = {8: "quat-xyzw", 12: "matrix", 16: "matrix"}
+        convention = guesses.get(len(columns), convention)
+    if convention == "auto":
         raise InputError(
             f"{where}: {len(columns)} columns of numbers without names; add a header (x,y,z,qx,qy,qz,qw) or say how "
             f"a pose is written with --pose-convention ({', '.join(CONVENTIONS)})"
         )
-    wanted = CONVENTIONS[known].columns
+    wanted = CONVENTIONS[convention].columns
     if len(wanted) == 16 and len(columns) in (12, 13):
         wanted = tuple(name for name in wanted if name not in _LAST_ROW)
     if len(columns) == len(wanted) + 1:
         named["timestamp"] = columns.pop(0)
     if len(columns) != len(wanted):
         raise InputError(
-            f"{where}: {len(columns)} columns of numbers; --pose-convention {known} has {len(wanted)}: "
+            f"{where}: {len(columns)} columns of numbers; --pose-convention {convention} has {len(wanted)}: "
             f"{', '.join(wanted)}"
         )
-    return named | dict(zip(wanted, columns, strict=True)), set(), convention
+    return named | dict(zip(wanted, columns, strict=True)), options.pose_units, convention
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
     """Read the header of a pose file (None without one) and the cells of every row."""
+    if file.suffix in pose_lists.SUFFIXES:
+        return pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     if file.suffix == ".npy":
         array = read_npy(file)
         if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
