@@ -14,7 +14,7 @@ MORE_MEMORY = "use fewer or smaller images, end other programs, or raise its lim
 
 
 def require_address_space() -> None:
-    """Raise InputError if the limit of the address space (ulimit -v) is below ADDRESS_SPACE.
+    """Raise InputError if the limit of the address space (ulimit -v) is below 2 GB.
 
     Below it, OpenBLAS ends the process, or libraries fail to load, without a clear message.
     """

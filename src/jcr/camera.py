@@ -53,7 +53,7 @@ def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrins
 
 
 def is_distorted(camera: Intrinsics) -> bool:
-    """Return whether the camera has a distortion; a fisheye always has."""
+    """Test whether the camera has a distortion; a fisheye always has."""
     return camera.model == "fisheye" or any(camera.distortion)
 
 

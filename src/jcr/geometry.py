@@ -213,7 +213,7 @@ def nearest_to_lines(
 
 
 def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
-    """Return the length (m) of motions (...,4,4): length of the translation plus ARM times the angle."""
+    """Return the length (m) of motions (...,4,4): length of the translation plus 0.3 m times the angle (rad)."""
     return np.linalg.norm(motion[..., :3, 3], axis=-1) + ARM * rotation_angle(motion[..., :3, :3])
 
 

@@ -135,7 +135,7 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
     """Return the width of an image's strongest edges as a share of its long side, along the axis with more blur.
 
     The width follows from the rise of grey levels within 2 pixels and within 16: 1/320 for sharp edges up to 1/40; 0
-    without edges. An image smaller than EDGES_AT counts as an image of that size.
+    without edges. An image whose long side is below 640 px counts as one of 640 px.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(EDGES_AT / max(grey.shape), 1.0)

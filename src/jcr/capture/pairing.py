@@ -106,7 +106,7 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
-    """Return the result of `pair_with_images` for a table whose rows name their images.
+    """Pair the poses of a table with images by the image names in its rows; the result is that of `pair_with_images`.
 
     Folder, slashes, case and file ending of a name may differ from those of the image file.
     """
@@ -140,7 +140,7 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
 def _paired_by_time(
     folder: Path, file: Path, table: PoseTable, taken: list[str], options: ReadOptions
 ) -> Paired | None:
-    """Return the result of `pair_with_images`, with poses interpolated at the time stamps that name the images `taken`.
+    """Pair the images `taken`, named by time stamps, with interpolated poses; the result is that of `pair_with_images`.
 
     None: the names are no time stamps, or none of the stamps is within the times of the table.
     """

@@ -118,7 +118,7 @@ def read_json(file: Path) -> Any:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Return the first NAMED names as text, separated by commas, and the number of the remaining ones."""
+    """Return the first ten names as text, separated by commas, and the number of the remaining ones."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 

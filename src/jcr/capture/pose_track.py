@@ -50,10 +50,10 @@ class PoseTrack:
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Return for each of n time stamps (ns) the row of the sample before it, and two numbers on the next sample.
+    """Return for each of n time stamps (ns) the row of the sample before, its place between two samples, and their gap.
 
-    The first number is the fraction (0 to 1) of the time from that sample to the next. The second is the time (ns)
-    between the two: 0 for a stamp at a sample, the largest int64 outside of the k ascending times `sample_ns`.
+    `sample_ns` are the k ascending times of the samples. The place is 0 at the sample before and 1 at the next one. The
+    gap is the time (ns) between the two: 0 for a stamp at a sample, the largest int64 outside of the samples.
     """
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))

@@ -77,21 +77,21 @@ def read_source(
         )
     name = format_of(path, options) if options.format == "auto" else options.format
     if name not in RECORDINGS:
-        found = FORMATS[name].read(path, options)
+        folder, origin, found = None, [], FORMATS[name].read(path, options)
     elif into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
     else:
-        into, made_from = Path(into), _origin(path, options)
-        file = into / capture_json.FILE
+        folder, origin = Path(into), _origin(path, options)
+        file = folder / capture_json.FILE
         extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
-        if extra.get("made_from") == made_from:
-            return replace(capture_json.read(into), notes=tuple(extra["notes"]))
-        found = FORMATS[name].read(path, options, into, progress or silent)
+        if extra.get("made_from") == origin:
+            return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
+        found = FORMATS[name].read(path, options, folder, progress or silent)
     if options.pose_inverted:
         found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
-    if name in RECORDINGS:
-        capture_json.write(into, found, notes=found.notes, made_from=made_from)
-        return replace(capture_json.read(into), notes=found.notes)
+    if folder is not None:
+        capture_json.write(folder, found, notes=found.notes, made_from=origin)
+        return replace(capture_json.read(folder), notes=found.notes)
     require_frames(len(found), str(path), at_least)
     require_motion(found.base_from_gripper, str(path))
     if isinstance(found, Capture) and (rotated := how_rotated(found)) is not None:
@@ -100,7 +100,7 @@ def read_source(
 
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name in FORMATS of the format of the files at a path; raise InputError if they match none."""
+    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches."""
     has_poses = options is not None and options.poses is not None
     for name, form in FORMATS.items():
         if form.recognises(path) or (name == "table" and has_poses):

@@ -178,7 +178,7 @@ class RecordedArm:
 
 
 def read_arm(options: ReadOptions) -> RecordedArm:
-    """Read the arm between the base and gripper links of the options; raise InputError if the URDF has no such arm."""
+    """Read the arm of `options.urdf` between its links `base_frame` and `gripper_frame`; raise InputError if none."""
     file = options.urdf
     assert file is not None
     urdf = load_urdf(file)

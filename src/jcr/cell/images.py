@@ -120,7 +120,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:
-    """Return the normal distribution of the own camera's used poses (m), for a reconstruction without image features."""
+    """Return mean and covariance of the own camera's used poses (m), for a reconstruction without image features."""
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:

@@ -94,7 +94,7 @@ class CameraViews:
 
     @property
     def rows(self) -> Int[ndarray, " k"]:
-        """Numbers of the used images."""
+        """Numbers of the used images, counted from 0 in the camera's list of images."""
         return np.array(list(self.used), dtype=int)
 
     @property
@@ -109,7 +109,7 @@ class CameraViews:
 
     @property
     def covariances(self) -> Float[ndarray, "k 6 6"]:
-        """Covariances of the steps of `places` (m, rad)."""
+        """Covariances of small steps (m, rad; recon axes) of the poses `places`."""
         return np.stack([one.pose.covariance[:6, :6] for one in self.used.values()])
 
     @property

@@ -52,9 +52,9 @@ def place_cameras(
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
 ) -> CellPlacement:
-    """Return the placement of the cameras `others`, which observe the scene that `hand_eye` is the calibration of.
+    """Return the poses of the cameras `others` of the cell; `hand_eye` is the calibration of the capture's own camera.
 
-    A camera that cannot be placed is in the result with the reason.
+    `reconstruction` is that of the own camera. A camera that cannot be placed is in the result with the reason.
     """
     if not others:
         return CellPlacement(())
@@ -136,7 +136,7 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
 def _examined(
     images: CellImages, mounted: Sequence[CameraViews], hand_eye: Calibration
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
-    """Return the joint solution of all images, and for each camera the findings of calibration/checks/effects.py.
+    """Return the joint solution of all images, and for each camera the findings on effects such as a slip.
 
     `mounted` are the cameras other than the capture's own. Confirmed effects on them are adopted in the solution.
     Another arm's poses are tested with its camera; those of the capture's own arm were tested in its calibration.

@@ -86,10 +86,36 @@ def write_nerfstudio(
 
 
 def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write the images and a COLMAP model with all tracks (sparse/0, binary and text) into a new folder."""
+    """Write the images and a COLMAP model with all tracks (sparse/0, binary and text) into a new folder.
+
+    The model is in the base frame, in metres. Raises InputError if COLMAP lacks the distortion model.
+    """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
-        model = _colmap_model(views, names, intrinsics)
+        if intrinsics.model == "thin_prism":
+            raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
+        model = pycolmap.Reconstruction()
+        camera = colmap_camera(intrinsics, known=True)
+        camera.camera_id = 1
+        model.add_camera_with_trivial_rig(camera)
+        x_px = views.tracks.x_px
+        if intrinsics != views.intrinsics:
+            x_px = project(intrinsics, unproject(views.intrinsics, x_px))
+        inside = ((x_px >= -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
+        place = np.zeros(len(x_px), int)  # index of each observation within its image
+        for row, name in enumerate(names):
+            mine = inside & (views.tracks.image == row)
+            place[mine] = np.arange(mine.sum())
+            image = pycolmap.Image(name=name, keypoints=x_px[mine] + 0.5, camera_id=1, image_id=row + 1)
+            camera_from_base = pycolmap.Rigid3d(inverse(views.base_from_camera[row])[:3])
+            model.add_image_with_trivial_frame(image, camera_from_base)
+        tracks = [pycolmap.Track() for _ in views.points_in_base]
+        for k in np.flatnonzero(inside):
+            tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
+        for xyz, track in zip(views.points_in_base, tracks, strict=True):
+            if track.length() >= 2:
+                model.add_point3D(xyz, track)
+        model.update_point_3d_errors()
         model.extract_colors_for_all_images(str(made / "images"))
         sparse = made / "sparse" / "0"
         sparse.mkdir(parents=True)
@@ -99,38 +125,6 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
         (made / "README.txt").write_text(
             f"{about}COLMAP's world is that frame; cameras are world to camera.\n"
         )
-
-
-def _colmap_model(views: PosedImages, names: list[str], intrinsics: Intrinsics) -> pycolmap.Reconstruction:
-    """Return a COLMAP model in the base frame (m) with all images and tracks.
-
-    `names` and `intrinsics` are those of the exported image files. Raises InputError if COLMAP lacks the distortion.
-    """
-    if intrinsics.model == "thin_prism":
-        raise InputError("COLMAP has no thin_prism distortion model; export with --undistort")
-    model = pycolmap.Reconstruction()
-    camera = colmap_camera(intrinsics, known=True)
-    camera.camera_id = 1
-    model.add_camera_with_trivial_rig(camera)
-    x_px = views.tracks.x_px
-    if intrinsics != views.intrinsics:
-        x_px = project(intrinsics, unproject(views.intrinsics, x_px))
-    inside = ((x_px >= -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
-    place = np.zeros(len(x_px), int)  # index of each observation within its image
-    for row, name in enumerate(names):
-        mine = inside & (views.tracks.image == row)
-        place[mine] = np.arange(mine.sum())
-        image = pycolmap.Image(name=name, keypoints=x_px[mine] + 0.5, camera_id=1, image_id=row + 1)
-        camera_from_base = pycolmap.Rigid3d(inverse(views.base_from_camera[row])[:3])
-        model.add_image_with_trivial_frame(image, camera_from_base)
-    tracks = [pycolmap.Track() for _ in views.points_in_base]
-    for k in np.flatnonzero(inside):
-        tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
-    for xyz, track in zip(views.points_in_base, tracks, strict=True):
-        if track.length() >= 2:
-            model.add_point3D(xyz, track)
-    model.update_point_3d_errors()
-    return model
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:

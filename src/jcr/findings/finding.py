@@ -55,7 +55,7 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Make a finding about `images`; `known` sets the fields named in NUMBERS, and other names as details."""
+        """Return a finding about `images`; `known` sets its fields, from joints to intrinsics_shift, and its details."""
         sizes = {name: known.pop(name) for name in NUMBERS if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 

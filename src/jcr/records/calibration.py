@@ -161,14 +161,13 @@ def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
     return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
 
 
-def _covariance_of(share: Share | None) -> Float[ndarray, "7 7"]:
-    """Return the covariance (COVARIANCE_ORDER) of a share of the uncertainty; a zero matrix for None."""
-    return np.zeros((7, 7)) if share is None else share.covariance
-
-
-_share = Annotated[Share | None, AfterValidator(_covariance_of), PlainSerializer(share_of, return_type=Share)]
+_share = Annotated[
+    Share | None,
+    AfterValidator(lambda share: np.zeros((7, 7)) if share is None else share.covariance),
+    PlainSerializer(share_of, return_type=Share),
+]
 PartOfBudget = Annotated[Float[ndarray, "7 7"], in_json(_share)]
-"""Covariance of one cause in COVARIANCE_ORDER; in files a Share."""
+"""Covariance of one cause in COVARIANCE_ORDER; in files a Share, where null is a covariance of 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +207,7 @@ class LeaveOneOut:
 
     @property
     def length_m(self) -> float:
-        """Translation and rotation error as one length (m): hypot of translation and rotation times ARM."""
+        """Translation and rotation error as one length (m): hypot of translation and 0.3 m times the rotation (rad)."""
         from jcr.geometry import ARM  # SciPy, which help need not wait for
 
         return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))

@@ -47,7 +47,7 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def with_std(self, std: Float[ndarray, " q"] | None) -> "IntrinsicsAndStd":
-        """Return the intrinsics with standard deviations, in the order of camera.parameters; None: not estimated."""
+        """Return the intrinsics with standard deviations, fx, fy, cx, cy and distortion; None: not estimated."""
         values: dict[str, Any] = vars(self) | {"std": None if std is None else tuple(std.tolist())}
         return IntrinsicsAndStd(**values)
 
@@ -179,7 +179,7 @@ class PosePairs:
     backend: str = "poses given"
 
     def __len__(self) -> int:
-        """Return the number of images."""
+        """Return the number of pairs."""
         return len(self.images)
 
     @property

@@ -89,16 +89,8 @@ def in_unit(per_unit: float) -> GetPydanticSchema:
 
     `per_unit` is the value in the unit of JSON of 1 m or 1 rad, such as 1000 for mm.
     """
-
-    def from_unit(value: float) -> float:
-        """Convert a number of the file to metres or radians."""
-        return value / per_unit
-
-    def to_unit(value: float) -> float:
-        """Convert a number to the unit of the file."""
-        return rounded(value * per_unit)
-
-    return in_json(Annotated[float, AfterValidator(from_unit), PlainSerializer(to_unit, return_type=float)])
+    in_file = PlainSerializer(lambda value: rounded(value * per_unit), return_type=float)
+    return in_json(Annotated[float, AfterValidator(lambda value: value / per_unit), in_file])
 
 
 def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:

@@ -31,7 +31,7 @@ SAME_MOMENT_NS = 20_000_000
 
 
 def recognises(path: Path) -> bool:
-    """Test whether a path is a bag: a folder with a metadata.yaml, or a file with one of SUFFIXES."""
+    """Test whether a path is a bag: a folder with a metadata.yaml, or a .bag, .mcap or .db3 file."""
     return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
 
 
@@ -53,11 +53,12 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             arm.columns(list(bag.joints), str(path))
             ordered = [dict(sorted(bag.joints[name].items())) for name in arm.joints]
             samples = [(np.array([*one]), np.array([*one.values()])) for one in ordered]
-            joints = arm.angles(arm.interpolated(samples, stamps)[0])
 
-            def poses_at(at: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+            def by_joints(at: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
                 recorded, gap = arm.interpolated(samples, at)
                 return arm.poses(recorded), gap
+
+            poses_at, joints = by_joints, arm.angles(arm.interpolated(samples, stamps)[0])
 
         poses, gap_ns = poses_at(stamps)
         recording = Recording(
@@ -79,7 +80,7 @@ class _Bag:
     """Open bag, and the content of all its messages except the images, collected in one pass."""
 
     def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
-        """Read the transforms, joint states, CameraInfo and the time stamps of the images."""
+        """Read transforms, joint states, CameraInfo and image time stamps of the bag `path`, opened as `reader`."""
         self.reader, self.path, self.tree = reader, path, TfTree()
         self.stamp_ns, self.log_ns = list[int](), list[int]()
         """Time stamps (ns) of the images, and the times (ns) at which the images were recorded."""

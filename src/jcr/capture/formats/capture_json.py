@@ -59,7 +59,7 @@ def read_intrinsics(file: Path) -> IntrinsicsEntry:
 
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
-    """Return frame `row` of a capture.json; raise InputError that names its image if the frame cannot be used."""
+    """Return the validated frame number `row` of a capture.json; raise InputError that names its image if invalid."""
     where = f"{file}: frame {row} ({_image_name(content, row, file)})"
     return validated_content(FrameEntry, content.frames[row], where)
 
