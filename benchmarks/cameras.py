@@ -178,7 +178,7 @@ def _withheld(folder: Path) -> Iterator[tuple[list[str], tuple[float, float] | N
         )
         for row in apart
     ]
-    found = place_cameras(rest, cameras, reconstruction, hand_eye)
+    found, _, _ = place_cameras(rest, cameras, reconstruction, hand_eye)
     for row, camera in zip(apart, found.cameras, strict=True):
         off, numbers = None, ["–"] * 4
         if camera.parent_from_camera is not None and camera.covariance is not None:

@@ -16,7 +16,7 @@ from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import added_camera
 from jcr.cell.placement import (
     CameraPlacement,
-    CellPlacement,
+    CamerasFile,
     read_cameras,
     write_cameras,
 )
@@ -65,8 +65,8 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, Calibration]:
     return old, reconstruction, calibrate_reconstruction(old, reconstruction)
 
 
-def placed(calibrated: tuple[Capture, Reconstruction, Calibration], *cameras: CellCamera) -> CellPlacement:
-    return place_cameras(calibrated[0], cameras, *calibrated[1:])
+def placed(calibrated: tuple[Capture, Reconstruction, Calibration], *cameras: CellCamera) -> CamerasFile:
+    return place_cameras(calibrated[0], cameras, *calibrated[1:])[0]
 
 
 def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
@@ -207,7 +207,7 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
     more = placed(calibrated, fixed(old, old.images[3])).cameras
-    content = CellPlacement((*found.cameras, *more)).file("0")
+    content = CamerasFile(cameras=[*found.cameras, *more], arms=[], version="0")
     write_cameras(tmp_path, content)
     assert read_cameras(tmp_path) == content
     written = json.loads((tmp_path / "cameras.json").read_text())["cameras"]

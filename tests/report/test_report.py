@@ -17,7 +17,7 @@ from chromium import Chromium
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.controllers import poses_from_numbers
-from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.estimation.observability import excitation
 from jcr.geometry import inverse, transform
 from jcr.records import COVARIANCE_ORDER, CellCamera, Reconstruction
@@ -220,7 +220,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     ]
     known = TransformUncertainty.of(1e-6 * np.eye(6))
     arm = ArmPlacement(name="right", base_from_other_base=base.tolist(), uncertainty=known)
-    content = CellPlacement(tuple(found), (arm,)).file("0.0")
+    content = CamerasFile(cameras=found, arms=[arm], version="0.0")
     capture = replace(run.capture, others=others)
     page = report_html(run.with_parts(capture=capture, cloud=None, scene=None, cameras=content))
     scene = json.loads(Elements(page).scripts[0])

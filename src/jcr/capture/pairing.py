@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.capture.controllers import tolerated
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_few, shown
-from jcr.capture.pose_track import PoseTrack
+from jcr.capture.pose_track import interpolated_poses
 from jcr.errors import InputError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -152,7 +152,8 @@ def _paired_by_time(
     if not ((stamps >= table.stamp_ns.min()) & (stamps <= table.stamp_ns.max())).any():
         return None
     sound = np.isfinite(table.base_from_gripper).all((1, 2))
-    poses, gap_ns = PoseTrack(table.stamp_ns[sound], table.base_from_gripper[sound]).at(stamps)
+    samples = table.stamp_ns[sound], table.base_from_gripper[sound]
+    poses, gap_ns = interpolated_poses(*samples, stamps)
     stale = np.flatnonzero(gap_ns > 1e6 * options.max_gap_ms).tolist()
     why = f"no pose within {options.max_gap_ms:.0f} ms around it; drop the image or raise --max-gap-ms"
     notes = (f"poses interpolated at the {len(taken)} images' time stamps",)

@@ -24,27 +24,24 @@ SPEED_OVER_NS = 50_000_000
 stop."""
 
 
-class PoseTrack:
-    """Poses a_from_b at ascending times, for interpolation; of poses with equal time stamps, the first one is kept."""
+def interpolated_poses(
+    sample_ns: Int[ndarray, " k"], a_from_b: Float[ndarray, "k 4 4"], stamp_ns: Stamps
+) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+    """Return poses interpolated at n time stamps (ns), and the time (ns) between the two samples around each.
 
-    def __init__(self, stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> None:
-        self.stamp_ns, rows = np.unique(stamp_ns, return_index=True)
-        self.a_from_b = a_from_b[rows]
-
-    def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
-        """Return interpolated poses at n time stamps (ns), and the time (ns) between the two samples around each.
-
-        That time is 0 at a sample, and the largest int64 for a stamp outside of the samples. Positions are interpolated
-        linearly and rotations by slerp.
-        """
-        before, share, gap = bracket(self.stamp_ns, stamp_ns)
-        if len(self.stamp_ns) == 1:
-            return np.repeat(self.a_from_b, len(stamp_ns), axis=0), gap
-        # Slerp on the row number: seconds since 1970 in float64 would round to 0.2 µs.
-        rows = np.arange(len(self.stamp_ns))
-        rotation = Slerp(rows, Rotation.from_matrix(self.a_from_b[:, :3, :3]))(before + share).as_matrix()
-        low, high = self.a_from_b[before, :3, 3], self.a_from_b[np.minimum(before + 1, rows[-1]), :3, 3]
-        return transform(rotation, low + share[:, None] * (high - low)), gap
+    `a_from_b` are the samples at the times `sample_ns`; of samples with equal times, the first is used. The time between
+    is 0 at a sample, and the largest int64 outside of the samples. Positions are interpolated linearly, rotations by
+    slerp.
+    """
+    times, first = np.unique(sample_ns, return_index=True)
+    before, share, gap = bracket(times, stamp_ns)
+    if len(times) == 1:
+        return np.repeat(a_from_b[first], len(stamp_ns), axis=0), gap
+    # Slerp on the row number: seconds since 1970 in float64 would round to 0.2 µs.
+    rows = np.arange(len(times))
+    rotation = Slerp(rows, Rotation.from_matrix(a_from_b[first, :3, :3]))(before + share).as_matrix()
+    low, high = a_from_b[first[before], :3, 3], a_from_b[first[np.minimum(before + 1, rows[-1])], :3, 3]
+    return transform(rotation, low + share[:, None] * (high - low)), gap
 
 
 def bracket(
@@ -126,23 +123,23 @@ class TfTree:
             gap, products = np.zeros(len(stamp_ns), np.int64), []
             for of_chain in edges:
                 poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
-                for track, static in of_chain:
-                    if static:
-                        poses = track.a_from_b[-1] @ poses
+                for at, samples, is_static in of_chain:
+                    if is_static:
+                        poses = samples[at.argmax()] @ poses
                         continue
-                    parent_from_child, edge_gap = track.at(stamp_ns)
+                    parent_from_child, edge_gap = interpolated_poses(at, samples, stamp_ns)
                     poses, gap = parent_from_child @ poses, np.maximum(gap, edge_gap)
                 products.append(poses)
             return inverse(products[0]) @ products[1], gap
 
         return poses_at
 
-    def _edge(self, child: str, source: Path) -> tuple[PoseTrack, bool]:
-        """Return the samples of parent_from_child for a child frame, and whether its transform is static."""
+    def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
+        """Return times (ns) and samples of a child frame's parent_from_child, and whether this transform is static."""
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
             text = "holds a transform that is none; record again"
             raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
         poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
-        return PoseTrack(stamps, poses), child in self._static
+        return stamps, poses, child in self._static

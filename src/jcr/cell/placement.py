@@ -1,10 +1,9 @@
 """Records of the placement (pose in the cell) of further cameras and arms, and their file cameras.json."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -20,10 +19,6 @@ from jcr.geometry import skew
 from jcr.records import CellCamera, IntrinsicsAndStd, Mount
 from jcr.records.json_fields import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.estimation.problem import State
-    from jcr.estimation.solve import Solution
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"
 
@@ -228,22 +223,6 @@ class CamerasFile(Part):
     def as_json(self) -> dict[str, Any]:
         """Return the content as a JSON object, with the names of the file."""
         return self.model_dump(by_alias=True)
-
-
-@dataclass(frozen=True)
-class CellPlacement:
-    """Placement of all cameras other than the capture's own, and of other arms, with the underlying solution."""
-
-    cameras: tuple[CameraPlacement, ...]
-    arms: tuple[ArmPlacement, ...] = ()
-    solution: "Solution | None" = None
-    """Joint solution of the cell; None if no camera was placed."""
-    poses: "dict[str, Callable[[State], Float[ndarray, '4 4']]]" = field(default_factory=dict)
-    """Function for each placed camera, by name, that returns parent_from_camera from a state."""
-
-    def file(self, version: str) -> CamerasFile:
-        """Return the content of cameras.json; `version` is written to the file."""
-        return CamerasFile(cameras=list(self.cameras), arms=list(self.arms), version=version)
 
 
 def write_cameras(folder: Path, content: CamerasFile) -> None:

@@ -4,7 +4,7 @@ Every image of another camera is localised in the reconstruction (rigs.py); then
 the arms' poses (estimation/). The calibration of the capture's own camera is not changed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr import __version__
 from jcr.calibration.case import Case
 from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
@@ -21,10 +22,11 @@ from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.capture.images import read_image
 from jcr.cell.images import CellImages, cell_images
-from jcr.cell.placement import ArmPlacement, CameraPlacement, CellPlacement, TransformUncertainty
+from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
 from jcr.estimation.image_equations import median_reprojection_px
+from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, step_between
@@ -33,6 +35,7 @@ from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 
+PoseOfState = Callable[[State], Float[ndarray, "4 4"]]
 CONTRADICTS = 5.0
 """Reprojection error of an image, as a multiple of the median of all images, from which it contradicts the pose."""
 LEAST_PX = 1.0
@@ -51,16 +54,17 @@ def place_cameras(
     hand_eye: Calibration,
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
-) -> CellPlacement:
+) -> tuple[CamerasFile, Solution | None, Mapping[str, PoseOfState]]:
     """Return the poses of the cameras `others` of the cell; `hand_eye` is the calibration of the capture's own camera.
 
-    `reconstruction` is that of the own camera. A camera that cannot be placed is in the result with the reason.
+    `reconstruction` is that of the own camera. The first result is the content of cameras.json; a camera that cannot be
+    placed is in it with the reason. The others are the joint solution (None if no camera was placed), and for each
+    placed camera a function that returns base_from_camera or gripper_from_camera from a state of the solution.
     """
-    if not others:
-        return CellPlacement(())
-    if not hand_eye.is_sound:
+    if not hand_eye.is_sound or not others:
         why = (Finding.of(FindingKind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
-        return CellPlacement(tuple(CameraPlacement.of(one, why) for one in others))
+        rejected = [CameraPlacement.of(one, why) for one in others]
+        return CamerasFile(cameras=rejected, arms=[], version=__version__), None, {}
     options = options or CalibrateOptions()
     robot = robot_errors(capture, options).of(reconstruction.image_index)
     case = Case(
@@ -94,7 +98,7 @@ def place_cameras(
         else:
             mounted.append(replace(views, number=len(mounted) + 1))
     if not mounted:
-        return CellPlacement(tuple(cameras.values()))
+        return CamerasFile(cameras=[*cameras.values()], arms=[], version=__version__), None, {}
     solution, faults = _examined(cell_images(rigs, mounted), mounted, hand_eye)
     for one, shown in zip(mounted, faults, strict=True):
         cameras[one.camera.name] = _placement(one, solution, hand_eye, shown)
@@ -104,7 +108,8 @@ def place_cameras(
         uncertainty = TransformUncertainty.of(covariance)
         arms.append(ArmPlacement(name=arm, base_from_other_base=transform.tolist(), uncertainty=uncertainty))
     poses = {one.camera.name: one.parent_from_camera for one in mounted}
-    return CellPlacement(tuple(cameras[camera.name] for camera in others), tuple(arms), solution, poses)
+    placed = [cameras[camera.name] for camera in others]
+    return CamerasFile(cameras=placed, arms=arms, version=__version__), solution, poses
 
 
 def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:

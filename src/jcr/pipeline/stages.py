@@ -292,7 +292,7 @@ def place(result: RunResult, progress: Progress) -> CamerasFile:
     from jcr.cell.stage import place_cameras
 
     parts = result.capture, result.others, result.reconstruction, result.found
-    return place_cameras(*parts, result.state.options.calibrate, progress).file(__version__)
+    return place_cameras(*parts, result.state.options.calibrate, progress)[0]
 
 
 def _cameras(result: RunResult, progress: Progress) -> RunResult:

@@ -244,15 +244,16 @@ def _fixed_cameras(
         now = replace(camera, name=f"{camera.name[:60]}_now", folder=camera.folder or new.folder, **known)
         both = replace(own, **known), now
         hand_eye = calibrate_reconstruction(capture, reconstruction, calibrate_options)
-        cell = place_cameras(capture, both, reconstruction, hand_eye, calibrate_options, progress)
+        parts = capture, both, reconstruction, hand_eye, calibrate_options, progress
+        cell, solution, poses = place_cameras(*parts)
         for one in cell.cameras:
             if one.parent_from_camera is None:
                 raise RejectedError(f"cannot tell: {one.doubt}")
-        assert cell.solution is not None
-        before, after = (cell.poses[one.name] for one in both)
-        j = cell.solution.derivative(after) - cell.solution.derivative(before)
-        offset = step_between(before(cell.solution.state), after(cell.solution.state))
-        found = _of_two(offset, j @ cell.solution.covariance @ j.T, options)
+        assert solution is not None
+        before, after = (poses[one.name] for one in both)
+        j = solution.derivative(after) - solution.derivative(before)
+        offset = step_between(before(solution.state), after(solution.state))
+        found = _of_two(offset, j @ solution.covariance @ j.T, options)
         notes = [text for one in cell.cameras for text in one.warnings]
         yield replace(_judged(found, options, now.images, notes, "in the mapped scene"), fixed=own.name)
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated_content
-from jcr.capture.pose_track import PoseTrack, speed
+from jcr.capture.pose_track import interpolated_poses, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
@@ -107,7 +108,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         options=options,
         names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
-        speed=np.concatenate([speed(PoseTrack(at, poses[part]).at, at) for at, part in pieces]),
+        speed=np.concatenate(
+            [speed(partial(interpolated_poses, at, poses[part]), at) for at, part in pieces]
+        ),
         gap_ns=np.zeros(len(state), np.int64),  # pose and image of a row have the same time
         images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
         joints=joints,
