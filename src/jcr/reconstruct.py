@@ -335,7 +335,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
             )
     elif len(selecting) > 1:
         raise InputError(
-            f"{' and '.join(_flag(row.selected_by) for row in selecting)} select different back ends "
+            f"{' and '.join(f'--{row.selected_by}' for row in selecting)} select different back ends "
             f"({', '.join(row.name for row in selecting)}); give one of them"
         )
     else:
@@ -354,7 +354,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
         if not any(name in BACKENDS[chosen].options for chosen in names):
             users = [row.name for row in BACKENDS.values() if name in row.options]
             raise InputError(
-                f"{_flag(name)} {value}: the back end here ({', '.join(names)}) does not use it; leave it out, or "
+                f"--{name} {value}: the back end here ({', '.join(names)}) does not use it; leave it out, or "
                 f"give --backend {' or '.join(users)}"
             )
     return names
@@ -436,11 +436,6 @@ def _given_options(options: ReconstructOptions) -> dict[str, Any]:
     own = {name for row in BACKENDS.values() for name in row.options}
     unset = {field.name: field.default for field in fields(options) if field.name in own}
     return {name: value for name in unset if (value := getattr(options, name)) != unset[name]}
-
-
-def _flag(name: str) -> str:
-    """Return the command-line flag of an option, such as --known-length for known_length."""
-    return f"--{name.replace('_', '-')}"
 
 
 def device_of(options: ReconstructOptions) -> str:

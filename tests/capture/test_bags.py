@@ -145,10 +145,10 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "--base-frame is not given; the frames of its tf are base_link, tool0, world"),
+        ({}, "a frame of its tf: choose one with --base-frame: base_link, tool0, world"),
         (
             {"base_frame": "base_link", "gripper_frame": "hand"},
-            "--gripper-frame hand is not in the bag; .* tool0",
+            "hand is not there; choose one with --gripper-frame: .* tool0",
         ),
         (
             {"camera_topic": "/nowhere"},

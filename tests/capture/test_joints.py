@@ -31,8 +31,11 @@ def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "--gripper-frame is not given; its links are base_link, upper"),
-        ({"gripper_frame": "nose"}, "--gripper-frame nose is not in it; its links are base_link, upper"),
+        ({}, "a link: choose one with --gripper-frame: base_link, upper"),
+        (
+            {"gripper_frame": "nose"},
+            "a link: nose is not there; choose one with --gripper-frame: base_link, upper",
+        ),
         ({"gripper_frame": "base_link"}, "nothing moves between base_link and base_link"),
         ({"gripper_frame": "tool0", "base_frame": "finger"}, "no joints lead from finger to tool0"),
     ],

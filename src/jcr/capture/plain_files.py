@@ -25,13 +25,11 @@ _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 def read_text(file: Path, most: int = MAX_JSON) -> str:
-    """Read the text of a file; raise InputError if it is missing, too long, binary, compressed or not UTF-8."""
+    """Read the text of a file; raise InputError if it is missing, too long, binary or not UTF-8."""
     try:
         data = read_bytes(file)
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); name a file that is there") from None
-    if data[:2] == b"\x1f\x8b":
-        raise InputError(f"{file}: compressed by gzip; unpack it first (gunzip)")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -123,11 +121,22 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
-def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
-    """Return the content of a file, validated and converted by `schema`; raise InputError if the content does not fit.
+def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
+    """Return the topic, key or frame `asked` by the user; if that is None, the only entry of `usual`, the likely names.
 
-    The message begins with `where`.
+    Raises InputError that lists all `names` if `asked` is not one of them, or if `usual` has not one entry. In the
+    message, `what` describes the choice and `option` is its command-line option.
     """
+    if asked in names:
+        return str(asked)
+    if asked is None and len(usual) == 1:
+        return usual[0]
+    wrong = "" if asked is None else f"{asked} is not there; "
+    raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(names) or 'there are none'}")
+
+
+def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
+    """Return the content of a file, converted by `schema`; raise InputError, begun with `where`, if it does not fit."""
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:
         return validate(content)

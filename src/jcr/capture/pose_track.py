@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
+from jcr.capture.plain_files import chosen_name
 from jcr.errors import InputError
 from jcr.geometry import inverse, motion_length, transform
 
@@ -103,12 +104,7 @@ class TfTree:
         """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
-            if frame is None or frame not in frames:
-                given = "is not given" if frame is None else f"{frame} is not in the bag"
-                raise InputError(
-                    f"{source}: {option} {given}; the frames of its tf are {', '.join(frames) or 'none'}"
-                )
-            chains.append([frame])
+            chains.append([chosen_name(frames, frame, (), f"{source}: a frame of its tf", option)])
             while chains[-1][-1] in self._parent and len(chains[-1]) <= len(self._parent):
                 chains[-1].append(self._parent[chains[-1][-1]])
         up, down = chains

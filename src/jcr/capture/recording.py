@@ -39,20 +39,6 @@ Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
 
 
-def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
-    """Return the topic or key `asked` by the user; if that is None, the only entry of `usual`, the likely names.
-
-    Raises InputError that lists all `names` if `asked` is not one of them, or if `usual` has not one entry. In the
-    message, `what` describes the choice and `option` is its command-line option.
-    """
-    if asked in names:
-        return str(asked)
-    if asked is None and len(usual) == 1:
-        return usual[0]
-    wrong = "" if asked is None else f"{asked} is not there; "
-    raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(names) or 'there are none'}")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Recording:
     """Frames of a bag or data set: gripper pose, speed and time of each frame, and functions that read its image."""

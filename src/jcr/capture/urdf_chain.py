@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.controllers import RADIANS_LIMIT
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_text
+from jcr.capture.plain_files import chosen_name, read_text
 from jcr.capture.pose_track import Stamps, bracket
 from jcr.errors import InputError
 from jcr.estimation.kinematics import Arm
@@ -182,12 +182,9 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     file = options.urdf
     assert file is not None
     urdf = load_urdf(file)
-    base, gripper = options.base_frame or urdf.base_link, options.gripper_frame
-    for option, link in (("--base-frame", base), ("--gripper-frame", gripper)):
-        if link not in urdf.link_map:
-            given = "is not given" if link is None else f"{link} is not in it"
-            raise InputError(f"{file}: {option} {given}; its links are {', '.join(urdf.link_map)}")
-    chain = joints_to(urdf, str(gripper))
+    asked = ("--base-frame", options.base_frame or urdf.base_link), ("--gripper-frame", options.gripper_frame)
+    base, gripper = (chosen_name([*urdf.link_map], link, (), f"{file}: a link", name) for name, link in asked)
+    chain = joints_to(urdf, gripper)
     parents = [joint.parent for joint in chain]
     if base not in (*parents, gripper):
         raise InputError(
@@ -209,8 +206,8 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     slides = np.array([urdf.joint_map[name].type == "prismatic" for name in names])
     return RecordedArm(
         urdf=urdf,
-        base=str(base),
-        gripper=str(gripper),
+        base=base,
+        gripper=gripper,
         joints=names,
         unit=np.where(slides, length, angle),
         turn=np.where(slides, 0.0, 2 * np.pi / angle),

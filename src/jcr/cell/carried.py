@@ -3,10 +3,20 @@
 In the frame of the object the camera moves like a wrist camera moves in the base frame. With inverse gripper poses, a
 fixed camera is therefore calibrated like a wrist camera. Robot errors are errors of the gripper poses, not of their
 inverses, so the result and its covariance are estimated again with the actual poses (estimation/pose_equations.py).
+
+The static background is removed from the images, because the background often has more features than the object. A
+pixel's background is the colour that many images share. Each image keeps the pixels that differ from the background and
+fades to grey elsewhere, smoothly, because a sharp border would produce features.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
@@ -17,12 +27,22 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.capture.images import encode_png, read_image
-from jcr.cell.background import moving_parts
 from jcr.estimation.solve import recon_frame, uncertainty_of
 from jcr.files import write_bytes
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse
 from jcr.records import Capture, Reconstruction
+
+LEVELS = 14.0
+"""Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
+REDUCED = 320
+"""Width (px) at which images are compared."""
+LEAST_SHARE, LEAST = 0.3, 3
+"""Smallest share and number of images that must agree on a background pixel."""
+GREY = 128
+"""Grey level of the removed background."""
+GROWN, SOFT = 0.012, 0.008
+"""Dilation of the moving part, and sigma of the blur of its border, as shares of the image width."""
 
 
 def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
@@ -98,3 +118,27 @@ def refined(
         findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
     )
     return judged(with_findings(judged(again), effects_found)).on_fixed_camera()
+
+
+def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
+    """Return the images of a fixed camera with the static background faded to grey; only what moves keeps its colour."""
+    height, width = images[0].shape[:2]
+    small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))
+    reduced = np.stack(
+        [cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32) for image in images]
+    )
+    # For each pixel, the number of images that have the same colour as each image (n,h,w), and the most frequent colour.
+    agreeing = np.stack([(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced])
+    background = np.take_along_axis(reduced, agreeing.argmax(0)[None, ..., None], axis=0)[0]
+    known = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(images))
+    out = []
+    for image, small_image in zip(images, reduced, strict=True):
+        moves = (np.abs(small_image - background).max(-1) > LEVELS) | ~known
+        mask = cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
+        grown = max(1, round(GROWN * small[0]))
+        mask = cv2.dilate(mask, np.ones((2 * grown + 1, 2 * grown + 1), np.uint8))
+        share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+        share = cv2.GaussianBlur(share, (0, 0), SOFT * width)[..., None]
+        out.append(np.rint(GREY + share * (image.astype(np.float32) - GREY)).astype(np.uint8))
+    return out

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int, UInt16
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_yaml
+from jcr.capture.plain_files import chosen_name, read_yaml
 from jcr.capture.pose_track import Stamps, TfTree, speed
-from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
+from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros, read_ros_depth
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError

@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json, validated_content
+from jcr.capture.plain_files import chosen_name, contained, read_json, validated_content
 from jcr.capture.pose_track import interpolated_poses, speed
-from jcr.capture.recording import Picture, Recording, capture_of_recording, chosen_name
+from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -175,12 +175,11 @@ def _read_table(
 
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
     """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`."""
-
-    def filled(field: re.Match[str]) -> str:
-        """Return the value of a field, padded with zeros to the width in the template."""
-        return str(fields.get(field[1], field[0])).zfill(int(field[2] or 0))
-
-    name = re.sub(r"\{(\w+)(?::0?(\d?\d)d)?\}", filled, template)
+    name = re.sub(
+        r"\{(\w+)(?::0?(\d?\d)d)?\}",  # the value of a field is padded with zeros to the width in the template
+        lambda field: str(fields.get(field[1], field[0])).zfill(int(field[2] or 0)),
+        template,
+    )
     return contained(path, name, str(path / INFO))
 
 
