@@ -325,10 +325,10 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     which uses the board alone. Raises InputError for an unknown back end, for options that select different back ends,
     and for an option that none of the returned back ends uses.
     """
-    given = _given_options(options)
+    given, auto = _given_options(options), [row for row in BACKENDS.values() if row.auto]
     selecting = [row for row in BACKENDS.values() if row.selected_by in given]
     if options.backend != "auto":
-        names = (options.backend,)
+        names = [options.backend]
         if options.backend not in BACKENDS:
             raise InputError(
                 f"--backend {options.backend}: no such back end; there are {', '.join(BACKENDS)}"
@@ -338,18 +338,14 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
             f"{' and '.join(f'--{row.selected_by}' for row in selecting)} select different back ends "
             f"({', '.join(row.name for row in selecting)}); give one of them"
         )
+    elif selecting:
+        without_weights = [row.name for row in auto if not row.hub_id]
+        names = [selecting[0].name, *(without_weights[:1] if selecting[0].hub_id else ())]
     else:
-        allowed = [row for row in BACKENDS.values() if row.auto]
-        beside = "board" in given
-        if not selecting:
-            allowed = [row for row in allowed if row.is_installed() and row.has_weights()]
-            names = tuple(row.name for row in allowed if not beside or "board" in row.options)
-        elif selecting[0].hub_id:
-            names = (selecting[0].name, next(row.name for row in allowed if not row.hub_id))
-        else:
-            names = (selecting[0].name,)
-        if beside and "board" in BACKENDS[names[0]].options:
-            names = (*names, MARKER)
+        usable = [row for row in auto if row.is_installed() and row.has_weights()]
+        names = [row.name for row in usable if "board" not in given or "board" in row.options]
+    if options.backend == "auto" and "board" in given and "board" in BACKENDS[names[0]].options:
+        names.append(MARKER)
     for name, value in given.items():
         if not any(name in BACKENDS[chosen].options for chosen in names):
             users = [row.name for row in BACKENDS.values() if name in row.options]
@@ -357,7 +353,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
                 f"--{name} {value}: the back end here ({', '.join(names)}) does not use it; leave it out, or "
                 f"give --backend {' or '.join(users)}"
             )
-    return names
+    return tuple(names)
 
 
 def tries(options: ReconstructOptions) -> list[ReconstructOptions]:

@@ -45,6 +45,9 @@ def read_capture_json(file: Path) -> CaptureFile:
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
+    for row, frame in enumerate(content["frames"]):
+        if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
+            raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')
     return validated_content(CaptureFile, content, str(file))
 
 
@@ -60,7 +63,7 @@ def read_intrinsics(file: Path) -> IntrinsicsEntry:
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return the validated frame number `row` of a capture.json; raise InputError that names its image if invalid."""
-    where = f"{file}: frame {row} ({_image_name(content, row, file)})"
+    where = f"{file}: frame {row} ({content.frames[row]['image']})"
     return validated_content(FrameEntry, content.frames[row], where)
 
 
@@ -70,7 +73,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     content = read_capture_json(file)
     count = len(content.frames)
     require_frames(count, str(file), 0)
-    images = [_image_name(content, row, file) for row in range(count)]
+    images = [frame["image"] for frame in content.frames]
     frames, faults = dict[int, FrameEntry](), dict[int, str]()
     for row in range(count):
         try:
@@ -286,11 +289,3 @@ def _inside(folder: Path, name: str, where: str) -> Path:
     if not (file := contained(folder, name, where)).is_file():
         raise InputError(f"{where}: {name} is not there; add it, or remove the key")
     return file
-
-
-def _image_name(content: CaptureFile, row: int, file: Path) -> str:
-    """Return the image path of frame `row`; raise InputError if the frame names no image."""
-    frame = content.frames[row]
-    if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
-        raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')
-    return frame["image"]
