@@ -20,6 +20,7 @@ PosesAt = Callable[[Stamps], tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]]
 a sample, NEVER outside of the recording."""
 
 NEVER = np.iinfo(np.int64).max
+"""Gap (ns) of a time stamp before the first sample or after the last."""
 SPEED_OVER_NS = 50_000_000
 """Half of the time (ns) over which speed is measured: long against the resolution of an encoder, short against a
 stop."""

@@ -12,6 +12,7 @@ from numpy import ndarray
 from jcr.capture.checks import checked_capture
 from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
 from jcr.capture.options import MIN_FRAMES, ReadOptions
+from jcr.capture.pose_track import NEVER
 from jcr.capture.ros import read_camera_info
 from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance
@@ -31,8 +32,6 @@ SAME_VIEW = 0.005
 kept."""
 WEAK = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
-BESIDE_ALL_POSES_NS = 1e15
-"""Gap (ns) that is longer than any recording: the frame is before the first pose or after the last."""
 Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
 """Image of a frame: the frame's row, the bytes of the encoded file or RGB pixels, and the file's ending."""
 Rows = Int[ndarray, " _"]
@@ -73,11 +72,11 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     fresh, limit = gap_ns <= 1e6 * options.max_gap_ms, f"{options.max_gap_ms:.0f} ms"
     if not fresh.any():
         far = f"those around an image are {gap_ns.min() / 1e6:.0f} ms apart"
-        far = "no image lies between two poses" if gap_ns.min() > BESIDE_ALL_POSES_NS else far
+        far = "no image lies between two poses" if gap_ns.min() == NEVER else far
         raise InputError(
             f"{recording.source}: every pose is stale (over {limit}): {far}; check the clocks, or raise --max-gap-ms"
         )
-    worst = gap_ns[gap_ns < BESIDE_ALL_POSES_NS].max(initial=0) / 1e6
+    worst = gap_ns[gap_ns < NEVER].max(initial=0) / 1e6
     stale = f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit} (gaps up to {worst:.0f} ms): "
 
     def sharpness_of(rows: Rows) -> Float[ndarray, " k"]:

@@ -15,7 +15,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.camera import is_distorted, pinhole_inside, project, undistortion, unproject
-from jcr.capture.images import encode_png, read_image
+from jcr.capture.images import ORIENTATION, encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
 from jcr.geometry import inverse
@@ -24,8 +24,6 @@ from jcr.scene.cloud import write_cloud
 from jcr.sfm.model import colmap_camera
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-_ORIENTATION = 0x0112
-"""EXIF tag of the rotation with which an image is displayed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +141,7 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
     for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
         source = (views.folder / image).resolve()
         with Image.open(source) as opened:
-            is_rotated = opened.getexif().get(_ORIENTATION, 1) != 1
+            is_rotated = opened.getexif().get(ORIENTATION, 1) != 1
         if is_rotated:  # some readers ignore the tag
             names[k] = f"{Path(name).stem}.png"
             (folder / names[k]).write_bytes(encode_png(read_image(source)))

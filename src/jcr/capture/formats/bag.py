@@ -43,9 +43,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
-        stamps, order = np.unique(bag.stamp_ns, return_index=True)
-        log_ns = np.array(bag.log_ns)[order]
-        joints = None
+        stamps, joints = bag.stamp_ns, None
         if options.urdf is None:
             poses_at = bag.tree.poses_at(options.base_frame, options.gripper_frame, path)
         else:
@@ -68,10 +66,10 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             base_from_gripper=poses,
             speed=speed(poses_at, stamps),
             gap_ns=gap_ns,
-            images_of_rows=lambda rows: bag.pictures(rows, stamps, log_ns),
+            images_of_rows=bag.pictures,
             intrinsics_of_size=bag.intrinsics,
             joints=joints,
-            depth_at=(lambda row: bag.depth_near(int(stamps[row]), int(log_ns[row]))) if bag.depth else None,
+            depth_at=bag.depth_at if bag.depth else None,
         )
         return capture_of_recording(recording, into, report)
 
@@ -82,8 +80,7 @@ class _Bag:
     def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
         """Read transforms, joint states, CameraInfo and image time stamps of the bag `path`, opened as `reader`."""
         self.reader, self.path, self.tree = reader, path, TfTree()
-        self.stamp_ns, self.log_ns = list[int](), list[int]()
-        """Time stamps (ns) of the images, and the times (ns) at which the images were recorded."""
+        stamps, recorded = list[int](), list[int]()
         self.joints = dict[str, dict[int, float]]()
         """Positions of each joint: from the joint's name to a dictionary from time stamp (ns) to position."""
         self.camera_info: Any = None
@@ -106,14 +103,18 @@ class _Bag:
                 elif kind == INFO:
                     self.camera_info = self.camera_info or message
                 else:
-                    self.stamp_ns.append(_stamp(message, at))
-                    self.log_ns.append(at)
+                    stamps.append(_stamp(message, at))
+                    recorded.append(at)
             except AttributeError as error:
                 text = f"its {kind} is not the one of ROS ({error}); record the standard message"
                 raise InputError(f"{path}: {text}") from None
             report("frames", 0.1 * (at - reader.start_time) / span)
-        if not self.stamp_ns:
+        if not stamps:
             raise InputError(f"{path}: topic {topic} has no images; choose another with --camera-topic")
+        self.stamp_ns, order = np.unique(stamps, return_index=True)
+        """Ascending time stamps (ns) of the images."""
+        self.log_ns = np.array(recorded)[order]
+        """Times (ns) at which the images were recorded."""
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
         """Yield the connection, time of recording (ns) and content of each message of the connections.
@@ -128,25 +129,18 @@ class _Bag:
                 f"{self.path}: damaged ({error}); repair it with the tool that recorded it"
             ) from None
 
-    def pictures(
-        self, rows: Int[ndarray, " k"], stamps: Int[ndarray, " n"], log_ns: Int[ndarray, " n"]
-    ) -> Iterator[Picture]:
-        """Yield the row, image and file ending of each of k rows among the bag's n images.
-
-        `stamps` and `log_ns` are the time stamps and the times of recording (ns) of all n images.
-        """
+    def pictures(self, rows: Int[ndarray, " k"]) -> Iterator[Picture]:
+        """Yield the row, image and file ending of each of k rows among the bag's images."""
         for row in rows.tolist():
-            at = int(log_ns[row])
+            at = int(self.log_ns[row])
             for _, _, message in self.messages(self.images, start=at, stop=at + 1):
-                if _stamp(message, at) == stamps[row]:
+                if _stamp(message, at) == self.stamp_ns[row]:
                     yield row, *image_of(message, f"{self.path}: {self.topic}")
                     break
 
-    def depth_near(self, stamp: int, logged: int) -> UInt16[ndarray, "h w"] | None:
-        """Return the depth image (mm) whose time stamp is nearest to `stamp` (ns), that of a colour image.
-
-        None: no depth image is within 20 ms. `logged` (ns) is the time at which the colour image was recorded.
-        """
+    def depth_at(self, row: int) -> UInt16[ndarray, "h w"] | None:
+        """Return the depth image (mm) nearest in time to the colour image of a row; None if none is within 20 ms."""
+        stamp, logged = int(self.stamp_ns[row]), int(self.log_ns[row])
         span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
         near = [
             (abs(_stamp(message, at) - stamp), connection.topic, message)

@@ -100,19 +100,16 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     state = np.concatenate([episode.state for episode in episodes])
     poses, joints = _poses(state, key, features[key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
-    rows = np.split(np.arange(ends[-1]), ends[:-1])
     stamps = [np.round(1e9 * episode.time_s).astype(np.int64) for episode in episodes]
-    pieces = zip(stamps, rows, strict=True)
+    pieces = zip(stamps, np.split(poses, ends[:-1]), strict=True)
     recording = Recording(
         source=path,
         options=options,
         names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
         base_from_gripper=poses,
-        speed=np.concatenate(
-            [speed(partial(interpolated_poses, at, poses[part]), at) for at, part in pieces]
-        ),
+        speed=np.concatenate([speed(partial(interpolated_poses, at, part), at) for at, part in pieces]),
         gap_ns=np.zeros(len(state), np.int64),  # pose and image of a row have the same time
-        images_of_rows=lambda wanted: _images(episodes, rows, wanted, camera, info.fps),
+        images_of_rows=lambda rows: _images(episodes, rows, camera, info.fps),
         joints=joints,
     )
     return capture_of_recording(recording, into, report)
@@ -183,19 +180,18 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
     return contained(path, name, str(path / INFO))
 
 
-def _images(
-    episodes: list[Episode], rows: list[Int[ndarray, " _"]], wanted: Int[ndarray, " k"], key: str, fps: float
-) -> Iterator[Picture]:
-    """Yield row, image and file ending for each of the `wanted` rows (ascending), from the episodes' videos or tables.
+def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
+    """Yield row, image and file ending for each of k ascending rows, from the episodes' videos or tables.
 
-    A row is the index of a frame, counted over all episodes; `rows` lists the rows of each episode. `key` is the image
-    column, `fps` the frame rate of the videos (1/s).
+    A row is the index of a frame, counted over all episodes. `key` is the image column, `fps` the frame rate of the
+    videos (1/s).
     """
-    for episode, part in zip(episodes, rows, strict=True):
-        mine = wanted[np.isin(wanted, part)]
+    first = 0
+    for episode in episodes:
+        local = rows[(rows >= first) & (rows < first + len(episode.time_s))] - first
+        mine, first = local + first, first + len(episode.time_s)
         if len(mine) == 0:
             continue
-        local = mine - part[0]
         if episode.video is not None:
             times = episode.video_start_s + episode.time_s[local]
             frames = _video_frames(episode.video, times, 0.5 / fps)
