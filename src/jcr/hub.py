@@ -60,9 +60,11 @@ def download(hub_id: str, revision: str | None = None, quiet: bool = False) -> P
     file is then deleted.
     """
     extra("huggingface_hub", "networks", "jcr models get")
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import constants, snapshot_download
     from huggingface_hub.utils import disable_progress_bars
 
+    if constants.HF_HUB_OFFLINE:
+        raise InputError(f"{hub_id}: HF_HUB_OFFLINE is set, so nothing is downloaded; unset it")
     if quiet:
         disable_progress_bars()
     try:
