@@ -204,7 +204,7 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     kinds = [camera.findings[0].kind for camera in found.cameras]
     assert kinds == [FindingKind.FEW_POINTS_SHARED, FindingKind.NOT_FIXED, FindingKind.NOT_FIXED]
     uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})
-    untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
+    untrusted, _, _ = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
     more = placed(calibrated, fixed(old, old.images[3])).cameras
     content = CamerasFile(cameras=[*found.cameras, *more], arms=[], version="0")
