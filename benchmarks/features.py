@@ -15,7 +15,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.features.matchers import FeatureName, Matcher
 from jcr.features.pairs import all_pairs
-from jcr.features.stage import Matched
+from jcr.features.stage import MatchedPairs
 from jcr.records import Intrinsics
 from jcr.sfm import colmap
 from jcr.sfm.colmap import reconstruct_colmap
@@ -70,9 +70,9 @@ def _row(folder: Path, features: FeatureName, gate: bool, way: str) -> tuple[boo
 
 def _match_all(
     matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
-) -> Matched:
+) -> MatchedPairs:
     """Match without gripper poses: all pairs, none judged, as if the gripper moved between all images."""
     pairs = all_pairs(len(matcher.x_px))
     moving = np.zeros((len(gripper), len(gripper)), bool)
     geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)), moving)
-    return Matched(geometries=geometries, intrinsics=working)
+    return MatchedPairs(geometries=geometries, intrinsics=working)

@@ -29,8 +29,8 @@ from jcr.geometry import (
     scale_translation,
     transform,
 )
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.global_alignment.align import global_align
+from jcr.pointmaps.pairs import complete_pairs
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import PairErrors, pairs_of_capture, synthetic_pairs, write_pairs

@@ -252,7 +252,7 @@ def networks(folder: Path) -> dict[str, Target]:
     from safetensors.torch import save_file
 
     from jcr.hub import Weights
-    from jcr.pointmaps.dust3r.weights import load_weights
+    from jcr.pointmaps.dust3r.dust3r import load_weights
 
     folder.mkdir()
     shape = (2, 4, 4)

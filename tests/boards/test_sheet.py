@@ -13,7 +13,7 @@ import jcr
 from in_process import run_jcr
 from jcr.boards import corners
 from jcr.boards.detection import Sighting, boards
-from jcr.boards.proposal import board_in_view, proposed
+from jcr.boards.proposal import board_in_view
 from jcr.boards.sheet import PAPERS_MM, as_pdf, board_sheet
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
@@ -112,12 +112,7 @@ def seen(spec: str, views: int = 3) -> list[ndarray]:
     ],
 )
 def test_a_board_is_recognised(printed: str, found: str):
-    images = seen(printed)
-    assert board_in_view(images) == found
-    finding = proposed(images)
-    assert finding is not None
-    text = sentence(finding)
-    assert f"--board {found}" in text
+    assert board_in_view(seen(printed)) == found
 
 
 @pytest.mark.slow
@@ -127,9 +122,7 @@ def test_single_tags_are_recognised():
     for k in range(3):
         scene[250:410, 100 + 250 * k : 260 + 250 * k] = cv2.aruco.generateImageMarker(tags, 5 + k, 160)
     images = [np.roll(cv2.cvtColor(scene, cv2.COLOR_GRAY2RGB), shift, axis=1) for shift in (0, 20, -30)]
-    found = proposed(images)
-    text = None if found is None else sentence(found)
-    assert text is not None and "--board apriltag:SIDE:36h11" in text
+    assert board_in_view(images) == "apriltag:SIDE:36h11"
 
 
 @pytest.mark.slow

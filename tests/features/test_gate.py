@@ -7,10 +7,10 @@ from numpy import ndarray
 
 from jcr.camera import project
 from jcr.estimation.closed_form import motions
-from jcr.features.gate import Pair, judge, rotation_of_x
-from jcr.features.matchers import hidden, matched, still_cells
-from jcr.features.pairs import near_pairs, translation_of_x, viewpoints
-from jcr.features.two_view import TwoViewMotion, readings
+from jcr.features.gate import Pair, classify_pairs, rotation_of_x
+from jcr.features.matchers import estimate_geometry, hidden, still_cells
+from jcr.features.pairs import hand_eye_of_pairs, near_pairs, viewpoints
+from jcr.features.two_view import CameraMotion, camera_motions
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.records import Intrinsics
 from jcr.sfm.model import colmap_camera
@@ -55,7 +55,7 @@ def test_a_reading_is_the_motion_as_surely_as_it_shows():
     errors, stds = [], []
     for seed in range(25):
         ray_i, ray_j = seen(MOTION, False, np.random.default_rng(seed))
-        best = readings(ray_i, ray_j, FOCAL, essential(MOTION), None)[0]
+        best = camera_motions(ray_i, ray_j, FOCAL, essential(MOTION), None)[0]
         errors.append(float(rotation_angle(best.rotation) - rotation_angle(MOTION[:3, :3])))
         stds.append(best.angle_std())
     # Half of 200 matches are counted as independent, so that it promises less than these have.
@@ -65,7 +65,7 @@ def test_a_reading_is_the_motion_as_surely_as_it_shows():
 def test_a_plane_has_two_readings_and_one_is_right():
     toward = transform(MOTION[:3, :3], np.array([0.05, 0.02, 0.12]))
     ray_i, ray_j = seen(toward, True, np.random.default_rng(0))
-    found = readings(ray_i, ray_j, FOCAL, None, homography(toward))
+    found = camera_motions(ray_i, ray_j, FOCAL, None, homography(toward))
     gaps = [np.degrees(rotation_angle(r.rotation.T @ toward[:3, :3])) for r in found]
     assert len(found) == 2
     assert min(gaps) < 1 and max(gaps) > 5
@@ -81,7 +81,7 @@ def problem_and_pairs(seed: int) -> tuple[HandEyeProblem, list[Pair]]:
         return v / np.linalg.norm(v)
 
     return problem, [
-        Pair((i, j), rows, (TwoViewMotion(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
+        Pair((i, j), rows, (CameraMotion(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
         for i in range(N)
         for j in range(i + 1, N)
     ]
@@ -93,28 +93,28 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
     problem, pairs = problem_and_pairs(seed)
     wrong = set(rng.permutation(len(pairs))[:12].tolist())
     for k in wrong:
-        reading = pairs[k].readings[0]
-        bad = TwoViewMotion(rotation_exp(rng.normal(size=3)), reading.direction, reading.covariance, 0.5)
+        motion = pairs[k].motions[0]
+        bad = CameraMotion(rotation_exp(rng.normal(size=3)), motion.direction, motion.covariance, 0.5)
         pairs[k] = Pair(pairs[k].key, pairs[k].rows, (bad,))
-    gate = judge(pairs, motions(problem.base_from_gripper))
+    gate = classify_pairs(pairs, motions(problem.base_from_gripper))
     assert gate.of_x is not None
     assert rotation_angle(gate.of_x.rotation.T @ problem.gripper_from_camera[:3, :3]) < 0.01
     assert {pair.key for pair in gate.contradicted} == {pairs[k].key for k in wrong}
-    x = translation_of_x(gate, motions(problem.base_from_gripper))
+    x = hand_eye_of_pairs(gate, motions(problem.base_from_gripper))
     assert x is not None
     assert np.linalg.norm(x[:3, 3] - problem.gripper_from_camera[:3, 3]) < 5e-3
 
 
 def test_the_second_reading_of_a_plane_is_tried():
     problem, pairs = problem_and_pairs(0)
-    right = pairs[3].readings[0]
-    other = TwoViewMotion(
+    right = pairs[3].motions[0]
+    other = CameraMotion(
         rotation_exp(np.array([0.5, 0.0, 0.0])) @ right.rotation, right.direction, right.covariance, 0.4
     )
     pairs[3] = Pair(pairs[3].key, pairs[3].rows, (other, right))
-    gate = judge(pairs, motions(problem.base_from_gripper))
+    gate = classify_pairs(pairs, motions(problem.base_from_gripper))
     assert not gate.contradicted
-    assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).readings[0] is right
+    assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).motions[0] is right
 
 
 def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
@@ -188,10 +188,10 @@ def rows_of(right: int, seed: int) -> Int[ndarray, "400 2"]:
 @pytest.mark.parametrize("seed", range(3))
 def test_three_right_matches_of_ten_are_found_and_none_make_no_pair(seed: int):
     x_px, camera = keypoints(seed), colmap_camera(INTRINSICS, True)
-    found = matched(x_px, camera, (0, 1), rows_of(120, seed), 0, True)
+    found = estimate_geometry(x_px, camera, (0, 1), rows_of(120, seed), 0, True)
     assert found is not None
     inside = np.asarray(found.inlier_matches)[:, 0]
     assert (inside < 120).sum() > 0.93 * 120
     assert (inside >= 120).sum() < 0.06 * 280, "only by chance near their epipolar line"
-    nothing = matched(x_px, camera, (0, 1), rows_of(0, seed), 0, True)
+    nothing = estimate_geometry(x_px, camera, (0, 1), rows_of(0, seed), 0, True)
     assert nothing is None or len(nothing.inlier_matches) < 0.1 * 400

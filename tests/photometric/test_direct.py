@@ -20,8 +20,8 @@ from jcr.photometric.residuals import (
     energy,
     equations,
     make_level,
-    on_rays,
-    strongest,
+    search_depths,
+    strong_edges,
 )
 from jcr.records import Intrinsics
 from simulation.capture import SimulateOptions, simulate
@@ -121,8 +121,8 @@ def test_gradient_is_that_of_the_energy(tied):
     off = Cameras(
         cameras.base_from_camera @ transform(rotation_exp(rng.normal(0, 0.01, (4, 3))), np.zeros(3)), 1.02
     )
-    host, x_px = strongest(level, 50)
-    points, _ = on_rays(level, off, host, x_px, np.full((1, 4), 0.5), 0.2, 2.0)
+    host, x_px = strong_edges(level, 50)
+    points, _ = search_depths(level, off, host, x_px, np.full((1, 4), 0.5), 0.2, 2.0)
     system = equations(level, off, points, 0.2, tied)
     # Without the depths' elimination.
     gradient = (

@@ -150,7 +150,7 @@ def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: 
 def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
     from jcr.pointmaps.any_view import Views
     from jcr.pointmaps.grid import ImageGrid, prepare_images
-    from jcr.pointmaps.refine import refine
+    from jcr.pointmaps.reconstruction import refine
 
     unknown = replace(capture, intrinsics=None)
     images = prepare_images(unknown, lambda size: ImageGrid.uncropped(size, size))

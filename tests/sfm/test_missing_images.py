@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.camera import project, unproject
 from jcr.features.gate import Key
 from jcr.features.matchers import Matcher
-from jcr.features.stage import Matched, match_with_robot
+from jcr.features.stage import MatchedPairs, match_with_robot
 from jcr.geometry import (
     Transforms,
     apply,
@@ -48,9 +48,9 @@ class PointsOfATable:
 
     every_pair, farthest = 12, 0.7
 
-    def __init__(self, minds_roll: bool) -> None:
+    def __init__(self, needs_upright: bool) -> None:
         rng = np.random.default_rng(0)
-        self.minds_roll = minds_roll
+        self.needs_upright = needs_upright
         points = rng.uniform([-0.3, -0.3, -0.06], [3.2, 0.3, 0.06], (3600, 3))
         down = transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
         self.base_from_camera = np.stack(
@@ -89,7 +89,7 @@ def matcher_of_points(features: PointsOfATable) -> Matcher:
     return Matcher(features, np.ones(2), colmap_camera(INTRINSICS, True), True, 0)
 
 
-def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> Matched:
+def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> MatchedPairs:
     """Return the pairs of all images, by these gripper poses."""
     matcher = matcher_of_points(features)
     names = [f"{k}.png" for k in range(IMAGES)]
@@ -104,16 +104,16 @@ def quiet():
 
 @pytest.fixture(scope="module")
 def table() -> PointsOfATable:
-    return PointsOfATable(minds_roll=False)
+    return PointsOfATable(needs_upright=False)
 
 
 @pytest.fixture(scope="module")
-def matched(table: PointsOfATable) -> Matched:
+def matched(table: PointsOfATable) -> MatchedPairs:
     return matched_pairs_of(table, table.base_from_gripper)
 
 
 def begun(
-    folder: Path, table: PointsOfATable, matched: Matched, missing: tuple[int, ...]
+    folder: Path, table: PointsOfATable, matched: MatchedPairs, missing: tuple[int, ...]
 ) -> tuple[Path, pycolmap.Reconstruction]:
     """Return a database of the matches and a map without some images."""
     camera = colmap_camera(INTRINSICS, True)
@@ -137,7 +137,7 @@ def off_mm(table: PointsOfATable, model: pycolmap.Reconstruction) -> float:
 
 
 def test_missing_images_are_added_from_the_map_s_own_x(
-    tmp_path: Path, table: PointsOfATable, matched: Matched
+    tmp_path: Path, table: PointsOfATable, matched: MatchedPairs
 ):
     database, model = begun(tmp_path, table, matched, (4, 11, 12, 29))
     reported = table.base_from_gripper.copy()
@@ -148,7 +148,7 @@ def test_missing_images_are_added_from_the_map_s_own_x(
 
 
 def test_images_that_nothing_ties_to_the_map_stay_out(
-    tmp_path: Path, table: PointsOfATable, matched: Matched
+    tmp_path: Path, table: PointsOfATable, matched: MatchedPairs
 ):
     """Twenty images and ten others, without a common match: gripper poses alone would hold them together."""
     apart = {key: one for key, one in matched.geometries.items() if (key[0] < 20) == (key[1] < 20)}

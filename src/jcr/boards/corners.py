@@ -5,7 +5,6 @@ other points. The bundle adjustment takes the board's shape and size as a prior 
 between images, the position that most images agree on is used.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.boards.detection import PRINTED, Sighting, boards, is_of_unknown_size, most_seen, side_of
+from jcr.boards.detection import boards, most_seen
 from jcr.boards.proposal import board_in_view
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
@@ -32,7 +31,7 @@ MOST_PAIRS = 100
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _BodyCorners:
     """Corners of one board or tag in m images: pixels (NaN where not detected), and positions on it (m or sides)."""
 
     number: int
@@ -61,7 +60,14 @@ def with_boards(
     report("board", 1.0)
     bodies, elsewhere = [], set[int]()
     tracks, cameras = reconstruction.tracks, reconstruction.recon_from_camera
-    for seen in _bodies(sightings):
+    for number in sorted({s.body for shown in sightings for s in shown}):
+        own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
+        x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
+        corner = {i: c for c, i in enumerate(sorted(x_in_body))}
+        x_px = np.full((len(images), len(corner), 2), np.nan)
+        for k, s in own:
+            x_px[k, [corner[i] for i in s.index]] = s.x_px
+        seen = _BodyCorners(number, x_px, np.stack([x_in_body[i] for i in corner]))
         agreeing = _at_one_place(seen, cameras, reconstruction.intrinsics)
         elsewhere |= set(seen.images.tolist()) - set(agreeing.tolist())
         if len(agreeing) >= FEWEST_IMAGES:
@@ -69,8 +75,8 @@ def with_boards(
             bodies.append(body)
     found = Boards(
         spec=spec if board is readings[0] else board.name,
-        side=side_of(spec),
-        size_std=None if is_of_unknown_size(spec) else PRINTED,
+        side=board.side,
+        size_std=board.size_std,
         bodies=tuple(bodies),
         elsewhere=tuple(sorted(elsewhere)),
         proposed=None if bodies else board_in_view(images),
@@ -81,54 +87,38 @@ def with_boards(
     return replace(reconstruction, tracks=replace(tracks, boards=found), notes=notes)
 
 
-def _bodies(sightings: Sequence[Sequence[Sighting]]) -> Iterator[_Seen]:
-    """Yield the corners of each board or tag that any image shows; `sightings` are the detections in each image."""
-    for number in sorted({s.body for shown in sightings for s in shown}):
-        own = [(k, s) for k, shown in enumerate(sightings) for s in shown if s.body == number]
-        x_in_body = {i: x for _, s in own for i, x in zip(s.index, s.x_in_body, strict=True)}
-        corner = {i: c for c, i in enumerate(sorted(x_in_body))}
-        x_px = np.full((len(sightings), len(corner), 2), np.nan)
-        for k, s in own:
-            x_px[k, [corner[i] for i in s.index]] = s.x_px
-        yield _Seen(number, x_px, np.stack([x_in_body[i] for i in corner]))
-
-
 def _at_one_place(
-    seen: _Seen, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
+    seen: _BodyCorners, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
     """Return the rows of the largest set of images that see the board at one position; empty if no two agree."""
-    images, best = seen.images, np.zeros(0, int)
+    images, best, limit_px = seen.images, np.zeros(0, int), SAME_PLACE * intrinsics.width
+
+    def agreeing(by: Int[ndarray, " b"]) -> Int[ndarray, " a"]:
+        """Return the rows of images whose corners agree with the position triangulated from the images `by`."""
+        points, rows = _triangulated(seen.x_px[by], cameras[by], intrinsics), list[int]()
+        for k in images.tolist():
+            x_in_camera = apply(inverse(cameras[k]), points)
+            off = ((project(intrinsics, x_in_camera) - seen.x_px[k]) ** 2).sum(1)
+            shared = np.isfinite(off)
+            ahead = (x_in_camera[shared, 2] > 0).all()
+            if shared.sum() >= FEWEST_POINTS and ahead and off[shared].mean() < limit_px**2:
+                rows.append(k)
+        return np.array(rows, dtype=int)
+
     pairs = np.array(list(combinations(images.tolist(), 2)), int).reshape(-1, 2)
     if len(pairs) > MOST_PAIRS:
         pairs = pairs[np.random.default_rng(0).permutation(len(pairs))[:MOST_PAIRS]]
     for pair in pairs:
-        agreeing = _agreeing(seen, pair, cameras, intrinsics)
-        best = agreeing if len(agreeing) > len(best) else best
+        best = max(best, agreeing(pair), key=len)
         if len(best) == len(images):
             return best
-    return _agreeing(seen, best, cameras, intrinsics) if len(best) else best
-
-
-def _agreeing(
-    seen: _Seen, by: Int[ndarray, " b"], cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
-) -> Int[ndarray, " a"]:
-    """Return the rows of images whose corners agree with the board's position triangulated from the images `by`."""
-    points = _triangulated(seen.x_px[by], cameras[by], intrinsics)
-    limit_px, agreeing = SAME_PLACE * intrinsics.width, list[int]()
-    for k in seen.images:
-        x_in_camera = apply(inverse(cameras[k]), points)
-        off = ((project(intrinsics, x_in_camera) - seen.x_px[k]) ** 2).sum(1)
-        shared = np.isfinite(off)
-        ahead = (x_in_camera[shared, 2] > 0).all()
-        if shared.sum() >= FEWEST_POINTS and ahead and off[shared].mean() < limit_px**2:
-            agreeing.append(int(k))
-    return np.array(agreeing, dtype=int)
+    return agreeing(best) if len(best) else best
 
 
 def _triangulated(
     x_px: Float[ndarray, "b c 2"], cameras: Float[ndarray, "b 4 4"], intrinsics: Intrinsics
 ) -> Float[ndarray, "c 3"]:
-    """Return the c corners in the recon frame, triangulated from b images; NaN if fewer than FEWEST_IMAGES show it."""
+    """Return the c corners in the recon frame, triangulated from b images; NaN for one in fewer than FEWEST_IMAGES."""
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])
     for c in np.flatnonzero(shown.sum(0) >= FEWEST_IMAGES):
@@ -141,12 +131,12 @@ def _triangulated(
 
 def _with_corners(
     tracks: Tracks,
-    seen: _Seen,
+    seen: _BodyCorners,
     images: Int[ndarray, " a"],
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """Return the tracks with a board's corners in `images` (rows) added, and the board's rows of track points."""
+    """Return the tracks with a board's corners in `images` (rows) added, and the record of the board in these tracks."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

@@ -47,12 +47,20 @@ class Sighting:
     x_px: Float[ndarray, "k 2"]
 
 
+Detector = Callable[[UInt8[ndarray, "h w"]], list[Sighting]]
+"""Function from a grey image to the detections of a board or of tags."""
+
+
 @dataclass(frozen=True)
 class Board:
-    """Board that a user's --board name may mean, with the function that detects it in a grey image."""
+    """Board or tags that a user's --board name may mean, with the function that detects them in a grey image."""
 
     name: str
-    detect: Callable[[UInt8[ndarray, "h w"]], list[Sighting]]
+    detect: Detector
+    side: float
+    """Side of a square or tag (circles: half their distance within a row), m; 1 if it is unknown."""
+    size_std: float | None
+    """Relative standard deviation of the size; None: the side is unknown and is the unit of length."""
 
 
 def boards(spec: str) -> list[Board]:
@@ -68,32 +76,28 @@ def boards(spec: str) -> list[Board]:
         return [one for ratio in RATIOS for one in boards(spec.replace(MARKER, f"{ratio:g}"))]
     try:
         match kind, parts:
-            case "charuco", [count, square, marker, tags]:
-                return _charuco(spec, _count(count), _length(square), _length(marker), _tags(tags))
-            case "chessboard", [count, square]:
-                return [Board(spec, _chessboard(_count(count), _length(square)))]
-            case "circles", [count, spacing]:
-                return [Board(spec, _circles(_count(count), _length(spacing)))]
-            case (("aruco" | "apriltag"), [side, tags]):
-                name = tags if kind == "aruco" else f"DICT_APRILTAG_{tags}"
-                return [Board(spec, _single_tags(_length(side), _tags(name)))]
+            case "charuco", [count, length, marker, tags]:
+                side = _length(length)
+                detectors = _charuco(spec, _count(count), side, _length(marker), _tags(tags))
+            case "chessboard", [count, length]:
+                side = _length(length)
+                detectors = {spec: _chessboard(_count(count), side)}
+            case "circles", [count, length]:
+                side = _length(length)
+                detectors = {spec: _circles(_count(count), side)}
+            case (("aruco" | "apriltag"), [length, tags]):
+                side, name = _length(length), tags if kind == "aruco" else f"DICT_APRILTAG_{tags}"
+                detectors = {spec: _single_tags(side, _tags(name))}
+            case _:
+                raise ValueError(f"no such board; write it as {'; '.join(KINDS)}")
     except ValueError as error:
         raise InputError(f"--board {spec}: {error}") from None
-    raise InputError(f"--board {spec}: no such board; write it as {'; '.join(KINDS)}")
-
-
-def is_of_unknown_size(spec: str) -> bool:
-    """Test whether a board's name has the word SIDE in place of the length of its squares or tags."""
-    return SIDE in spec.split(":")
-
-
-def side_of(spec: str) -> float:
-    """Return the side of a square or tag in a board's name, m; 1 for an unknown side."""
-    kind, *parts = spec.split(":")
-    return _length(parts[0] if kind in ("aruco", "apriltag") else parts[1])
+    size_std = None if SIDE in parts else PRINTED
+    return [Board(name, detect, side, size_std) for name, detect in detectors.items()]
 
 
 def _count(text: str) -> tuple[int, int]:
+    """Return columns and rows from a text such as 7x5; raise ValueError for another text."""
     across, by, down = text.partition("x")
     if not (by and across.isdigit() and down.isdigit() and int(across) > 1 and int(down) > 1):
         raise ValueError(f"{text} is no size such as 7x5")
@@ -101,41 +105,42 @@ def _count(text: str) -> tuple[int, int]:
 
 
 def _length(text: str) -> float:
+    """Return a length in metres from a text, or 1 for the word SIDE; raise ValueError for another text."""
     if text == SIDE:
         return 1.0
     try:
         length = float(text)
     except ValueError:
-        raise ValueError(f"{text} is no length in metres") from None
+        length = 0.0
     if not 0 < length <= LARGEST:
         raise ValueError(f"{text} is no length of a square in metres; 30 mm is 0.030")
     return length
 
 
 def _tags(name: str) -> cv2.aruco.Dictionary:
-    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
-    if number is None:
-        known = ", ".join(sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_")))
-        raise ValueError(f"{name} is no dictionary of tags; there are {known}")
-    return cv2.aruco.getPredefinedDictionary(number)
+    """Return OpenCV's dictionary of tags of this name, such as DICT_4X4_50; raise ValueError for another name."""
+    known = [key for key in dir(cv2.aruco) if key.startswith("DICT_")]
+    if name not in known:
+        raise ValueError(f"{name} is no dictionary of tags; there are {', '.join(sorted(known))}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 def _charuco(
     spec: str, count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary
-) -> list[Board]:
+) -> dict[str, Detector]:
+    """Return by name the detectors of a ChArUco board in both layouts, and with columns and rows swapped."""
     if marker >= square:
         raise ValueError(f"a marker of {marker} m does not fit into a square of {square} m")
-    readings = []
+    detectors = {}
     for size, legacy in product((count, count[::-1]), (False, True)):
         board = cv2.aruco.CharucoBoard(size, square, marker, tags)
         board.setLegacyPattern(legacy)
         name = spec.replace(f"{count[0]}x{count[1]}", f"{size[0]}x{size[1]}")
-        name += " printed as before OpenCV 4.6" if legacy else ""
-        readings.append(Board(name, _charuco_detector(board)))
-    return readings
+        detectors[name + " printed as before OpenCV 4.6" * legacy] = _charuco_detector(board)
+    return detectors
 
 
-def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
+def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
     detector = cv2.aruco.CharucoDetector(board)
     corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()
 
@@ -162,7 +167,7 @@ def _charuco_shift_px() -> float:
     return HALF_PIXEL * round(float(np.mean(x_px.reshape(-1, 2) - true)) / HALF_PIXEL)
 
 
-def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
+def _chessboard(count: tuple[int, int], square: float) -> Detector:
     across, down = count
     if (across + down) % 2 == 0:
         raise ValueError(
@@ -177,24 +182,20 @@ def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarra
         if not found:
             return []
         x_px = corners.reshape(-1, 2).astype(np.float64)
-        if not _starts_dark(grey, x_px.reshape(down, across, 2)):
+        # The square below and right of the first corner must be dark; a rotation by 180° changes that.
+        at = x_px.reshape(down, across, 2)
+        centre = (at[:-1, :-1] + at[1:, :-1] + at[:-1, 1:] + at[1:, 1:]) / 4
+        u, v = np.moveaxis(np.rint(centre).astype(int), -1, 0)
+        shade = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(float)
+        like_first = np.indices(shade.shape).sum(0) % 2 == 0
+        if shade[like_first].mean() >= shade[~like_first].mean():
             x_px = x_px[::-1]
         return [Sighting(0, tuple(range(across * down)), x_in_board, x_px)]
 
     return detect
 
 
-def _starts_dark(grey: UInt8[ndarray, "h w"], x_px: Float[ndarray, "down across 2"]) -> bool:
-    """Test whether the square below and right of the first corner is dark; a rotation by 180° changes that."""
-    centre = (x_px[:-1, :-1] + x_px[1:, :-1] + x_px[:-1, 1:] + x_px[1:, 1:]) / 4
-    u, v = np.moveaxis(np.rint(centre).astype(int), -1, 0)
-    shade = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(float)
-    row, column = np.indices(shade.shape)
-    like_first = (row + column) % 2 == 0
-    return bool(shade[like_first].mean() < shade[~like_first].mean())
-
-
-def _circles(count: tuple[int, int], spacing: float) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
+def _circles(count: tuple[int, int], spacing: float) -> Detector:
     across, down = count
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
@@ -218,9 +219,7 @@ def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
     return np.column_stack([column, row, 0 * row])
 
 
-def _single_tags(
-    side: float, tags: cv2.aruco.Dictionary
-) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
+def _single_tags(side: float, tags: cv2.aruco.Dictionary) -> Detector:
     parameters = cv2.aruco.DetectorParameters()
     # Fits lines to the edges; sub-pixel corners are drawn inwards by blur, 0.1 to 0.4 px. AprilTag's corners are counted
     # from the corner of the image.
@@ -253,20 +252,18 @@ def most_seen(
     The first board is tried first. The others, and images whose strongly coloured pixels are filled in, are tried only
     while the best board is found in fewer than half of the images.
     """
-    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     best, seen, points = readings[0], [], -1
-    for prepared in (lambda: grey, lambda: [_without_ink(image) for image in images]):
+    for fill in (False, True):
+        prepared = images
+        if fill:  # drawn detections hide the board's corners
+            ink = [(np.ptp(image, axis=2) > INK).astype(np.uint8) for image in images]
+            prepared = [cv2.inpaint(*of, 3, cv2.INPAINT_TELEA) for of in zip(images, ink, strict=True)]
+        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in prepared]
         for board in readings:
-            found = [board.detect(image) for image in prepared()]
+            found = [board.detect(image) for image in grey]
             count = sum(len(sighting.index) for sightings in found for sighting in sightings)
             if count > points:
                 best, seen, points = board, found, count
             if 2 * sum(map(bool, seen)) >= len(images):
                 return best, seen
     return best, seen
-
-
-def _without_ink(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w"]:
-    """Return an image in grey; strongly coloured pixels, such as drawn detections, are filled in from around them."""
-    ink = (np.ptp(image, axis=2) > INK).astype(np.uint8)
-    return cv2.cvtColor(cv2.inpaint(image, ink, 3, cv2.INPAINT_TELEA), cv2.COLOR_RGB2GRAY)

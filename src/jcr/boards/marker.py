@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.boards.detection import PRINTED, Board, Sighting, boards, is_of_unknown_size, most_seen
+from jcr.boards.detection import Board, Sighting, boards, most_seen
 from jcr.camera import WITHIN_FOLD, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
@@ -82,8 +82,8 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
         intrinsics=intrinsics,
         tracks=tracks,
         backend="marker",
-        is_metric=not is_of_unknown_size(look_for),
-        metric_std=None if is_of_unknown_size(look_for) else PRINTED,
+        is_metric=board.size_std is not None,
+        metric_std=board.size_std,
         notes=tuple(notes),
     )
 

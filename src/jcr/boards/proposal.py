@@ -72,15 +72,16 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     return f"chessboard:{across}x{down}:SIDE"
 
 
-def proposed_for(capture: Capture, board: str | None) -> Finding | None:
-    """Return the finding that the images show a board; None if they do not, `board` is given or the camera is fixed."""
+def proposed(capture: Capture, board: str | None) -> tuple[Finding, ...]:
+    """Return the finding that the capture's images show a board, with the value of --board that would use it.
+
+    The result is empty if they show none, if the option --board has a value (`board`), or if the camera is fixed.
+    """
     if board is not None or capture.mount == "base":
-        return None
-    return proposed([read_image(capture.folder / name) for name in capture.images])
-
-
-def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:
-    """Return the finding that the images show a board, with the --board that would use it; None without a board."""
-    if (board := board_in_view(images)) is None:
-        return None
-    return Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=board)
+        return ()
+    found = board_in_view([read_image(capture.folder / name) for name in capture.images])
+    return (
+        ()
+        if found is None
+        else (Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=found),)
+    )

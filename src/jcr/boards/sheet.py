@@ -4,8 +4,6 @@ import io
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
-from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from jcr.boards.detection import boards
@@ -52,7 +50,14 @@ def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
         )
     square_px = int(np.ceil(LEAST_PX_PER_MM * square_mm))
     if kind == "charuco":
-        board = _charuco(across, down, square_px, float(parts[2]) / float(parts[1]), parts[3])
+        tags = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, parts[3]))
+        printed = cv2.aruco.CharucoBoard((across, down), 1.0, float(parts[2]) / float(parts[1]), tags)
+        if (count := len(printed.getIds())) > len(tags.bytesList):
+            raise InputError(
+                f"jcr board: {across}x{down} squares need {count} markers, but {parts[3]} has {len(tags.bytesList)}; "
+                f"choose {parts[3].rpartition('_')[0]}_100 or a larger one"
+            )
+        board = np.asarray(printed.generateImage((square_px * across, square_px * down)), np.uint8)
     else:
         white = np.add.outer(np.arange(down), np.arange(across)) % 2 == 1
         board = np.kron(255 * white, np.ones((square_px, square_px))).astype(np.uint8)
@@ -73,19 +78,6 @@ def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
     ):
         draw.text((x_mm * px_per_mm, y_mm * px_per_mm), text, 0, font, anchor="ls")
     return pixels, px_per_mm
-
-
-def _charuco(
-    across: int, down: int, square_px: int, marker_per_square: float, dictionary: str
-) -> UInt8[ndarray, "h w"]:
-    tags = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    board = cv2.aruco.CharucoBoard((across, down), 1.0, marker_per_square, tags)
-    if (count := len(board.getIds())) > len(tags.bytesList):
-        raise InputError(
-            f"jcr board: {across}x{down} squares need {count} markers, but {dictionary} has {len(tags.bytesList)}; "
-            f"choose {dictionary.rpartition('_')[0]}_100 or a larger one"
-        )
-    return np.asarray(board.generateImage((square_px * across, square_px * down)), np.uint8)
 
 
 def _ruler(

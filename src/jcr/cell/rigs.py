@@ -6,7 +6,7 @@ camera. A camera whose images contradict its stated mount is rejected here, befo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -26,7 +26,7 @@ from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
-from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registration, shared_points
+from jcr.sfm.register import GATE_PX, KnownImages, Registration, registrations
 
 CLEARLY_MORE = 1.1
 """Ratio of RANSAC inliers with estimated over given focal length, above which the given one is wrong."""
@@ -55,20 +55,9 @@ def localise(
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
     gate_px = 2 * GATE_PX * max(1.0, start.width / 1600)
-    shared = shared_points(known, features(image, start))
-    found = registration(shared, start, "free", gate_px)
-    if given is not None:
-        by_given = registration(shared, start, "given", gate_px)
-        found = found if _count(found) > CLEARLY_MORE * _count(by_given) else by_given
-    return found if isinstance(found, Registration) else None, _count(found)
-
-
-def _count(found: Registration | int) -> int:
-    """Return the number of points that agree with a registration; an int is returned unchanged.
-
-    An int stands for a failed registration and is its number of points.
-    """
-    return len(found.x_px) if isinstance(found, Registration) else found
+    focals: Sequence[Literal["given", "free"]] = ("free",) if given is None else ("free", "given")
+    found, *by_given = registrations(known, image, start, focals, gate_px)
+    return by_given[0] if by_given and found[1] <= CLEARLY_MORE * by_given[0][1] else found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +105,7 @@ class CameraViews:
     def intrinsics(self) -> Intrinsics:
         """Given intrinsics, else those estimated from the image with most inliers."""
         given, _ = usable_intrinsics(self.camera.intrinsics)
-        return given or max(self.used.values(), key=_count).pose.camera
+        return given or max(self.used.values(), key=lambda one: len(one.x_px)).pose.camera
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":
         """Return the views without some images; `reasons` maps the number of a removed image to the reason."""

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import sine_axis
-from jcr.features.two_view import TwoViewMotion
+from jcr.features.two_view import CameraMotion
 from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log
+from jcr.least_squares import minimise
 
 ROBOT_STD = math.radians(0.3)
 """Standard deviation of a reported gripper rotation, rad; an industrial arm has 0.05°, a servo arm 1°."""
@@ -36,6 +37,7 @@ MAX_HYPOTHESES = 3000
 LEAST_INFORMATION = 6.25e-3
 """Least information of the pairs on R_X along any axis, in units of one residual; with less, R_X is not determined."""
 ROUNDS = 20
+"""Largest number of least-squares estimates of R_X, each with new weights (Cauchy) of the pairs that agree."""
 
 
 Key = tuple[int, int]
@@ -50,7 +52,7 @@ class Pair:
     """Rows of the two images."""
     rows: Int[ndarray, "m 2"]
     """Rows of the matched keypoints among those of the first and of the second image."""
-    readings: tuple[TwoViewMotion, ...]
+    motions: tuple[CameraMotion, ...]
     """Possible relative motions of the two cameras, best first; empty where none could be found."""
 
 
@@ -72,7 +74,7 @@ class Gate:
     """Image pairs that the gripper's rotation confirms, leaves undecided or contradicts; and the hand-eye rotation."""
 
     confirmed: tuple[Pair, ...]
-    """Pairs that agree with the gripper's motion; the first of their `readings` is the motion that agrees best."""
+    """Pairs that agree with the gripper's motion; the first of their `motions` is the motion that agrees best."""
     undecided: tuple[Pair, ...]
     """Pairs whose rotation is too uncertain to be judged."""
     contradicted: tuple[Pair, ...]
@@ -81,22 +83,20 @@ class Gate:
     """Hand-eye rotation R_X from the confirmed pairs; None while too few pairs agree."""
 
 
-def agreeing_readings(pair: Pair, angle: float, systematic: float) -> list[tuple[TwoViewMotion, float]]:
+def agreeing_motions(pair: Pair, angle: float, systematic: float) -> list[tuple[CameraMotion, float]]:
     """Return the motions of an image pair that rotate by the gripper's `angle` (rad), each with its tolerance (rad).
 
     `systematic` is the share of the angle by which camera and gripper may differ systematically.
     """
     found = []
-    for reading in pair.readings:
-        tolerance = SIGMAS * math.sqrt(
-            reading.angle_std() ** 2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2
-        )
-        if abs(float(rotation_angle(reading.rotation)) - angle) < tolerance:
-            found.append((reading, tolerance))
+    for one in pair.motions:
+        tolerance = SIGMAS * math.sqrt(one.angle_std() ** 2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2)
+        if abs(float(rotation_angle(one.rotation)) - angle) < tolerance:
+            found.append((one, tolerance))
     return found
 
 
-def judge(
+def classify_pairs(
     pairs: Sequence[Pair],
     motion: Float[ndarray, "n n 4 4"],
     systematic: float = SYSTEMATIC,
@@ -111,50 +111,35 @@ def judge(
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     undecided, passing, judged = [], [], []
     for pair in pairs:
-        if not any(reading.angle_std() < LARGEST_STD for reading in pair.readings):
+        if not any(one.angle_std() < LARGEST_STD for one in pair.motions):
             undecided.append(pair)
             continue
-        found = agreeing_readings(pair, float(angle[pair.key]), systematic)
-        sure = [(reading, allowed) for reading, allowed in found if reading.angle_std() < LARGEST_STD]
+        found = agreeing_motions(pair, float(angle[pair.key]), systematic)
+        sure = [(one, allowed) for one, allowed in found if one.angle_std() < LARGEST_STD]
         passing += [(pair.key, *one) for one in sure]
         judged.append((pair, sure[0][0] if sure else None))
     of_x = _common_rotation(passing, motion) or known
     confirmed, contradicted = [], []
     for pair, best in judged:
         if of_x is not None:
-            gaps = [
-                float(
-                    rotation_angle(
-                        (of_x.rotation @ r.rotation @ of_x.rotation.T).T @ motion[pair.key][:3, :3]
-                    )
-                )
-                for r in pair.readings
-            ]
-            k = int(np.argmin(gaps))
-            allowed = _rotation_tolerance(pair.readings[k], float(angle[pair.key]), of_x, systematic)
-            best = pair.readings[k] if gaps[k] < allowed else None
+            camera = np.stack([one.rotation for one in pair.motions])
+            gaps = _gap(of_x.rotation, motion[pair.key][None, :3, :3], camera)
+            nearest, by_gripper = pair.motions[int(np.argmin(gaps))], float(angle[pair.key])
+            # Variances (rad²) of the pair's rotation, of its prediction by R_X, and of the gripper's motion.
+            own, robot = np.trace(nearest.covariance[:3, :3]), 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
+            of_mean = 4 * math.sin(min(by_gripper, math.pi) / 2) ** 2 * np.trace(of_x.covariance)
+            variance = own + of_mean + robot + (systematic * by_gripper) ** 2
+            best = nearest if gaps.min() < SIGMAS * math.sqrt(variance) else None
         if best is None:
             contradicted.append(pair)
         else:
-            others = (reading for reading in pair.readings if reading is not best)
-            confirmed.append(replace(pair, readings=(best, *others)))
+            others = (one for one in pair.motions if one is not best)
+            confirmed.append(replace(pair, motions=(best, *others)))
     return Gate(tuple(confirmed), tuple(undecided), tuple(contradicted), of_x)
 
 
-def _rotation_tolerance(reading: TwoViewMotion, angle: float, of_x: RotationOfX, systematic: float) -> float:
-    """Return the largest accepted angle (rad) between a pair's rotation and its prediction from the gripper and R_X.
-
-    `reading` is the pair's camera motion, `angle` the gripper's rotation (rad), and `systematic` the share of it by
-    which both may differ.
-    """
-    own = float(np.trace(reading.covariance[:3, :3]))
-    of_mean = 4 * math.sin(min(angle, math.pi) / 2) ** 2 * float(np.trace(of_x.covariance))
-    robot = 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
-    return SIGMAS * math.sqrt(own + of_mean + robot + (systematic * angle) ** 2)
-
-
 def _common_rotation(
-    passing: Sequence[tuple[Key, TwoViewMotion, float]], motion: Float[ndarray, "n n 4 4"]
+    passing: Sequence[tuple[Key, CameraMotion, float]], motion: Float[ndarray, "n n 4 4"]
 ) -> RotationOfX | None:
     """Return the hand-eye rotation R_X; None if fewer than LEAST_PAIRS image pairs agree on it or it is uncertain.
 
@@ -164,7 +149,7 @@ def _common_rotation(
     if len(set(keys)) < LEAST_PAIRS:
         return None
     gripper = np.stack([motion[key][:3, :3] for key in keys])
-    camera = np.stack([reading.rotation for _, reading, _ in passing])
+    camera = np.stack([one.rotation for _, one, _ in passing])
     # A wrong motion that passed by chance has another axis. Motions of one pair count as one agreeing pair.
     found = rotation_of_x(gripper, camera, np.array([1.5 * tolerance for _, _, tolerance in passing]))
     if found is None or np.linalg.eigvalsh(found.covariance)[-1] > SURE_STD**2:
@@ -205,20 +190,18 @@ def rotation_of_x(
     x = hypotheses[int(score.argmax())]
     information, agreeing = np.zeros((3, 3)), np.zeros(len(gripper), dtype=bool)
     for _ in range(ROUNDS):
-        rotated = x @ camera @ x.T
-        residual = rotation_log(np.swapaxes(rotated, 1, 2) @ gripper)
-        size = np.linalg.norm(residual, axis=1)
-        agreeing = size < tolerance
+        gap = _gap(x, gripper, camera)
+        agreeing = gap < tolerance
         if agreeing.sum() < 3:
             return None
-        # A step w of R_X changes `rotated` to exp(w) rotated exp(-w), and the residual by (rotatedᵀ − I) w.
-        jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
-        w = np.where(agreeing, 1 / (1 + (2 * size / tolerance) ** 2), 0.0)
-        information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
-        gradient = np.einsum("p,pki,pk->i", w, jacobian, residual)
-        step = np.linalg.solve(information + 1e-9 * np.eye(3), gradient)
-        x = nearest_rotation(rotation_exp(step) @ x)
-        if np.abs(step).max() < 1e-9:
+        root = agreeing / np.sqrt(1 + (2 * gap / tolerance) ** 2)
+        found = minimise(
+            lambda x, root=root: _residuals(x, gripper, camera, root),
+            x,
+            lambda x, step: nearest_rotation(rotation_exp(step) @ x),
+        )
+        before, x, information = x, found.unknowns, found.normal
+        if np.abs(x - before).max() < 1e-9:
             break
     if np.linalg.eigvalsh(information)[0] < LEAST_INFORMATION:
         return None
@@ -226,6 +209,21 @@ def rotation_of_x(
     sigma = max(1.48 * float(np.median(gap[agreeing])) / np.sqrt(3), np.radians(0.02))
     covariance = sigma**2 * np.linalg.inv(information)
     return RotationOfX(rotation=x, covariance=covariance, agreeing=agreeing, sigma=sigma)
+
+
+def _residuals(
+    x: Float[ndarray, "3 3"],
+    gripper: Float[ndarray, "p 3 3"],
+    camera: Float[ndarray, "p 3 3"],
+    scale: Float[ndarray, " p"],
+) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 3"]]:
+    """Return rotation vectors (rad) from X camera Xᵀ to the gripper's rotations, and their derivatives by a step of X.
+
+    Both are multiplied by the `scale` of each pair, the root of its weight.
+    """
+    # A step w of X changes X camera Xᵀ to exp(w) X camera Xᵀ exp(-w).
+    back = np.swapaxes(x @ camera @ x.T, 1, 2)
+    return scale[:, None] * rotation_log(back @ gripper), scale[:, None, None] * (np.eye(3) - back)
 
 
 def _gap(

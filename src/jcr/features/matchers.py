@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation, label
 
 from jcr.camera import HALF_PIXEL, unproject
 from jcr.features.gate import Key, Pair
-from jcr.features.two_view import readings
+from jcr.features.two_view import camera_motions
 from jcr.records import Intrinsics
 
 FeatureName = Literal["auto", "sift", "xfeat"]
@@ -50,13 +50,13 @@ class Features(Protocol):
     """Largest distance of the descriptors of a match."""
 
     @property
-    def minds_roll(self) -> bool:
+    def needs_upright(self) -> bool:
         """True if images must be rotated upright before matching."""
         ...
 
     @property
     def every_pair(self) -> int:
-        """Largest number of images of which all pairs are matched; of more images, only near viewpoints are."""
+        """Largest number of images of which all pairs are matched; of more images, only pairs of near viewpoints."""
         ...
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
@@ -77,7 +77,7 @@ class ImageGeometry:
 
     @staticmethod
     def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "ImageGeometry":
-        """Return keypoints `x_px` and intrinsics together with the keypoints' rays."""
+        """Return the geometry of images with these intrinsics and keypoints (px); compute the rays of the keypoints."""
         return ImageGeometry(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
 
@@ -115,7 +115,7 @@ class Matcher:
 
         `repeats` marks pairs of images between which the gripper did not move.
         """
-        new = [k for k, key in enumerate(pairs) if self.features.minds_roll or key not in self.raw]
+        new = [k for k, key in enumerate(pairs) if self.features.needs_upright or key not in self.raw]
         some = [pairs[k] for k in new]
         self.raw |= dict(zip(some, self.features.matches(some, rolls[new]), strict=True))
         x_px = self.x_px
@@ -136,7 +136,7 @@ class Matcher:
             rows = rows[np.linalg.norm(x_i - x_j, axis=1) > STATIONARY_PX]
         depends = key, np.ascontiguousarray(rows).tobytes()
         if depends not in self._verified:
-            self._verified[depends] = matched(x_px, self._camera, key, rows, self.seed, self.known)
+            self._verified[depends] = estimate_geometry(x_px, self._camera, key, rows, self.seed, self.known)
         found = self._verified[depends]
         if found is None or self.still is None:
             return found
@@ -152,17 +152,17 @@ class Matcher:
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
 
-        The intrinsics are those of `view`.
+        The rays and intrinsics are those of `view`.
         """
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
             ray_i, ray_j = (view.rays[row][own] for row, own in zip(key, rows.T, strict=True))
-            found = readings(ray_i, ray_j, view.intrinsics.fx, *matrices(geometry, view.intrinsics))
+            found = camera_motions(ray_i, ray_j, view.intrinsics.fx, *matrices(geometry, view.intrinsics))
             self._pairs[depends] = Pair(key, rows, tuple(found)), geometry
         return self._pairs[depends][0]
 
-    def image_removed(self, row: int) -> None:
+    def remove_image(self, row: int) -> None:
         """Remove all matches of image `row`, which the features no longer have; later rows decrease by one."""
 
         def after(key: Key) -> Key:
@@ -176,7 +176,7 @@ class Matcher:
         }
 
 
-def matched(
+def estimate_geometry(
     x_px: Sequence[Float[ndarray, "_ 2"]],
     camera: pycolmap.Camera,
     key: Key,
@@ -221,7 +221,7 @@ def still_cells(
     size: tuple[int, int],
     moving: Iterable[Key],
 ) -> Bool[ndarray, "r c"]:
-    """Return which cells of the image have matches that keep their pixel in many pairs although the gripper moves.
+    """Return a mask of the image cells with matches that keep their pixel in many pairs although the gripper moves.
 
     Such cells show the gripper's own fingers, a logo, or text drawn into the images. `raw` are the matches of each
     pair, `moving` the pairs between which the gripper moved, and `size` is width and height, px.

@@ -60,13 +60,13 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
     return first
 
 
-def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
+def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
     The shared scene is measured by the points of the pairs in `found` that the gripper confirms. It is unknown without
     a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is gripper i_from_j.
     """
-    x = translation_of_x(found, motion)
+    x = hand_eye_of_pairs(found, motion)
     if x is None:
         return []
     first_from_camera = motion[0] @ x
@@ -88,7 +88,7 @@ def seen_in_common(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n
     return _best(score, PARTNERS, viewpoints(motion))
 
 
-def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
+def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
     """Return gripper_from_camera = (R_X, t_X) from the confirmed image pairs; None while R_X is unknown.
 
     The gripper's motion of a pair is (R_A, t_A), `motion[i, j]`. The camera's translation is known up to its length;
@@ -97,10 +97,10 @@ def translation_of_x(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[nd
     """
     if found.of_x is None or not found.confirmed:
         return None
-    best = [pair.readings[0] for pair in found.confirmed]
+    best = [pair.motions[0] for pair in found.confirmed]
     gripper = np.stack([motion[pair.key] for pair in found.confirmed])
     turn, moved = gripper[:, :3, :3] - np.eye(3), gripper[:, :3, 3]
-    cross = skew(np.stack([reading.direction for reading in best]) @ found.of_x.rotation.T)
+    cross = skew(np.stack([one.direction for one in best]) @ found.of_x.rotation.T)
     loose = np.sqrt([max(np.trace(r.covariance[3:, 3:]) / 2, LEAST_DIRECTION_STD**2) for r in best])
     a, b = cross @ turn, (cross @ moved[..., None])[..., 0]
     t = np.zeros(3)
@@ -132,7 +132,7 @@ def _scene_points(
 
 
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:
-    """Return the pairs of each image with the `count` other viewpoints of highest finite `score`, one image of each.
+    """Return pairs of each image with one image of each of the `count` other viewpoints with the highest finite `score`.
 
     `viewpoint` is the viewpoint of each image. Images of one viewpoint are paired with different images of another one,
     so that all images are connected and their noise averages.

@@ -72,7 +72,7 @@ def matches(
 class SiftFeatures:
     """SIFT keypoints and descriptors of images reduced to one size; image rotation does not change them."""
 
-    minds_roll = False
+    needs_upright = False
     every_pair = 24
     farthest = FARTHEST
 

@@ -5,7 +5,7 @@ images are then rotated upright.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +21,9 @@ from jcr.features.gate import (
     Gate,
     Key,
     Pair,
-    agreeing_readings,
+    agreeing_motions,
     by_quarters,
-    judge,
+    classify_pairs,
     rolls,
 )
 from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices, still_cells
@@ -32,13 +32,14 @@ from jcr.features.pairs import (
     FIRST_NEIGHBOURS,
     NEIGHBOURS,
     all_pairs,
+    hand_eye_of_pairs,
     near_pairs,
+    pairs_of_common_scene,
     repeats,
-    seen_in_common,
-    translation_of_x,
 )
 from jcr.features.two_view import starting_motions
 from jcr.geometry import Transform, rotation_angle
+from jcr.progress import Progress, silent
 from jcr.records import Intrinsics
 
 WORTH_SAYING = 0.1
@@ -61,7 +62,7 @@ FOCAL_MATCHES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
-class Matched:
+class MatchedPairs:
     """Result of the search for matching pairs: their two-view geometries, the intrinsics used, notes and warnings."""
 
     geometries: Geometries
@@ -95,10 +96,10 @@ class _Search:
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
-        """Match pairs, their two images first rotated by the given angles (rad); keep a pair's better geometry."""
+        """Match pairs with their two images rotated by angles (rad); keep the better geometry of each pair."""
         todo = {}
         for key, both in rotations.items():
-            if not self.matcher.features.minds_roll:
+            if not self.matcher.features.needs_upright:
                 both = (0.0, 0.0)
             both = by_quarters(both[0]), by_quarters(both[1])
             how = (*key, round(math.degrees(both[0])), round(math.degrees(both[1])))
@@ -108,7 +109,7 @@ class _Search:
         if not todo:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats)
-        if self.matcher.features.minds_roll:  # rotated images have added keypoints
+        if self.matcher.features.needs_upright:  # rotated images have added keypoints
             self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             if self._is_better(pair := self.matcher.pair(self.view, key, geometry)):
@@ -123,21 +124,23 @@ class _Search:
             for quarter in range(4):
                 guess = (0.0, quarter * math.pi / 2)
                 self.match(dict.fromkeys(pairs[start : start + GUESSED_AT_ONCE], guess))
-            found = judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
+            found = classify_pairs([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
             if found.of_x is not None:
                 break
         return found
 
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
-        """Match pairs with each image rotated by its angle `upright` (rad); return all pairs, classified.
+        """Match pairs with each image rotated by its angle `upright` (rad); classify all pairs by the gripper's motion.
 
         `found` is the classification before, whose hand-eye rotation is used if the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
-        return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x)
+        return classify_pairs(
+            [pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x
+        )
 
     def hide_still_parts(self) -> None:
-        """Find the parts of the image that stay while the gripper moves; verify all matches without them."""
+        """Find the cells of the image that stay while the gripper moves; verify all matches without these cells."""
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
@@ -153,27 +156,27 @@ class _Search:
                 self.pairs[key] = self.matcher.pair(self.view, key, geometry), geometry
 
     def _is_better(self, new: Pair) -> bool:
-        """Test whether the new geometry of a pair is to replace the pair's old one.
+        """Test whether the new geometry of a pair replaces the one in `pairs`.
 
-        It is if only the new one agrees with the gripper's angle. If both or neither agree, the new one needs more than
+        It does if it alone agrees with the gripper's angle. If both or neither agree, the new geometry needs more than
         half as many matches as the old one.
         """
         if new.key not in self.pairs:
             return True
         old, angle = self.pairs[new.key][0], float(rotation_angle(self.motion[new.key][:3, :3]))
-        first, second = (bool(agreeing_readings(pair, angle, self.systematic)) for pair in (new, old))
+        first, second = (bool(agreeing_motions(pair, angle, self.systematic)) for pair in (new, old))
         # The later geometry is preferred: its images are rotated upright, so that all pairs share their keypoints.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def gate(self) -> Gate:
-        """Return all pairs, classified; unknown intrinsics are first estimated from the gripper's angles."""
+        """Estimate unknown intrinsics from the gripper's angles, then classify all pairs by the gripper's motion."""
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
             self.view = ImageGeometry.of(self.view.x_px, intrinsics)
             self.pairs = {
                 key: (self.matcher.pair(self.view, key, geometry), geometry)
                 for key, (_, geometry) in self.pairs.items()
             }
-        return judge([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
+        return classify_pairs([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
 
     def _intrinsics_by_robot(self) -> Intrinsics | None:
         """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
@@ -213,32 +216,33 @@ def match_with_robot(
     base_from_gripper: Float[ndarray, "n 4 4"],
     intrinsics: Intrinsics,
     names: Sequence[str],
-    report: Callable[[float], None] = lambda fraction: None,
-) -> Matched:
+    report: Progress = silent,
+) -> MatchedPairs:
     """Match pairs of images and return those that the gripper poses do not contradict.
 
     `intrinsics` are at the size in which images are matched; they are an initial estimate unless the matcher's are
     known. If the hand-eye rotation cannot be found from the pairs, the pairs are not checked against the robot poses,
     which may be of another convention.
     """
+    report("matching", 0.0)
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     matcher.still, view = None, ImageGeometry.of(matcher.x_px, intrinsics)
     search = _Search(matcher=matcher, motion=motion, view=view, repeats=repeats(motion))
     everything = all_pairs(n) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
-    at_once = n <= FEW and not features.minds_roll
+    at_once = n <= FEW and not features.needs_upright
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     as_taken = (0.0, 0.0)
-    search.match({key: as_taken for key in first if not features.minds_roll or angle[key] < AS_TAKEN})
+    search.match({key: as_taken for key in first if not features.needs_upright or angle[key] < AS_TAKEN})
     search.hide_still_parts()
-    report(0.3)
+    report("matching", 0.3)
     found = search.gate()
-    if found.of_x is None and features.minds_roll:
+    if found.of_x is None and features.needs_upright:
         confirmed = {pair.key for pair in found.confirmed}
         left = sorted(set(everything) - confirmed, key=lambda key: float(angle[key]))
         found = search.match_by_quarters(left, found)
-    report(0.5)
+    report("matching", 0.5)
     if found.of_x is None:
         search.match(dict.fromkeys(everything, as_taken))
         found = search.gate()
@@ -247,25 +251,27 @@ def match_with_robot(
         kept, notes, warnings = {key: one for key, (_, one) in search.pairs.items()}, (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
-        found = search.match_upright(seen_in_common(search.view, found, motion) or everything, upright, found)
-        report(0.8)
+        found = search.match_upright(
+            pairs_of_common_scene(search.view, found, motion) or everything, upright, found
+        )
+        report("matching", 0.8)
         rows = [row for pair in found.confirmed for row in pair.key]
         lonely = set(np.flatnonzero(np.bincount(rows, minlength=n) < 2).tolist())
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
-        kept, notes, warnings = _believed(search, found, names)
-        x = translation_of_x(found, motion)
+        kept, notes, warnings = _pairs_to_map(search, found, names)
+        x = hand_eye_of_pairs(found, motion)
     if matcher.still is not None:
         percent = 100 * matcher.still.mean()
         notes += (
             f"{percent:.0f} % of the image do not move while the gripper does, fingers or a logo: left out",
         )
-    report(1.0)
+    report("matching", 1.0)
     intrinsics = search.view.intrinsics
-    return Matched(geometries=kept, intrinsics=intrinsics, x=x, notes=notes, warnings=warnings)
+    return MatchedPairs(geometries=kept, intrinsics=intrinsics, x=x, notes=notes, warnings=warnings)
 
 
-def _believed(
+def _pairs_to_map(
     search: _Search, found: Gate, names: Sequence[str]
 ) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
     """Return the two-view geometries that are to be mapped, and notes and warnings for the user about the other pairs.
@@ -303,7 +309,7 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
         corrections = []
         for pair in found.contradicted:
             if row in pair.key and (set(pair.key) - {row}) & confirmed:
-                of_gripper, camera = motion[pair.key][:3, :3], x @ pair.readings[0].rotation @ x.T
+                of_gripper, camera = motion[pair.key][:3, :3], x @ pair.motions[0].rotation @ x.T
                 corrections.append(of_gripper.T @ camera if pair.key[1] == row else of_gripper @ camera.T)
         if len(corrections) >= 3:
             all_of = np.array(corrections)

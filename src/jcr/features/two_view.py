@@ -23,7 +23,7 @@ LARGEST_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True)
-class TwoViewMotion:
+class CameraMotion:
     """Possible relative motion of cameras i and j of an image pair: rotation, direction, covariance and noise."""
 
     rotation: Float[ndarray, "3 3"]
@@ -45,25 +45,25 @@ class TwoViewMotion:
         return float(np.sqrt(max(axis @ covariance @ axis, 0.0)))
 
 
-def readings(
+def camera_motions(
     ray_i: Float[ndarray, "m 2"],
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
     j_from_i_essential: Float[ndarray, "3 3"] | None,
     j_from_i_homography: Float[ndarray, "3 3"] | None,
-) -> list[TwoViewMotion]:
+) -> list[CameraMotion]:
     """Return the motions that may explain matched rays (x/z, y/z) of cameras i and j, best first; empty without one.
 
     The matrices map rays of image i to image j, each None if not found. `focal_px` converts residuals to px.
     """
-    found: list[TwoViewMotion] = []
+    found: list[CameraMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
-        reading = _least_squares_motion(*start, ray_i, ray_j, focal_px)
-        if reading is None or reading.sigma_px > LARGEST_SIGMA_PX:
+        one = _least_squares_motion(*start, ray_i, ray_j, focal_px)
+        if one is None or one.sigma_px > LARGEST_SIGMA_PX:
             continue
-        if all(np.linalg.norm(other.rotation - reading.rotation) > 0.02 for other in found):
-            found.append(reading)
-    return sorted(found, key=lambda reading: reading.sigma_px)
+        if all(np.linalg.norm(other.rotation - one.rotation) > 0.02 for other in found):
+            found.append(one)
+    return sorted(found, key=lambda one: one.sigma_px)
 
 
 def starting_motions(
@@ -138,7 +138,7 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return the length of the gradient of x_i · E x_j by both rays, per match; line_i is E x_j, line_j is Eᵀ x_i."""
+    """Return the norm of the gradient of x_i · E x_j by both rays for m matches; line_i is E x_j, line_j is Eᵀ x_i."""
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
@@ -148,7 +148,7 @@ def _least_squares_motion(
     ray_i: Float[ndarray, "m 2"],
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
-) -> TwoViewMotion | None:
+) -> CameraMotion | None:
     """Return a camera motion refined to least Sampson distances, with covariance; None for fewer than eight matches.
 
     Rotation (i_from_j) and direction (i to j) have five parameters. The loss is Cauchy, whose scale is estimated
@@ -175,7 +175,7 @@ def _least_squares_motion(
     # Errors of neighbouring matches are correlated: at most a hundred matches count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
     covariance = np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5))
-    return TwoViewMotion(*at, covariance, sigma)
+    return CameraMotion(*at, covariance, sigma)
 
 
 def _retracted(

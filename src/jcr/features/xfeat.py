@@ -170,7 +170,7 @@ class LearnedFeatures:
     angle.
     """
 
-    minds_roll = True
+    needs_upright = True
     every_pair = 12
     farthest = FARTHEST
 

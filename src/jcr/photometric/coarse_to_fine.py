@@ -16,8 +16,8 @@ from jcr.photometric.residuals import (
     Points,
     energy,
     equations,
-    on_rays,
-    strongest,
+    search_depths,
+    strong_edges,
 )
 
 DEPTHS = 40
@@ -51,15 +51,15 @@ class PyramidLevel:
     """Colour difference (RGB, each 0 to 1) at which the robust cost reaches half of its maximum."""
 
 
-def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
+def axes_intersection(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
     """Return the point in the base frame with the least squared distances from the optical axes of the n cameras."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
     """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth."""
-    host, x_px = strongest(level, _per_image(level, stage))
-    return on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
+    host, x_px = strong_edges(level, _per_image(level, stage))
+    return search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
 
 def _per_image(level: Level, stage: PyramidLevel) -> int:
@@ -67,9 +67,9 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Return the depths (m) to try in each image: d trials (rows) for n images (columns)."""
+    """Return the depths (m) to try in each of n images (columns), evenly spaced in inverse depth."""
     pose = cameras.base_from_camera
-    depth = ((axes_meet(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
+    depth = ((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
     middle = np.clip(depth, *MEET_WITHIN)
     return middle / np.linspace(1 / DEPTH_RANGE[0], 1 / DEPTH_RANGE[1], DEPTHS)[:, None]
 
@@ -104,27 +104,7 @@ def align_photometrically(
     """Align cameras at one pyramid level by rounds of depth search and Gauss-Newton; return cameras and points.
 
     `stage` has the settings. The columns of `directions` are the free steps of the cameras (`tied_directions`,
-    `free_directions`).
-    """
-    host, x_px = strongest(level, _per_image(level, stage))
-    before, points = np.inf, None
-    for _ in range(stage.rounds):
-        points, cost = on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
-        if cost > SETTLED * before:
-            break
-        cameras, points = _after_descent(level, cameras, points, stage.sigma, directions)
-        before = cost
-    assert points is not None
-    return cameras, points
-
-
-def _after_descent(
-    level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
-) -> tuple[Cameras, Points]:
-    """Return cameras and points that minimise the robust photometric cost of an image level, from given initial values.
-
-    The p camera unknowns (order of `after_step`) move only along the q columns of `directions`; with p = 7 all cameras
-    move as one rigid body. `sigma` is the scale of the robust cost, in units of the image intensity.
+    `free_directions`); with 7 rows, all cameras move as one.
     """
 
     def step(
@@ -136,15 +116,24 @@ def _after_descent(
         depth = at[1].depth * np.exp(np.clip(system.depth_step(along), -0.05, 0.05))
         return after_step(at[0], along), replace(at[1], depth=depth)
 
-    return damped_gauss_newton(
-        lambda at: equations(level, *at, sigma, tied=len(directions) == 7),
-        step,
-        lambda at: energy(level, *at, sigma),
-        (cameras, points),
-        enough=lambda best: ENOUGH * best,
-        damping=1e-3,
-        iterations=STEPS,
-    )[0]
+    host, x_px = strong_edges(level, _per_image(level, stage))
+    before, points = np.inf, None
+    for _ in range(stage.rounds):
+        points, cost = search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
+        if cost > SETTLED * before:
+            break
+        before = cost
+        (cameras, points), _, _ = damped_gauss_newton(
+            lambda at: equations(level, *at, stage.sigma, tied=len(directions) == 7),
+            step,
+            lambda at: energy(level, *at, stage.sigma),
+            (cameras, points),
+            enough=lambda best: ENOUGH * best,
+            damping=1e-3,
+            iterations=STEPS,
+        )
+    assert points is not None
+    return cameras, points
 
 
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:

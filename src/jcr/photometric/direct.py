@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from scipy.linalg import block_diag
 
 from jcr.camera import (
     guessed_intrinsics,
@@ -35,6 +36,7 @@ from jcr.photometric.coarse_to_fine import (
     tied_directions,
 )
 from jcr.photometric.residuals import (
+    FAINT,
     Cameras,
     Level,
     Points,
@@ -42,7 +44,7 @@ from jcr.photometric.residuals import (
     in_base,
     in_view,
     make_level,
-    relative_exposures,
+    sample,
     squared_misfit,
 )
 from jcr.photometric.search import SIZES, search
@@ -56,6 +58,8 @@ BEFORE_GAINS = PyramidLevel(60, 300, 1, 0.2)
 """Stage after which the brightness of the images is compared."""
 GAIN_ROUNDS = 3
 """Number of times that the gains are estimated; the number of points that agree grows each time."""
+SHARED = 5
+"""Least number of points that two images must share for their brightness to be compared."""
 LEAST_GAIN = 0.05
 """Largest log gain of any image at which all gains are ignored: shading and gloss have the same effect."""
 LEAST_AGREED = 0.25
@@ -125,12 +129,27 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
 
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """Return a factor per image that makes all images equally bright; all are 1 where brightness hardly differs."""
-    factor = np.ones(level.count)
+    """Return a factor per image that makes all images equally bright; all are 1 where brightness hardly differs.
+
+    The brightness of two images is compared at the points of one that the other shows in nearly the same colour.
+    """
+    factor, dark, images = np.ones(level.count), 10 * FAINT, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
         _, points = align_photometrically(even, cameras, BEFORE_GAINS, np.zeros((7, 0)))
-        factor /= relative_exposures(even, cameras, points, BEFORE_GAINS.sigma)
+        _, u, v, seen = in_view(even, cameras, points)
+        shown, own = sample(even.color, even, u, v).mean(-1), points.color.mean(-1)
+        used = seen & points.agreed & (shown > dark) & (own > dark)
+        used &= squared_misfit(even, points, u, v) < (2 * BEFORE_GAINS.sigma) ** 2
+        ratio = np.log(np.maximum(shown, dark) / np.maximum(own, dark))
+        # The logs of the brightness by least squares from those of their ratios; their mean is 0.
+        rows, values = [np.ones(level.count)], [0.0]
+        for image, host in np.ndindex(level.count, level.count):
+            of_pair = used[image] & (points.host == host)
+            if (count := of_pair.sum()) >= SHARED:
+                rows.append(np.sqrt(count) * ((images == image) - 1.0 * (images == host)))
+                values.append(np.sqrt(count) * np.median(ratio[image, of_pair]))
+        factor /= np.exp(np.linalg.lstsq(np.stack(rows), np.array(values), rcond=None)[0])
     return factor if np.abs(np.log(factor)).max() > LEAST_GAIN else np.ones(level.count)
 
 
@@ -162,7 +181,7 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Return the images, undistorted and reduced, by their height in pixels; the heights are those of all stages."""
+    """Undistort images (RGB, 0 to 255) and reduce them to the height (px) of each stage; return the levels by height."""
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
@@ -187,11 +206,7 @@ def camera_covariance(
     np.add.at(score, region, system.gradient @ directions)
     spread = np.einsum("bp,pq,bq->", score, inverse_normal, score) / directions.shape[1]
     first_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
-    n = len(first_from_camera)
-    to_first = np.zeros((6 * n, 6 * n))
-    for k, block in enumerate(step_axes(first_from_camera[:, :3, :3])):
-        to_first[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
-    steps = to_first @ directions[:-1]
+    steps = block_diag(*step_axes(first_from_camera[:, :3, :3])) @ directions[:-1]
     return spread * steps @ inverse_normal @ steps.T
 
 

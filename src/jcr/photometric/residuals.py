@@ -24,11 +24,9 @@ SEEN_BY = 0.6
 others."""
 NEAREST = 0.05
 """Least depth of a point in front of a camera, m."""
-_FAINT = 2.0 / 255
+FAINT = 2.0 / 255
 """Change of colour (0 to 1) per pixel below which a pixel has too little contrast to be located."""
 _BORDER_PX = 2
-_SHARED = 5
-"""Least number of points that two images must share for their brightness to be compared."""
 _KEEP_DEPTH = 1e-3
 """Information that is added to every log depth, so that a depth that the images do not determine keeps its value."""
 _CHUNK = 500
@@ -51,7 +49,7 @@ class Level:
         return len(self.color) // self.grid.height
 
     def rows(self, which: Int[ndarray, " m"]) -> "Level":
-        """Return only the images `which` (rows), as a level."""
+        """Return the level with only the images of the rows `which`."""
         color, by_u, by_v = (
             x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
             for x in (self.color, self.by_u, self.by_v)
@@ -59,7 +57,7 @@ class Level:
         return Level(color, by_u, by_v, self.grid)
 
     def times(self, factor: Float[ndarray, " n"]) -> "Level":
-        """Return the images, each with its brightness multiplied by its factor, as a level."""
+        """Return the level with the brightness of each image multiplied by its factor."""
         of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
         return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
@@ -121,8 +119,8 @@ def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: in
     return Level(color, by_u, by_v, small)
 
 
-def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
-    """Return image row and pixel (u, v) of the strongest edges, at most one per block and `per_image` per image."""
+def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
+    """Return row of the image and pixel (u, v) of k strong edges: one per block of pixels, `per_image` per image."""
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
     change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
@@ -133,14 +131,14 @@ def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[nda
     blocks = blocks.swapaxes(2, 3).reshape(n, rows * columns, block * block)
     inside, best = blocks.argmax(-1), blocks.max(-1)
     cell = np.argsort(-best, axis=1, kind="stable")[:, :per_image]
-    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > _FAINT**2)
+    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > FAINT**2)
     cell = cell[host, rank]
     inside = inside[host, cell]
     u, v = cell % columns * block + inside % block, cell // columns * block + inside // block
     return host, np.column_stack([u, v])
 
 
-def on_rays(
+def search_depths(
     level: Level,
     cameras: Cameras,
     host: Int[ndarray, " k"],
@@ -152,50 +150,41 @@ def on_rays(
     """Return points at the given pixels with the best of the tried `depths`, and the mean of the points' costs.
 
     `host` is the image row of each pixel; `depths` (m) has one row per trial and one column per image. The cost of a
-    point is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r. Points with a cost
-    below `least` are marked as agreed.
+    point is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r; it is 1 where fewer
+    than two images see the point. Points with a cost below `least` are marked as agreed.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)
     points = Points(host=host, x_px=x_px.astype(float), color=color, depth=depths[0, host], agreed=agreed)
-    cost = np.stack([_cost(level, cameras, replace(points, depth=depth[host]), sigma) for depth in depths])
+    cost = np.empty((len(depths), len(host)))
+    for trial, depth in enumerate(depths):
+        _, u, v, seen = in_view(level, cameras, replace(points, depth=depth[host]))
+        misfit = squared_misfit(level, points, u, v)
+        misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
+        count = seen.sum(0)
+        kept = np.maximum(np.ceil(SEEN_BY * count), 2)
+        total = np.where(np.arange(len(misfit))[:, None] < kept, misfit, 0).sum(0)
+        cost[trial] = np.where(count < 2, 1.0, total / kept)
     best = cost.argmin(0)
     found = cost[best, np.arange(len(host))]
     return replace(points, depth=depths[best, host], agreed=found < least), float(found.mean())
-
-
-def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
-    """Return the cost of each point, 0 to 1; it is 1 where fewer than two images see the point.
-
-    The cost is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r.
-    """
-    _, u, v, seen = in_view(level, cameras, points)
-    misfit = squared_misfit(level, points, u, v)
-    misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
-    count = seen.sum(0)
-    kept = np.maximum(np.ceil(SEEN_BY * count), 2)
-    total = np.where(np.arange(len(misfit))[:, None] < kept, misfit, 0).sum(0)
-    return np.where(count < 2, 1.0, total / kept)
 
 
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
     """Return for each image and point the squared difference of the image's colour at u, v and the point's colour."""
-    return _squared(_sample(level.color, level, u, v) - points.color)
-
-
-def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
+    difference = sample(level.color, level, u, v) - points.color
     return np.einsum("nkc,nkc->nk", difference, difference)
 
 
 def _in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return each point in the camera frame of its host image, m."""
+    """Return the points in the camera frame of their host images, m."""
     return points.depth[:, None] * unproject(zoomed(level.grid, cameras.zoom), points.x_px)
 
 
 def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
-    """Return each point in the base frame, m."""
+    """Return the points in the base frame, m."""
     pose = cameras.base_from_camera[points.host]
     return np.einsum("kij,kj->ki", pose[:, :3, :3], _in_host(level, cameras, points)) + pose[:, :3, 3]
 
@@ -219,35 +208,13 @@ def in_view(
     return x, u, v, seen
 
 
-def _sample(
+def sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Return the colour of every image of `stack` (images below each other) at its own pixels u, v, bilinearly."""
+    """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation."""
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
-    """Return the brightness of each image relative to the others (geometric mean 1), from the points that images share.
-
-    Points whose colour differs by more than 2 `sigma` are not used.
-    """
-    _, u, v, seen = in_view(level, cameras, points)
-    shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
-    dark = 10 * _FAINT
-    used = seen & points.agreed & (shown > dark) & (own > dark)
-    used &= squared_misfit(level, points, u, v) < (2 * sigma) ** 2
-    ratio = np.log(np.maximum(shown, dark) / np.maximum(own, dark))
-    rows, values = [np.full(level.count, 1.0)], [0.0]
-    for image, host in np.ndindex(level.count, level.count):
-        of_pair = used[image] & (points.host == host)
-        if (count := of_pair.sum()) >= _SHARED:
-            row = np.zeros(level.count)
-            row[image], row[host] = np.sqrt(count), -np.sqrt(count)
-            rows.append(row)
-            values.append(np.sqrt(count) * np.median(ratio[image, of_pair]))
-    return np.exp(np.linalg.lstsq(np.stack(rows), np.array(values), rcond=None)[0])
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
@@ -318,10 +285,11 @@ def _linearised(
         rows = slice(start, start + _CHUNK)
         some = points.where(rows)
         x, u, v, seen = in_view(level, cameras, some)
-        residual, by_u, by_v = (_sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
+        residual, by_u, by_v = (sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
         residual = residual - some.color
         # Weight of the Geman-McClure loss.
-        weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
+        squared = np.einsum("nkc,nkc->nk", residual, residual)
+        weight = (seen & some.agreed) / (1 + squared / np.float32(sigma**2)) ** 2
         root = np.sqrt(weight, dtype=np.float32)[..., None]
         x_in_host = _in_host(level, cameras, some).astype(np.float32)
         other_from_host = rotation[:, some.host]

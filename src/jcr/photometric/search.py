@@ -12,11 +12,11 @@ from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
 from jcr.photometric.coarse_to_fine import (
     PyramidLevel,
     align_photometrically,
-    axes_meet,
+    axes_intersection,
     cost_of,
     tied_directions,
 )
-from jcr.photometric.residuals import Cameras, Level, strongest
+from jcr.photometric.residuals import Cameras, Level, strong_edges
 from jcr.progress import Progress
 
 ROTATIONS, TILTS, TILT_DEG = 24, 6, 15.0
@@ -49,7 +49,7 @@ def search(
     `levels` are the images by their height in pixels. Raises RejectedError where a different hand-eye transform fits as
     well, or where the images have no edges.
     """
-    if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
+    if not len(strong_edges(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"
         )
@@ -78,7 +78,7 @@ def search(
     ranked = [(cost_of(levels[screen.height], cameras, screen), cameras) for cameras in starts]
     ranked = sorted(ranked, key=lambda each: each[0])[:KEPT]
     coarse = refined(ranked, COARSEST, COARSE, 0.1, 0.4)
-    (cost, best), *rivals = _different(refined(_different(coarse)[:KEPT_BASINS], COARSE, JUDGE, 0.5, 0.2))
+    (cost, best), *rivals = _distinct(refined(_distinct(coarse)[:KEPT_BASINS], COARSE, JUDGE, 0.5, 0.2))
     if rivals and cost > CLEARLY_BETTER * rivals[0][0]:
         raise RejectedError(
             f"direct alignment: cameras at different places explain the images alike (cost {cost:.3f} and "
@@ -102,7 +102,7 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     facing = np.stack([x, np.cross(z, x), z], -1)
     cameras = base_from_gripper @ transform(facing, np.zeros(3))[:, None]
-    towards = axes_meet(cameras)[:, None] - cameras[..., :3, 3]
+    towards = axes_intersection(cameras)[:, None] - cameras[..., :3, 3]
     cosine = (towards * cameras[..., :3, 2]).sum(-1) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-9)
     best = facing[cosine.mean(1).argmax()]
     rotation = 2 * np.pi * np.arange(ROTATIONS) / ROTATIONS
@@ -113,7 +113,7 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
     return transform(rotations.reshape(-1, 3, 3), np.zeros(3))
 
 
-def _different(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
+def _distinct(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
     """Return (cost, cameras) of the best of each group of nearly equal results, best first."""
     kept: list[tuple[float, Cameras]] = []
     for cost, cameras in sorted(found, key=lambda each: each[0]):

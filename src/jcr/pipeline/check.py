@@ -200,8 +200,7 @@ def _compare_with_images(
     except RejectedError as error:
         if is_quick:
             return _compare_with_images(capture, robot, options, seed, progress, thorough=True)
-        board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return _Comparison(findings=(*no_reconstruction(error), *(() if board is None else (board,))))
+        return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
     hand_eye, assumptions, registered = case.hand_eye, None, made.image_index[case.hand_eye.inliers]
     if hand_eye.converged:

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.allocator import give_back
-from jcr.boards.proposal import proposed_for
+from jcr.boards.proposal import proposed
 from jcr.calibration.record import AnyCalibration, failed_calibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
@@ -240,12 +240,12 @@ def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
     The error proposes the option `--board` if the images show a board.
     """
     capture, tried = result.capture, error.attempts
-    board = proposed_for(capture, result.state.options.reconstruct.board)
+    boards = proposed(capture, result.state.options.reconstruct.board)
     content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
-    content = content if board is None else content.with_findings(board).with_notes()
+    content = content.with_findings(*boards).with_notes() if boards else content
     keep_calibration(result.out, content)
     complete(_report(result.with_parts(calibration=content)))
-    return error if board is None else NothingFoundError(error.with_more(sentence(board)), tried)
+    return NothingFoundError(error.with_more(*map(sentence, boards)), tried) if boards else error
 
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
@@ -256,8 +256,7 @@ def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     notes = (*capture.notes, *reconstruction.notes)
     content = replace(content, attempts=result.state.attempts, notes=notes)
     if content.verdict == "rejected" or content.short is not None:
-        board = proposed_for(capture, result.state.options.reconstruct.board)
-        content = content if board is None else content.with_findings(board)
+        content = content.with_findings(*proposed(capture, result.state.options.reconstruct.board))
     content = content.with_notes()
     keep_calibration(result.out, content)
     return result.with_parts(calibration=content)

@@ -53,8 +53,9 @@ def reconstruct_any_view(
 ) -> Reconstruction:
     """Reconstruct a capture by a network that predicts all images at once, and refine it by matches.
 
-    `load` returns the network of a folder of weights on a device. The unit is that of the prediction. Raises InputError
-    for weights that are missing or damaged.
+    `load` returns the network of a folder of weights on a device. The unit is that of the prediction. Pixels whose point
+    or confidence is not finite, or whose point lies behind the camera, get confidence 0. Raises InputError for weights
+    that are missing or damaged.
     """
     report = progress or silent
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
@@ -62,39 +63,26 @@ def reconstruct_any_view(
     with redirect_stdout(sys.stderr):  # packages print to stdout, which is for the command's result
         maps = load(weights.path, device)(Views(images.colors, images.pinhole))
     report("reconstruct", 1.0)
-    maps = usable_pointmaps(maps, backend)
-    colors = np.stack([resize_and_crop(image, maps.grid) for image in images.colors])
-    return reconstruct_pointmaps(
-        capture,
-        replace(images, grid=maps.grid, colors=colors),
-        replace(maps, notes=(*maps.notes, weights.note)),
-        backend,
-        progress,
-    )
-
-
-def usable_pointmaps(maps: PosedPointmaps, model: str) -> PosedPointmaps:
-    """Return the pointmaps with confidence 0 at unusable pixels; raise InputError where no pixel is usable.
-
-    A pixel is unusable if its point or confidence is not finite, or if the point lies behind the camera. `model` is the
-    network's name in the message.
-    """
-    confidence = maps.confidence
-    there = np.isfinite(maps.x_in_camera).all(-1) & np.isfinite(confidence) & (confidence > 0)
-    there &= maps.x_in_camera[..., 2] > 0
+    there = np.isfinite(maps.x_in_camera).all(-1) & (maps.x_in_camera[..., 2] > 0)
+    there &= np.isfinite(maps.confidence) & (maps.confidence > 0)
     if not there.any() or not np.isfinite(maps.recon_from_camera).all():
         raise InputError(
-            f"{model} gave no usable depth or camera; its weights may be damaged, get them again"
+            f"{backend} gave no usable depth or camera; its weights may be damaged, get them again"
         )
-    return replace(
+    maps = replace(
         maps,
         x_in_camera=np.where(there[..., None], maps.x_in_camera, 0).astype(np.float32),
-        confidence=np.where(there, confidence, 0).astype(np.float32),
+        confidence=np.where(there, maps.confidence, 0).astype(np.float32),
+        notes=(*maps.notes, weights.note),
+    )
+    colors = np.stack([resize_and_crop(image, maps.grid) for image in images.colors])
+    return reconstruct_pointmaps(
+        capture, replace(images, grid=maps.grid, colors=colors), maps, backend, progress
     )
 
 
 def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
-    """Return images as a tensor (n,3,h,w), normalised as for encoders that were trained on ImageNet."""
+    """Return images (RGB, 0 to 255) as a tensor (n,3,h,w), normalised by mean and deviation of ImageNet's colours."""
     mean, deviation = (
         torch.tensor(values, device=device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
     )

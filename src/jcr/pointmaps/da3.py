@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 from torch import nn
 
@@ -87,25 +87,17 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
     count, height, width = colors.shape[:3]
     depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
     matrices = output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3")
+    # In the network's intrinsics, pixel coordinates are 0 at the image's corner, and 0.5 at the first pixel's centre.
+    centres = *np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))
+    rays = np.einsum("nij,jhw->nhwi", np.linalg.inv(matrices), np.stack(centres)).astype(np.float32)
     camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
     return PosedPointmaps(
         grid=grid,
-        x_in_camera=depth[..., None] * rays_of_edges(matrices, height, width),
+        x_in_camera=depth[..., None] * rays,
         confidence=output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
         recon_from_camera=inverse(camera_from_recon),
         is_metric=False,
     )
-
-
-def rays_of_edges(matrices: Float[ndarray, "n 3 3"], height: int, width: int) -> Float[ndarray, "n h w 3"]:
-    """Return the rays with z = 1 through the centres of all pixels, by each image's intrinsics (`matrices`).
-
-    In these intrinsics, pixel coordinates are 0 at the image's corner, and 0.5 at the first pixel's centre.
-    """
-    pixel = np.stack(
-        [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1
-    )
-    return np.einsum("nij,hwj->nhwi", np.linalg.inv(matrices), pixel).astype(np.float32)
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:

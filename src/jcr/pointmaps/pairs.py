@@ -1,4 +1,4 @@
-"""Pairwise pointmaps as a record and an npz file, the input of global alignment."""
+"""Pairwise pointmaps as a record and an npz file, the input of global alignment; lists of image pairs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -98,7 +98,13 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
     edges = arrays["edges"]
     count, height, width = arrays["pts3d"].shape[:3]
     images = tuple(str(name) for name in arrays.get("images", ()))
-    image_count = _check_edges(edges, len(images), source)
+    if len(edges) == 0:
+        raise InputError(f"{source}: no pair in it; predict at least one")
+    if edges.dtype.kind not in "iu":
+        raise InputError(f"{source}: edges must be integers, they are {edges.dtype}")
+    image_count = len(images) or int(edges.max()) + 1
+    if edges.min() < 0 or edges.max() >= image_count or (edges[:, 0] == edges[:, 1]).any():
+        raise InputError(f"{source}: edges must join two of the {image_count} images, counted from 0")
     intrinsics, grid = camera_of_arrays(arrays, (width, height), source)
     colors = arrays.get("colors")
     if colors is not None and (colors.shape != (image_count, height, width, 3) or colors.dtype != np.uint8):
@@ -112,21 +118,6 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
         grid=grid,
         is_metric=bool(arrays.get("is_metric", False)),
     )
-
-
-def _check_edges(edges: ndarray, names: int, source: str) -> int:
-    """Return the number of images: `names`, or the largest index in `edges` plus 1 if there are no names.
-
-    Raises InputError for wrong edges.
-    """
-    if len(edges) == 0:
-        raise InputError(f"{source}: no pair in it; predict at least one")
-    if edges.dtype.kind not in "iu":
-        raise InputError(f"{source}: edges must be integers, they are {edges.dtype}")
-    images = names or int(edges.max()) + 1
-    if edges.min() < 0 or edges.max() >= images or (edges[:, 0] == edges[:, 1]).any():
-        raise InputError(f"{source}: edges must join two of the {images} images, counted from 0")
-    return images
 
 
 def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: str) -> None:
@@ -174,3 +165,14 @@ def camera_of_arrays(
             )
         grid = ImageGrid(*((int(x), int(y)) for x, y in arrays["grid"]))
     return intrinsics, grid
+
+
+def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
+    """Return all ordered pairs of `count` images: first (i, j) with i > j, then each reversed, as DUSt3R has them."""
+    return window_pairs(count, count)
+
+
+def window_pairs(count: int, size: int) -> Int[ndarray, "e 2"]:
+    """Return the pairs of images at most `size` apart in the capture's order: (i, j) with i > j, then each reversed."""
+    edges = np.argwhere(np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool))
+    return np.concatenate([edges, edges[:, ::-1]])

@@ -40,7 +40,7 @@ class PosedPointmaps:
     warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
-        """Return the pointmaps with each point moved at its z to the ray of its pixel; `pinhole` is the grid's."""
+        """Return the pointmaps with each point moved, at constant z, to its pixel's ray by the grid's `pinhole`."""
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 

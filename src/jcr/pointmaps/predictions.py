@@ -112,14 +112,23 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
 def _images(
     capture: Capture, rows: Int[ndarray, " m"], arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> PreparedImages:
-    """Return the images on the file's grid, in ascending order of `rows`, their rows in the capture.
+    """Return the capture's images on the pixel grid of a file with `arrays`, in ascending order of their `rows`.
 
     Intrinsics in the file are those of undistorted images, as in predictions made by this package. Without them, the
     pixels are taken to be those of the capture's images, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
-    grid = grid or _plain_grid(capture.image_size, size, source)
+    original = capture.image_size
+    grids = [grid] if grid else [image_grid(original), image_grid(original, 224)]
+    if abs(size[0] * original[1] - size[1] * original[0]) <= max(original):
+        grids.append(ImageGrid.uncropped(original, size))
+    grid = next((one for one in grids if one.size == size), None)
+    if grid is None:
+        raise InputError(
+            f"{source}: pointmaps of {size[0]}x{size[1]} are no plain resize of {original[0]}x{original[1]} images; "
+            "give their crop as array 'grid'"
+        )
     if seen is not None:
         pinhole = grid.original_intrinsics(seen)
         intrinsics = intrinsics or pinhole
@@ -131,10 +140,10 @@ def _images(
         )
     else:
         pinhole = intrinsics
-    if grid.original_size != capture.image_size and (intrinsics is None or not is_distorted(intrinsics)):
+    if grid.original_size != original and (intrinsics is None or not is_distorted(intrinsics)):
         raise InputError(
             f"{source}: made from images of {'x'.join(map(str, grid.original_size))}, the capture's are "
-            f"{'x'.join(map(str, capture.image_size))}; predict from this capture's images"
+            f"{'x'.join(map(str, original))}; predict from this capture's images"
         )
     ordered = np.sort(rows)
     if "colors" in arrays:
@@ -147,20 +156,4 @@ def _images(
         colors = read_colors(part, grid, intrinsics, pinhole)
     return PreparedImages(
         colors=colors, grid=grid, intrinsics_of_capture=intrinsics, pinhole=pinhole, warnings=warnings
-    )
-
-
-def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
-    """Return DUSt3R's resize and crop if it gives `size`, else a plain resize of `original` to `size`.
-
-    Sizes are (width, height). Raises InputError where the aspect ratios do not agree.
-    """
-    for published in (image_grid(original), image_grid(original, 224)):
-        if published.size == size:
-            return published
-    if abs(size[0] * original[1] - size[1] * original[0]) <= max(original):
-        return ImageGrid.uncropped(original, size)
-    raise InputError(
-        f"{source}: pointmaps of {size[0]}x{size[1]} are no plain resize of {original[0]}x{original[1]} "
-        "images; give their crop as array 'grid'"
     )

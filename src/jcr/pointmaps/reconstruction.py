@@ -3,19 +3,21 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import without_distortion
 from jcr.errors import InputError
-from jcr.geometry import apply
+from jcr.extras import xfeat_is_installed
+from jcr.features.matchers import FeatureName
+from jcr.geometry import apply, inverse
 from jcr.pointmaps.global_alignment.align import PIXELS, global_align
 from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.posed import FOCAL_STD, PosedPointmaps, fit_pinhole, published_covariance
-from jcr.pointmaps.refine import refine
 from jcr.progress import Progress, silent
-from jcr.records import CameraEvidence, Capture, Pointmaps, Reconstruction, Tracks
+from jcr.records import CameraEvidence, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.sfm.colmap import reconstruct_near_cameras
 
 NO_TRACKS = Tracks(
     image=np.zeros(0, int), x_px=np.zeros((0, 2)), point=np.zeros(0, int), points_in_recon=np.zeros((0, 3))
@@ -25,6 +27,11 @@ UNCONFIRMED = (
     f"the focal length is that of the network and known to {100 * FOCAL_STD:.0f} % only, for too few matches between "
     "the images confirm it; give the intrinsics"
 )
+LEAST_MATCHES = 70
+"""Least number of observations in every image for a refinement. The calibration adjusts the tracks of three images from
+200 observations on."""
+BEND_STD = 0.03
+"""Prior standard deviation of the coefficients, except the constant, of the log of a depth correction."""
 
 
 def align_pairs(
@@ -105,3 +112,81 @@ def reconstruct_pointmaps(
         evidence=evidence,
         predicted_focal=None if refined or predicted is None else (predicted.fx, FOCAL_STD),
     )
+
+
+def refine(
+    capture: Capture,
+    images: PreparedImages,
+    maps: PosedPointmaps,
+    pinhole: Intrinsics,
+    report: Progress = silent,
+) -> tuple[Reconstruction, PosedPointmaps] | None:
+    """Adjust the predicted cameras to matches of SIFT, or else of learned features, and the depth maps to the points.
+
+    Returns the reconstruction from the matches and the adjusted pointmaps, both in the unit of the prediction; None
+    where an image has too few matches. `pinhole` belongs to the undistorted images and is the initial estimate of
+    unknown intrinsics.
+    """
+    given = images.intrinsics_of_capture
+    kinds: tuple[FeatureName, ...] = ("sift", "xfeat") if xfeat_is_installed() else ("sift",)
+    for kind in kinds:
+        made = reconstruct_near_cameras(
+            capture, maps.recon_from_camera, given or pinhole, given is not None, kind, report
+        )
+        if made is None or np.bincount(made.tracks.image).min() < LEAST_MATCHES:
+            continue
+        change, unit = _depth_changes(made, maps, images.grid_px(made.tracks.x_px))
+        poses, tracks = made.recon_from_camera.copy(), made.tracks
+        poses[:, :3, 3] *= unit
+        tracks = replace(tracks, points_in_recon=unit * tracks.points_in_recon)
+        v, u = np.mgrid[: maps.grid.size[1], : maps.grid.size[0]]
+        factor = np.exp(np.einsum("hwc,nc->nhw", _basis(np.stack([u, v], -1), maps.grid.size), change))
+        maps = replace(
+            maps, recon_from_camera=poses, x_in_camera=maps.x_in_camera * factor[..., None].astype(np.float32)
+        )
+        return replace(made, recon_from_camera=poses, tracks=tracks), maps
+    return None
+
+
+def _basis(x_px: Float[ndarray, "*k 2"], size: tuple[int, int]) -> Float[ndarray, "*k 6"]:
+    """Return 1, x, y, x², xy, y² of pixels, with x and y scaled to -1 … 1 over an image of `size` (width, height)."""
+    scaled = 2 * x_px / (np.array(size) - 1) - 1
+    x, y = scaled[..., 0], scaled[..., 1]
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def _depth_changes(
+    made: Reconstruction, maps: PosedPointmaps, x_px: Float[ndarray, "k 2"]
+) -> tuple[Float[ndarray, "n 6"], float]:
+    """Fit a smooth correction of each image's depth map to the points; return its coefficients (n,6) and a unit.
+
+    The log of the correction factor is quadratic in the image, with coefficients in the order of `_basis`. The unit is
+    that of the reconstruction `made`, in units of the prediction. `x_px` are the pixels of the tracks on the pointmaps'
+    grid. The fit is robust, with a prior on all coefficients but the constant, so that five points in a corner do not
+    change the depth elsewhere.
+    """
+    tracks, size = made.tracks, maps.grid.size
+    camera_from_recon = inverse(made.recon_from_camera)[tracks.image]
+    z = np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], tracks.points_in_recon[tracks.point])
+    z += camera_from_recon[:, 2, 3]
+    column, row = np.clip(np.rint(x_px), 0, np.array(size) - 1).astype(int).T
+    own = maps.x_in_camera[tracks.image, row, column, 2]
+    usable = (maps.confidence[tracks.image, row, column] > 0) & (own > 0) & (z > 0)
+    usable &= ((x_px > -0.5) & (x_px < np.array(size) - 0.5)).all(1)
+    target = np.log(np.where(usable, z, 1.0) / np.where(usable, own, 1.0))
+    shift = float(np.median(target[usable])) if usable.any() else 0.0
+    found = np.zeros((len(maps.recon_from_camera), 6))
+    for view, coefficients in enumerate(found):
+        mine = usable & (tracks.image == view)
+        if not mine.any():
+            continue
+        design, wanted = _basis(x_px[mine], size), target[mine] - shift
+        coefficients[0] = np.median(wanted)
+        for _ in range(10):
+            off = wanted - design @ coefficients
+            sigma = 1.4826 * np.median(np.abs(off)) + 1e-4
+            weight = 1 / (1 + (off / (2 * sigma)) ** 2) / sigma**2
+            normal = design.T @ (weight[:, None] * design) + 1e-9 * np.eye(6)
+            normal[1:, 1:] += np.eye(5) / BEND_STD**2
+            coefficients[:] = np.linalg.solve(normal, design.T @ (weight * wanted))
+    return found, float(np.exp(-shift))

@@ -34,7 +34,7 @@ from jcr.errors import RejectedError
 from jcr.extras import extra
 from jcr.features.matchers import FeatureName, Geometries, Matcher
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
-from jcr.features.stage import Matched, match_with_robot
+from jcr.features.stage import MatchedPairs, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.missing_images import model_near_cameras, nearer_to_robot, with_missing_images
@@ -142,13 +142,8 @@ def matched_database(
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         (camera,) = working_cameras([intrinsics], known)
         matcher = matcher_of(images, camera, known, features, seed, report)
-        matched = match_with_robot(
-            matcher,
-            capture.base_from_gripper,
-            resized(intrinsics, camera.width, camera.height),
-            capture.images,
-            lambda fraction: report("matching", fraction),
-        )
+        working = resized(intrinsics, camera.width, camera.height)
+        matched = match_with_robot(matcher, capture.base_from_gripper, working, capture.images, report)
         yield write_database(Path(folder), camera, matcher.x_px, matched.geometries), camera
 
 
@@ -161,12 +156,24 @@ def _adjusted(
 ) -> Reconstruction:
     """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
-    All cameras and points are adjusted before and after. `like` are the intrinsics at the images' size, held if
-    `known`.
+    All cameras and points are adjusted before and after. Random points beyond _MOST_OBSERVATIONS are deleted first.
+    `like` are the intrinsics at the images' size, held if `known`.
     """
-    _thin(model, seed)
+    if model.compute_num_observations() > _MOST_OBSERVATIONS:
+        order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
+        count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
+        for point in order[count > _MOST_OBSERVATIONS]:
+            model.delete_point3D(int(point))
     adjust_robustly(model, known, _ROUGHLY)
-    std_px = _align_observations(model, images, intrinsics_of(model.camera(1), like, known))
+    camera, rows, intrinsics = model.camera(1), rows_of(model), intrinsics_of(model.camera(1), like, known)
+    size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
+    greys = np.stack([grey_of(images[row], size) for row in rows])
+    tracks = tracks_of(model, image_ids, size)
+    from jcr.sfm.track_refinement import align_tracks  # its loops take a second to load
+
+    aligned = align_tracks(greys, tracks, poses_of(model, rows), resized(intrinsics, *size))
+    for (row, index, _), x_px in zip(observations(model, image_ids), aligned.x_px, strict=True):
+        model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
     adjust_robustly(model, known)
     intrinsics, notes = intrinsics_of(model.camera(1), like, known), ()
     if not known and fold_distance_px(intrinsics) is not None:
@@ -174,7 +181,8 @@ def _adjusted(
         model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
         adjust_robustly(model, fix_intrinsics=True)
         intrinsics = intrinsics_of(model.camera(1), intrinsics, known)
-    made = reconstruction_of(model, rows_of(model), intrinsics)
+    made = reconstruction_of(model, rows, intrinsics)
+    std_px = None if aligned.std_px is None else like.width / size[0] * aligned.std_px
     return replace(made, tracks=replace(made.tracks, std_px=std_px), notes=notes)
 
 
@@ -205,7 +213,7 @@ def map_images(
     names: Sequence[str],
     report: Progress,
     begun: pycolmap.Reconstruction | None = None,
-) -> tuple[Matched, pycolmap.Reconstruction | None]:
+) -> tuple[MatchedPairs, pycolmap.Reconstruction | None]:
     """Match the images and map the verified pairs by COLMAP's mapper; return the matches and the model.
 
     The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size. The mapper
@@ -213,22 +221,14 @@ def map_images(
     `begun` is continued with the images that it lacks. Images that the mapper leaves out are added near cameras
     predicted from the gripper poses.
     """
-    report("matching", 0.0)
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
-    found = match_with_robot(
-        matcher,
-        base_from_gripper,
-        working,
-        names,
-        lambda fraction: report("matching", fraction),
-    )
+    found = match_with_robot(matcher, base_from_gripper, working, names, report)
     matched = replace(found, geometries=_thinned(found.geometries, len(names), matcher.seed))
     if matched.intrinsics != working:
         cameras = [colmap_camera(matched.intrinsics, matcher.known), *cameras]
     model, matching = begun, len({row for key in matched.geometries for row in key})
     with tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = write_database(Path(folder), cameras[0], matcher.x_px, matched.geometries)
-        report("matching", 1.0)
         if model is None or model.num_reg_images() < matching:
             some = cameras if model is None else [model.camera(1)]
             model = _map_incrementally(database, some, matcher, report, model)
@@ -301,10 +301,21 @@ def _map_incrementally(
     COLMAP's thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with
     the images that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
     """
-    n_images, pipeline = len(matcher.x_px), _pipeline_options(matcher.known, matcher.seed)
+    n_images, folder, pipeline = len(matcher.x_px), database.parent, pycolmap.IncrementalPipelineOptions()
+    mapper = pipeline.mapper
+    pipeline.min_model_size = 2
+    pipeline.extract_colors = False
+    # A first pair may distort unknown intrinsics so that no third image fits; other pairs are then tried.
+    pipeline.multiple_models, pipeline.max_num_models = not matcher.known, 3
+    # With one thread a seed fixes the result; the order of sums over threads changes the last bits.
+    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = matcher.seed
+    pipeline.num_threads = mapper.num_threads = 1
+    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
+    refine = not matcher.known
+    pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
     if n_images > _MANY:
         pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
-    mapper, folder = pipeline.mapper, database.parent
     best, registered, done = None, 0, 0
     if begun is not None:
         (folder / "begun").mkdir(exist_ok=True)
@@ -342,58 +353,8 @@ def _map_incrementally(
     return best
 
 
-def _pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Return the options of COLMAP's incremental mapping, by which a seed always gives the same result.
-
-    The intrinsics are held if `known`.
-    """
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    mapper = pipeline.mapper
-    pipeline.min_model_size = 2
-    pipeline.extract_colors = False
-    # A first pair may distort unknown intrinsics so that no third image fits; other pairs are then tried.
-    pipeline.multiple_models, pipeline.max_num_models = not known, 3
-    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
-    pipeline.num_threads = mapper.num_threads = 1  # the order of sums over threads changes the last bits
-    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
-    if known:
-        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
-        mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
-    return pipeline
-
-
-def _thin(model: pycolmap.Reconstruction, seed: int) -> None:
-    """Delete randomly chosen points until the model has at most _MOST_OBSERVATIONS observations."""
-    if model.compute_num_observations() <= _MOST_OBSERVATIONS:
-        return
-    order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
-    count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
-    for point in order[count > _MOST_OBSERVATIONS]:
-        model.delete_point3D(int(point))
-
-
-def _align_observations(
-    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
-) -> Float[ndarray, " k"] | None:
-    """Refine the model's observations by least-squares matching, in images of the size of COLMAP's camera.
-
-    Returns the standard deviation of each observation, in pixels of the original images and in the order of
-    `tracks_of`.
-    """
-    camera, rows = model.camera(1), rows_of(model)
-    size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
-    greys = np.stack([grey_of(images[row], size) for row in rows])
-    tracks, poses = tracks_of(model, image_ids, size), poses_of(model, rows)
-    from jcr.sfm.track_refinement import align_tracks  # its loops take a second to load
-
-    aligned = align_tracks(greys, tracks, poses, resized(intrinsics, *size))
-    for (row, index, _), x_px in zip(observations(model, image_ids), aligned.x_px, strict=True):
-        model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
-    return None if aligned.std_px is None else intrinsics.width / camera.width * aligned.std_px
-
-
 def _not_registered(
-    matcher: Matcher, matched: Matched, model: pycolmap.Reconstruction | None
+    matcher: Matcher, matched: MatchedPairs, model: pycolmap.Reconstruction | None
 ) -> RejectedError:
     """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy."""
     x_px, pairs = matcher.x_px, len(matched.geometries)

@@ -1,6 +1,5 @@
 """The back end `given`: camera poses of a COLMAP model, with its own points or with triangulated features."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from jcr.capture.formats import colmap
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
-from jcr.records import Capture, Reconstruction, Tracks
+from jcr.records import Capture, Reconstruction
 from jcr.sfm.colmap import matched_database
 from jcr.sfm.model import tracks_of, triangulated_model
 
@@ -26,16 +25,24 @@ def reconstruct_given(
     """
     report = progress or silent
     names, recon_from_camera = colmap.read_registered_cameras(cameras)
-    row_of = _rows(names)
-    known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
+    # An image's name with folders matches the end of its path; otherwise the file name alone must match.
+    by_path = {Path(name).parts: row for row, name in enumerate(names)}
+    by_file = {Path(name).name: row for row, name in enumerate(names)}
+    known, rows = list[int](), list[int]()
+    for k, parts in enumerate(Path(image).parts for image in capture.images):
+        ends = (by_path[parts[j:]] for j in range(len(parts)) if parts[j:] in by_path)
+        if (row := next(ends, by_file.get(parts[-1]))) is not None:
+            known.append(k)
+            rows.append(row)
     if len(known) < 3:
         raise InputError(
             f"{cameras}: knows {len(known)} of the capture's images by name; at least 3 are needed"
         )
-    rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
     intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
-    tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
+    model = colmap.read_model(cameras)
+    id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
+    tracks = tracks_of(model, [id_of[names[row]] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         some = capture.of_rows(np.array(known))
         images = [read_image(some.folder / name) for name in some.images]
@@ -57,29 +64,3 @@ def reconstruct_given(
         backend="given",
         notes=notes,
     )
-
-
-def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
-    """Return a function from an image's path to the row of its name in `names`, or None.
-
-    A name with folders matches the end of the path; otherwise the file name alone must match.
-    """
-    by_path = {Path(name).parts: row for row, name in enumerate(names)}
-    by_name = {Path(name).name: row for row, name in enumerate(names)}
-
-    def row_of(image: str) -> int | None:
-        parts = Path(image).parts
-        exact = (by_path[parts[k:]] for k in range(len(parts)) if parts[k:] in by_path)
-        return next(exact, by_name.get(parts[-1]))
-
-    return row_of
-
-
-def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
-    """Return the tracks of the COLMAP model at path `cameras` in the images `names`, in pixels of images of `size`.
-
-    The size is (width, height).
-    """
-    model = colmap.read_model(cameras)
-    id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
-    return tracks_of(model, [id_of[name] for name in names], size)

@@ -59,7 +59,7 @@ class LiveMap:
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
             self._features.remove(row)
-            self._matcher.image_removed(row)
+            self._matcher.remove_image(row)
             self._names.remove(name)
             self._model = None  # The model names images by their rows, which have changed.
         for name in capture.images:

@@ -54,22 +54,6 @@ class KnownImages:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharedPoints:
-    """Features of a new image that match images of known poses, with points triangulated from at least two of these."""
-
-    known: KnownImages
-    x_px: Float[ndarray, "n 2"]
-    """Keypoints of the new image, one per point, px."""
-    points: Float[ndarray, "n 3"]
-    spread: Float[ndarray, "n 3 3"]
-    """Covariance of the points in the recon frame per rad² of variance of the rays."""
-    point: Int[ndarray, " c"]
-    """Row in `points` of the point of each observation in the known images."""
-    row: Int[ndarray, " c"]
-    row_x_px: Float[ndarray, "c 2"]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Registration:
     """Result of the registration of a new image: its pose, and the points that it shares with images of known poses."""
 
@@ -94,8 +78,8 @@ def register(
     """
     camera = reconstruction.intrinsics
     known = KnownImages.of(older, camera, reconstruction.recon_from_camera)
-    found = [registration(shared_points(known, features(image, camera)), camera) for image in new]
-    return [one.pose if isinstance(one, Registration) else one for one in found]
+    found = [registrations(known, image, camera)[0] for image in new]
+    return [one.pose if one else count for one, count in found]
 
 
 def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFeatures:
@@ -109,67 +93,61 @@ def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFea
     )
 
 
-def shared_points(known: KnownImages, new: ImageFeatures) -> SharedPoints:
-    """Match the features of a new image with those of known images; triangulate the matches from the known images."""
+def registrations(
+    known: KnownImages,
+    image: UInt8[ndarray, "h w 3"],
+    camera: Intrinsics,
+    focals: Sequence[Literal["given", "free"]] = ("given",),
+    gate_px: float = GATE_PX,
+) -> list[tuple[Registration | None, int]]:
+    """Return for each of `focals` a new image's registration, None if too few points agree, and their number.
+
+    Matches of the image with the known images are triangulated from the known images; the pose is the one on which most
+    points agree. The focal length of the new image's intrinsics (`camera`) is held (`given`) or estimated (`free`).
+    `gate_px` is the largest reprojection error of an inlier, and MIN_POINTS the least number of inliers.
+    """
+    new = features(image, camera)
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
     feature = np.concatenate([mine for mine, _ in of_row])
     row = np.repeat(np.arange(len(of_row)), [len(mine) for mine, _ in of_row])
     theirs = list(zip(known.features, (rows for _, rows in of_row), strict=True))
-    rays = np.concatenate([one.rays[rows] for one, rows in theirs])
-    gate = GATE_PX / known.camera.fx
+    rays, row_x_px = (
+        np.concatenate([getattr(one, of)[rows] for one, rows in theirs]) for of in ("rays", "x_px")
+    )
     points, spread, good = triangulated_features(
-        feature, row, rays, known.recon_from_camera, gate, len(new.rays)
+        feature, row, rays, known.recon_from_camera, GATE_PX / known.camera.fx, len(new.rays)
     )
     seen = good[feature]
-    return SharedPoints(
-        known=known,
-        x_px=new.x_px[good],
-        points=points[good],
-        spread=spread[good],
-        point=(np.cumsum(good) - 1)[feature[seen]],
-        row=row[seen],
-        row_x_px=np.concatenate([one.x_px[rows] for one, rows in theirs])[seen],
-    )
-
-
-def registration(
-    shared: SharedPoints,
-    camera: Intrinsics,
-    focal: Literal["given", "free"] = "given",
-    gate_px: float = GATE_PX,
-) -> Registration | int:
-    """Return the pose on which the shared points agree, or the number of points that agree if below MIN_POINTS.
-
-    `camera` are the new image's intrinsics; their focal length is held (`given`) or estimated (`free`). `gate_px` is
-    the largest reprojection error of an inlier.
-    """
-    known, std_px, pose = shared.known, 1.0, None
-    if len(shared.points) < MIN_POINTS:
-        return len(shared.points)
-    for _ in range(2):  # the noise estimated in the new image is used for the known images
-        covariance = (std_px / known.camera.fx) ** 2 * shared.spread
-        pose = absolute_pose(shared.x_px, shared.points, camera, covariance, gate_px, focal)
-        if pose is None or pose.inlier.sum() < MIN_POINTS:
-            return 0 if pose is None else int(pose.inlier.sum())
-        std_px = pose.std_px
-    assert pose is not None
+    point, row, row_x_px = (np.cumsum(good) - 1)[feature[seen]], row[seen], row_x_px[seen]
+    points, spread, x_px = points[good], spread[good], new.x_px[good]
     # Observations in known images are kept if they are near the projections of their points.
-    rotation, centre = (
-        part[shared.row] for part in (known.recon_from_camera[:, :3, :3], known.recon_from_camera[:, :3, 3])
-    )
-    in_camera = np.einsum("cji,cj->ci", rotation, shared.points[shared.point] - centre)
-    ahead = in_camera[:, 2] > 1e-6
-    projected = project(known.camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
-    miss_px = np.linalg.norm(projected - shared.row_x_px, axis=1)
-    kept = ahead & (miss_px < GATE_PX) & pose.inlier[shared.point]
-    return Registration(
-        pose=pose,
-        points_in_recon=shared.points[pose.inlier],
-        x_px=shared.x_px[pose.inlier],
-        row=shared.row[kept],
-        row_x_px=shared.row_x_px[kept],
-        row_point=(np.cumsum(pose.inlier) - 1)[shared.point[kept]],
-    )
+    rotation, centre = known.recon_from_camera[row, :3, :3], known.recon_from_camera[row, :3, 3]
+    in_camera = np.einsum("cji,cj->ci", rotation, points[point] - centre)
+    near = in_camera[:, 2] > 1e-6
+    projected = project(known.camera, np.where(near[:, None], in_camera, [0.0, 0.0, 1.0]))
+    near &= np.linalg.norm(projected - row_x_px, axis=1) < GATE_PX
+    found = list[tuple[Registration | None, int]]()
+    for focal in focals:
+        std_px, pose, count = 1.0, None, len(points)
+        for _ in range(2):  # the noise estimated in the new image is used for the known images
+            if count < MIN_POINTS:
+                break
+            covariance = (std_px / known.camera.fx) ** 2 * spread
+            pose = absolute_pose(x_px, points, camera, covariance, gate_px, focal)
+            std_px, count = (0.0, 0) if pose is None else (pose.std_px, int(pose.inlier.sum()))
+        if pose is None or count < MIN_POINTS:
+            found.append((None, count))
+            continue
+        kept = near & pose.inlier[point]
+        inliers = {
+            "points_in_recon": points[pose.inlier],
+            "x_px": x_px[pose.inlier],
+            "row": row[kept],
+            "row_x_px": row_x_px[kept],
+            "row_point": (np.cumsum(pose.inlier) - 1)[point[kept]],
+        }
+        found.append((Registration(pose=pose, **inliers), count))
+    return found
 
 
 def triangulated_features(

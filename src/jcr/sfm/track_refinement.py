@@ -63,14 +63,20 @@ def align_tracks(
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
     begins = np.flatnonzero(np.diff(point, prepend=-1))
     ends = np.append(begins, len(point))
-    facing = _facing(tracks, recon_from_camera)[point]
-    scale = _scales(image, tracks.points_in_recon[point], facing, recon_from_camera, intrinsics)
+    # The normal of a point's assumed plane is the sum of the unit vectors from the point to its cameras. Planes through
+    # neighbouring points gave the same result, because the affine part of a warp is free.
+    x_in_recon = tracks.points_in_recon[point]
+    toward = recon_from_camera[image, :3, 3] - x_in_recon
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    facing = np.stack([np.bincount(point, along) for along in toward.T], axis=1)[point]
+    # An area on this plane appears in an image with a factor det [J; nᵀ], times the same constant in all images.
+    camera_from_recon = inverse(recon_from_camera)[image]
+    by_recon = by_point(intrinsics, _x_in_b(camera_from_recon, x_in_recon)) @ camera_from_recon[:, :3, :3]
+    scale = np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
     rank = np.lexsort((scale, point))
     reference = rank[(ends[:-1] + ends[1:]) // 2]
     of_reference = np.repeat(reference, np.diff(ends))
-    warp, bend = _warps(
-        x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, intrinsics
-    )
+    warp, bend = _warps(x_px, image, x_in_recon, facing, of_reference, recon_from_camera, intrinsics)
 
     def align(level: UInt8[ndarray, "m h2 w2"], job: tuple[Any, ...], first: int) -> None:
         """Align the tracks from number `first` on; each thread writes only to observations of its own tracks."""
@@ -101,36 +107,6 @@ def align_tracks(
     refined, std_px = np.empty_like(found), np.empty(len(found))
     refined[order], std_px[order] = found, np.sqrt(variance)
     return replace(tracks, x_px=refined, std_px=std_px)
-
-
-def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
-    """Return the normal of each point's assumed plane: the sum of the unit vectors from the point to its cameras.
-
-    Planes through neighbouring points gave the same result, because the affine part of a warp is free.
-    """
-    toward = recon_from_camera[tracks.image, :3, 3] - tracks.points_in_recon[tracks.point]
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    return np.stack(
-        [np.bincount(tracks.point, along, len(tracks.points_in_recon)) for along in toward.T], axis=1
-    )
-
-
-def _scales(
-    image: Int[ndarray, " k"],
-    x_in_recon: Float[ndarray, "k 3"],
-    facing: Float[ndarray, "k 3"],
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    intrinsics: Intrinsics,
-) -> Float[ndarray, " k"]:
-    """Return for each observation the image area (px²) of a unit area on the plane of its point, times a factor.
-
-    The factor, the length of the plane's normal `facing`, is the same for all observations of a point.
-    """
-    camera_from_recon = inverse(recon_from_camera)[image]
-    x_in_camera = _x_in_b(camera_from_recon, x_in_recon)
-    by_recon = by_point(intrinsics, x_in_camera) @ camera_from_recon[:, :3, :3]
-    # The area's factor along a normal n is det [J; nᵀ], and n is as long for all observations of a point.
-    return np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
 
 
 def _warps(
@@ -236,7 +212,9 @@ def _window(radius):
 def _patch(grey, x_px, affine, bend, offsets, patch):
     """Write to `patch` the grey at each of the `offsets`, warped about x_px; return whether the image contains all.
 
-    The warp is that of `_warps`, with `affine` (2,2) and `bend` (2,3).
+    The warp is that of `_warps`, with `affine` (2,2) and `bend` (2,3). The grey is that of a cubic B-spline whose
+    coefficients are the pixels, which blurs by 0.58 px. Without this blur, interpolation would smooth differently on
+    pixels and between them, which biases positions.
     """
     for k in range(len(offsets)):
         u = offsets[k, 0]
@@ -247,29 +225,19 @@ def _patch(grey, x_px, affine, bend, offsets, patch):
         y += bend[1, 0] * u * u + bend[1, 1] * u * v + bend[1, 2] * v * v
         if not (x >= 1 and y >= 1 and x < grey.shape[1] - 2 and y < grey.shape[0] - 2):
             return False
-        patch[k] = _smooth(grey, x, y)
+        column = int(x)
+        row = int(y)
+        f = x - column
+        g = y - row
+        across = ((1 - f) ** 3 / 6, 2 / 3 - f * f * (1 - f / 2), 2 / 3 - (1 - f) ** 2 * (1 + f) / 2, f**3 / 6)
+        down = ((1 - g) ** 3 / 6, 2 / 3 - g * g * (1 - g / 2), 2 / 3 - (1 - g) ** 2 * (1 + g) / 2, g**3 / 6)
+        value = 0.0
+        for i in range(4):
+            line = grey[row + i - 1]
+            for j in range(4):
+                value += down[i] * across[j] * line[column + j - 1]
+        patch[k] = value
     return True
-
-
-@compiled
-@no_type_check
-def _smooth(grey, x, y):
-    """Return the grey at x, y of a cubic B-spline whose coefficients are the pixels, which blurs by 0.58 px.
-
-    Without this blur, interpolation would smooth differently on pixels and between them, which biases positions.
-    """
-    column = int(x)
-    row = int(y)
-    f = x - column
-    g = y - row
-    across = ((1 - f) ** 3 / 6, 2 / 3 - f * f * (1 - f / 2), 2 / 3 - (1 - f) ** 2 * (1 + f) / 2, f**3 / 6)
-    down = ((1 - g) ** 3 / 6, 2 / 3 - g * g * (1 - g / 2), 2 / 3 - (1 - g) ** 2 * (1 + g) / 2, g**3 / 6)
-    value = 0.0
-    for i in range(4):
-        line = grey[row + i - 1]
-        for j in range(4):
-            value += down[i] * across[j] * line[column + j - 1]
-    return value
 
 
 @compiled

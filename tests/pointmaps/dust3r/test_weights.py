@@ -11,9 +11,8 @@ import pytest
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.hub import Weights
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs, pairs_to_predict
 from jcr.pointmaps.grid import PreparedImages, image_grid
-from jcr.pointmaps.pairs import PairPredictions, read_pairs
+from jcr.pointmaps.pairs import PairPredictions, complete_pairs, read_pairs
 from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
 from jcr.records import Intrinsics
 from simulation.pairs import write_pairs
@@ -75,7 +74,7 @@ def write_folder(
 
 def load(path: Path, device: str = "cpu") -> "Dust3r":
     """The network in a file or folder of unknown licence."""
-    from jcr.pointmaps.dust3r.weights import load_weights
+    from jcr.pointmaps.dust3r.dust3r import load_weights
 
     return load_weights(Weights(path, str(path), "unknown"), device)
 
@@ -176,7 +175,7 @@ def test_a_hub_id_comes_from_the_cache(
 ) -> None:
     import huggingface_hub.constants
 
-    from jcr.pointmaps.dust3r.weights import load_weights
+    from jcr.pointmaps.dust3r.dust3r import load_weights
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
     row = BACKENDS["dust3r"]
@@ -318,6 +317,8 @@ def test_file_round_trip_and_faults(tmp_path: Path) -> None:
 
 
 def test_the_robot_graph_has_near_pairs_and_joins_far_groups() -> None:
+    from jcr.pointmaps.dust3r.dust3r import pairs_to_predict
+
     # Two groups of images, 2 m apart, that share no view.
     base_from_gripper = np.tile(np.eye(4), (24, 1, 1))
     base_from_gripper[:, 0, 3] = 0.05 * np.arange(24) + 2.0 * (np.arange(24) >= 12)

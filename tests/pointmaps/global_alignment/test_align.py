@@ -11,8 +11,8 @@ from benchmarks import adam
 from jcr.camera import rays
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import Similarity, fit_similarity, rotation_between_deg
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
+from jcr.pointmaps.pairs import complete_pairs, window_pairs
 from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
 
 SMALL = (48, 36)

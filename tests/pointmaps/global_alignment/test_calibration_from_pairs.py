@@ -15,9 +15,8 @@ from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
 from jcr.findings.finding import text
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.pointmaps.dust3r.pair_graph import complete_pairs
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pairs import PairPredictions, complete_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.records import Capture, Reconstruction
 from jcr.records.npz import read_reconstruction, write_reconstruction

@@ -1,27 +1,36 @@
-"""The DUSt3R and MASt3R back ends: prediction of pairwise pointmaps, global alignment, refinement by matches."""
+"""The DUSt3R and MASt3R back ends: published weights, pairwise pointmaps, global alignment, refinement by matches."""
 
+import json
+import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
+from torch import Tensor
 
 from jcr.allocator import give_back
 from jcr.errors import InputError, RejectedError
-from jcr.hub import Weights
+from jcr.estimation.closed_form import motions
+from jcr.features.pairs import NEIGHBOURS, near_pairs
+from jcr.hub import HUB_FILES, Weights
 from jcr.pointmaps.dust3r.network import Dust3r, EncodedImages
-from jcr.pointmaps.dust3r.pair_graph import pairs_to_predict
-from jcr.pointmaps.dust3r.weights import load_weights
 from jcr.pointmaps.grid import PreparedImages, prepare_images
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pairs import PairPredictions, complete_pairs, window_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
 
 MAX_BATCH = {"cpu": 1, "cuda": 16}
 """Number of pairs in a batch, by device. A CPU gains nothing from more: one pair of 768 tokens keeps its cores busy."""
+FEW_IMAGES = 12
+"""Largest number of images for which every pair is predicted (132 ordered pairs)."""
+_ANNOUNCED = set[str]()
+"""Notes about source and licence of weights that this process has printed."""
 
 
 def reconstruct_dust3r(
@@ -48,6 +57,20 @@ def reconstruct_dust3r(
         return reconstruct_pointmaps(capture, images, maps, backend, progress)
     except RejectedError as error:  # a rejection also names the weights and their licence
         raise error.with_more(*notes) from None
+
+
+def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
+    """Return the pairs of images to predict, in both orders: all pairs of up to FEW_IMAGES images.
+
+    With more images, these are the pairs of near viewpoints, and of successive images, which connect separate groups of
+    viewpoints.
+    """
+    count = len(base_from_gripper)
+    if count <= FEW_IMAGES:
+        return complete_pairs(count)
+    near = np.reshape(near_pairs(motions(base_from_gripper), NEIGHBOURS), (-1, 2))[:, ::-1]
+    edges = np.unique(np.concatenate([near, window_pairs(count, 1)[: count - 1]]), axis=0)
+    return np.concatenate([edges, edges[:, ::-1]])
 
 
 def predict_pairs(
@@ -129,3 +152,66 @@ def _in_batches(
             raise InputError(
                 "out of memory with one pair of images; close other programs, or use --device cpu"
             )
+
+
+def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
+    """Load a network from a folder, or from a .safetensors file next to its config.json.
+
+    The licence is printed on stderr. Raises InputError for files that are missing, damaged or of another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    path = weights.path
+    tensors = path / HUB_FILES[1] if path.is_dir() else path
+    config_path = tensors.with_name(HUB_FILES[0])
+    if tensors.suffix != ".safetensors" or not (tensors.is_file() and config_path.is_file()):
+        raise InputError(
+            f"{path}: no such weights; give a folder of {' and '.join(HUB_FILES)}, or a hub id (jcr models)"
+        )
+    try:
+        config, state = dict(json.loads(config_path.read_text("utf-8"))), load_file(tensors)
+    except (SafetensorError, OSError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({_line(error)}); fetch it again") from None
+    # MASt3R is this network with a further head for matching, which is not used; its points are metric.
+    mast3r = [key for key in state if ".head_local_features." in key]
+    network = _build(config, {key: state[key] for key in state if key not in mast3r}, path)
+    network.is_metric = bool(mast3r)
+    try:
+        # Channels last: the heads' convolutions take 0.94 s instead of 1.32 s on two cores at 512x384.
+        network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
+    if weights.note not in _ANNOUNCED:
+        _ANNOUNCED.add(weights.note)
+        sys.stderr.write(f"{weights.note}\n")
+    return network
+
+
+def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
+    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit."""
+    mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
+    config = {key: value for key, value in config.items() if key not in mast3r_only}
+    config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")
+    config["output_mode"] = str(config.get("output_mode", "pts3d")).partition("+")[0]
+    try:
+        with torch.device("meta"):
+            network = Dust3r(**config)
+    except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
+        raise InputError(f"{path}: its configuration is not of this network ({_line(error)})") from None
+    # Checkpoints may hold a tensor with two names under one of them.
+    for key in network.state_dict():
+        twin = re.sub(r"\.layer_rn\.(\d)\.", lambda level: f".layer{int(level[1]) + 1}_rn.", key)
+        present = state.get(twin, state.get(key))
+        if present is not None and twin != key:
+            state |= {key: present, twin: present}
+    try:
+        network.load_state_dict({key: tensor.float() for key, tensor in state.items()}, assign=True)
+    except (RuntimeError, AttributeError) as error:
+        raise InputError(f"{path}: its tensors are not those of its configuration ({_line(error)})") from None
+    return network.eval().requires_grad_(False)
+
+
+def _line(error: BaseException) -> str:
+    """Return the first sentence of an error's message, on one line."""
+    return " ".join(str(error).split()).split(". ")[0][:160] or type(error).__name__

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jcr.camera import rays
 from jcr.errors import InputError
-from jcr.pointmaps.global_alignment.gauss_newton import ITERATIONS, AlignmentSolution, solve
+from jcr.pointmaps.global_alignment.gauss_newton import ROUNDS, AlignmentSolution, solve
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import fitted_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
@@ -79,13 +79,6 @@ def global_align(
     predictions = pairs if isinstance(pairs, PairPredictions) else read_pairs(Path(pairs))
     if pixels < LEAST_PIXELS:
         raise InputError(f"{pixels} pixels per image are too few; alignment needs {LEAST_PIXELS} or more")
-    _check_connected(predictions)
-    problem = AlignmentProblem.of(predictions)
-    return _dense_alignment(problem, solve(problem, pixels), progress or silent)
-
-
-def _check_connected(predictions: PairPredictions) -> None:
-    """Raise InputError if no chain of pairs connects some images to the first pair; the message names these images."""
     count, edges = predictions.image_count, predictions.edges
     if len(edges) == 0:
         raise InputError("the predictions have no pair; predict at least one")
@@ -96,6 +89,8 @@ def _check_connected(predictions: PairPredictions) -> None:
             f"no chain of pairs joins {names} to the other images; predict pairs between them, "
             "or leave these images out"
         )
+    problem = AlignmentProblem.of(predictions)
+    return _dense_alignment(problem, solve(problem, pixels), progress or silent)
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
@@ -129,7 +124,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
             f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",
         )
     if not solution.settled:
-        warnings += (f"the alignment had not settled after {ITERATIONS} iterations and may be wrong",)
+        warnings += (f"the alignment had not settled after {ROUNDS} rounds and may be wrong",)
     if middle > USELESS:
         warnings += (
             f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them",

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from jcr.errors import RejectedError
 from jcr.geometry import adjoint, inverse, retract, skew, twist_from_step
-from jcr.least_squares import one_blas_thread
+from jcr.least_squares import damped_gauss_newton, one_blas_thread
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, ImageObservations
 from jcr.pointmaps.global_alignment.residuals import (
@@ -24,8 +24,8 @@ from jcr.pointmaps.global_alignment.residuals import (
     ResidualSpread,
     depth_residuals,
     fitted_depth,
-    geman_mcclure_weights,
     measure_noise,
+    residual_weights,
 )
 
 COARSE_PIXELS = 300
@@ -33,7 +33,10 @@ COARSE_PIXELS = 300
 COARSE_TOLERANCE = 1e-3
 FINE_TOLERANCE = 1e-4
 """Largest last step (rad, or relative), a tenth of the noise of the predictions."""
-ITERATIONS = 30
+ROUNDS, STEPS = 30, 10
+"""Largest number of estimates of the weights, and of Gauss-Newton steps with the same weights."""
+ENOUGH = 0.1
+"""Relative change of the cost below which the weights are estimated again."""
 START_SPREAD = 0.01
 """Initial standard deviation of the pairs' errors, relative to the depth and in radians."""
 LEAST_SPREAD = 1e-5
@@ -41,8 +44,6 @@ GAUGE_WEIGHT = 1e3
 """Weight that fixes the sum of the log pair scales, as a multiple of the mean information on one of them."""
 NORMAL_SQUARE_MEDIAN = 0.455
 """Median of the square of a standard normal variable."""
-
-UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,57 +99,119 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
     return gauss_newton(images, state, coarse.pair_spread, FINE_TOLERANCE)
 
 
+Iterate = tuple[AlignmentState, list[Residuals]]
+"""State, and the residuals of each image at the state."""
+
+
 @one_blas_thread
 def gauss_newton(
     images: list[ImageObservations], state: AlignmentState, pair_spread: Float[ndarray, "6"], tolerance: float
 ) -> AlignmentSolution:
-    """Solve for cameras, focal length, pair scales and depths by Gauss-Newton until no step exceeds `tolerance`.
+    """Solve for cameras, focal length, pair scales and depths by iteratively reweighted least squares.
 
-    The tolerance is in rad for rotations and relative for the rest. Each iteration estimates the weights and
-    `pair_spread`, the standard deviations of the pairs' errors, again. It eliminates depths and pair errors, which
-    least_squares.py does not support. The first camera and the product of the pair scales are fixed. Raises
-    RejectedError where the pointmaps do not determine the unknowns.
+    Each round estimates the weights, and at its end `pair_spread`, the standard deviations of the pairs' errors. The
+    rounds end when a round changes no camera, focal length or pair scale by more than `tolerance` (rad, or relative).
+    The first camera and the product of the pair scales are fixed. Raises RejectedError where the pointmaps do not
+    determine the unknowns.
     """
-    focal = 6 * len(images)
-    for iteration in range(1, ITERATIONS + 1):
-        misfit = [
-            depth_residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
-        ]
-        noise = measure_noise(images, misfit)
-        try:
-            # The residuals of an image, most of the memory, are freed as soon as its equations exist.
-            equations = [
-                image_equations(o, misfit.pop(0), own, state, pair_spread)
-                for o, own in zip(images, noise, strict=True)
-            ]
-            hessian = np.sum([e.selection.T @ (e.selection.T @ e.hessian).T for e in equations], axis=0)
-            gradient = np.sum([e.selection.T @ e.gradient for e in equations], axis=0)
-            # A pair without weight keeps its scale.
-            scales = np.arange(focal + 1, len(gradient))
-            hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
-            hessian[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
-            normal, step = hessian[6:, 6:], np.zeros(len(gradient))
-            step[6:] = -np.linalg.solve(normal, gradient[6:])
-            if not np.isfinite(step).all():
-                raise np.linalg.LinAlgError
-        except np.linalg.LinAlgError:
-            raise RejectedError(UNDETERMINED) from None
-        state, variance = _after_step(images, state, equations, step)
-        pair_spread = _spread(state.pair_error, variance, pair_spread)
-        settled = bool(np.abs(step).max() < tolerance)
-        if settled or iteration == ITERATIONS:
-            covariance = np.zeros((focal, focal))
-            covariance[6:, 6:] = np.linalg.inv(normal)[: focal - 6, : focal - 6]
-            return AlignmentSolution(
-                state=state,
-                covariance=covariance,
-                images=images,
-                noise=noise,
-                pair_spread=pair_spread,
-                settled=settled,
-            )
-        del equations  # otherwise both these and the next equations would be in memory
-    raise AssertionError
+    at: Iterate = (state, _residuals(images, state))
+    noise, equations, settled = list[ResidualSpread](), list[ImageEquations](), False
+    for _ in range(ROUNDS):
+        before, noise = at[0], measure_noise(images, at[1])
+        at, equations = _least_squares(images, at, noise, pair_spread)
+        # σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians in place of the
+        # sums, so that entirely wrong pairs do not count; one value for translations, and one for rotations.
+        variance, error = np.concatenate([e.error_variance for e in equations]), at[0].pair_error
+        determined, squared = (
+            np.median(values.reshape(-1, 2, 3), axis=(0, 2))
+            for values in (1 - variance / pair_spread**2, error**2)
+        )
+        spread = np.sqrt(squared / NORMAL_SQUARE_MEDIAN / np.maximum(determined, 0.01))
+        pair_spread = np.repeat(np.maximum(spread, LEAST_SPREAD), 3)
+        settled = all(
+            np.abs(getattr(at[0], name) - getattr(before, name)).max() < tolerance
+            for name in ("recon_from_camera", "log_focal", "log_pair_scale")
+        )
+        if settled:
+            break
+    covariance, cameras = np.zeros((6 * len(images),) * 2), 6 * len(images) - 6
+    covariance[6:, 6:] = np.linalg.inv(_normal_equations(equations)[0])[:cameras, :cameras]
+    return AlignmentSolution(
+        state=at[0],
+        covariance=covariance,
+        images=images,
+        noise=noise,
+        pair_spread=pair_spread,
+        settled=settled,
+    )
+
+
+def _residuals(images: list[ImageObservations], state: AlignmentState) -> list[Residuals]:
+    """Return the residuals of each image at a state."""
+    return [
+        depth_residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
+    ]
+
+
+def _least_squares(
+    images: list[ImageObservations],
+    begin: Iterate,
+    noise: list[ResidualSpread],
+    pair_spread: Float[ndarray, "6"],
+) -> tuple[Iterate, list[ImageEquations]]:
+    """Minimise the weighted squares of residuals and pairs' errors; return state, residuals and last equations.
+
+    The weights are those at `begin`. `noise` is the spread of each image's residuals, and `pair_spread` that of the
+    pairs' errors.
+    """
+    latest: list[ImageEquations] = []
+    weights = [residual_weights(*of) for of in zip(images, begin[1], noise, strict=True)]
+
+    def linearise(at: Iterate) -> list[ImageEquations]:
+        latest[:] = (
+            image_equations(o, r, w, at[0], pair_spread)
+            for o, r, w in zip(images, at[1], weights, strict=True)
+        )
+        return latest
+
+    def step(at: Iterate, equations: list[ImageEquations], damping: float) -> Iterate:
+        normal, gradient = _normal_equations(equations)
+        normal += damping * np.diag(normal.diagonal())
+        along = np.concatenate([np.zeros(6), -np.linalg.solve(normal, gradient)])
+        if not np.isfinite(along).all():
+            raise np.linalg.LinAlgError
+        tried = _after_step(images, at[0], equations, along)
+        return tried, _residuals(images, tried)
+
+    def cost(at: Iterate) -> float:
+        squares = ((at[0].pair_error / pair_spread) ** 2).sum()
+        for r, (w_across, w_along) in zip(at[1], weights, strict=True):
+            squares += np.vdot(w_across, r.across_squared) + np.vdot(w_along, r.along**2)
+        return 0.5 * float(squares)
+
+    try:
+        at, _, _ = damped_gauss_newton(
+            linearise, step, cost, begin, enough=lambda best: ENOUGH * best, iterations=STEPS
+        )
+    except np.linalg.LinAlgError:
+        raise RejectedError("the pointmaps of the pairs have too little in common to be aligned") from None
+    return at, latest
+
+
+def _normal_equations(
+    equations: list[ImageEquations],
+) -> tuple[Float[ndarray, "q q"], Float[ndarray, " q"]]:
+    """Return matrix and gradient of the equations of all images, without the rows of the first camera, which is fixed.
+
+    The q unknowns are the steps of the other cameras (six each), the log focal length and the log pair scales.
+    """
+    hessian = np.sum([e.selection.T @ (e.selection.T @ e.hessian).T for e in equations], axis=0)
+    gradient = np.sum([e.selection.T @ e.gradient for e in equations], axis=0)
+    # A pair without weight keeps its scale.
+    scales = np.arange(6 * len(equations) + 1, len(gradient))
+    hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
+    hessian[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+    return hessian[6:, 6:], gradient[6:]
 
 
 def _after_step(
@@ -156,14 +219,12 @@ def _after_step(
     state: AlignmentState,
     equations: list[ImageEquations],
     step: Float[ndarray, " p"],
-) -> tuple[AlignmentState, Float[ndarray, "e 6"]]:
-    """Return the state after `step`, and the variances (e,6) of the pairs' errors.
+) -> AlignmentState:
+    """Return the state after `step`: six numbers per camera, the log focal length and the log pair scales.
 
-    The step has six numbers per camera, the log focal length and the log pair scales; depths and pair errors follow
-    from it.
+    Depths and pair errors follow from it.
     """
     log_depth, pair_error = [], state.pair_error.copy()
-    variance = np.zeros_like(pair_error)
     for o, before, e in zip(images, state.log_depth, equations, strict=True):
         local_step = e.selection @ step
         pair_step = e.gain @ local_step + e.offset
@@ -172,52 +233,32 @@ def _after_step(
         # Clip the step: a pixel without parallax must not move far off the scene.
         depth_step = -(e.depth_gradient + local_step.astype(np.float32) @ e.coupling) / e.depth_hessian
         log_depth.append(before + np.clip(depth_step, -0.5, 0.5))
-        second_pairs = o.pair[: o.second_count]
-        pair_error[second_pairs] += np.einsum("kij,kj->ki", e.axes, pair_step.reshape(-1, 6))
-        variance[second_pairs] = e.error_variance
+        pair_error[o.pair[: o.second_count]] += np.einsum("kij,kj->ki", e.axes, pair_step.reshape(-1, 6))
     focal = 6 * len(images)
-    after = AlignmentState(
+    return AlignmentState(
         recon_from_camera=retract(state.recon_from_camera, step[:focal].reshape(-1, 6)),
         log_focal=state.log_focal + float(step[focal]),
         log_pair_scale=state.log_pair_scale + step[focal + 1 :],
         pair_error=pair_error,
         log_depth=log_depth,
     )
-    return after, variance
-
-
-def _spread(
-    error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
-) -> Float[ndarray, "6"]:
-    """Return the standard deviations of the pairs' errors: three of translation, three of rotation.
-
-    `error` are the estimated errors, `variance` their variances, and `before` the standard deviations assumed in the
-    estimate. The update is σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians
-    in place of the sums, so that entirely wrong pairs do not count.
-    """
-    determined = 1.0 - np.median((variance / before**2).reshape(-1, 2, 3), axis=(0, 2))
-    squared = np.median((error**2).reshape(-1, 2, 3), axis=(0, 2)) / NORMAL_SQUARE_MEDIAN
-    return np.repeat(np.maximum(np.sqrt(squared / np.maximum(determined, 0.01)), LEAST_SPREAD), 3)
 
 
 def image_equations(
     o: ImageObservations,
     r: Residuals,
-    noise: ResidualSpread,
+    weights: tuple[Float[ndarray, "k m"], Float[ndarray, "k m"]],
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> ImageEquations:
-    """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their spread `noise`.
+    """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their `weights`.
 
     A modelled point lies at distance |x| along the unit vector x̂. If it moves by v, the weighted squares of the
     residuals' changes sum to vᵀ (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights
     of the residuals across and along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
     """
     n, count, maps = o.second_count, 6 * o.second_count, len(o.pair)
-    # The confidence weights are scaled to mean 1, so that the hessian is the information of the pointmaps.
-    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
-    w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
-    w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
+    w_across, w_along = weights
     alpha = w_across / r.distance**2
     beta = w_along / r.distance**2 - alpha
     # Derivatives of a point by the twist (I, −[X]), the log focal length and its log depth.

@@ -15,15 +15,20 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
     """Return an initial estimate of all unknowns, accurate to a few per cent.
 
     Depths come from the pairs that have the image first, cameras from the pairs that agree best. `edges` are the images
-    (first, second) of each pair.
+    (first, second) of each pair. Raises RejectedError where no first view has points in front of its camera.
     """
-    focal = _focal(images)
+    # The median of pixel radius / tangent of the angle off the optical axis, of pointmaps in their own camera's frame.
+    ratios = []
+    for o in images:
+        x, y, forward = o.direction[o.second_count :].swapaxes(0, 1)
+        aside = np.hypot(x, y)
+        usable = (forward > 1e-3) & (aside > 1e-3) & (o.weight[o.second_count :] > 0)
+        ratios.append((np.hypot(*o.pixel_offset) * forward)[usable] / aside[usable])
+    if not sum(ratio.size for ratio in ratios):
+        raise RejectedError("no first view of a pair has points in front of its camera")
+    focal = float(np.median(np.concatenate(ratios)))
     depth, unit = [], np.zeros(len(edges))
-    first_from_second, log_ratio, cost = (
-        np.empty((len(edges), 4, 4)),
-        np.empty(len(edges)),
-        np.empty(len(edges)),
-    )
+    first_from_second, (log_ratio, cost) = np.empty((len(edges), 4, 4)), np.empty((2, len(edges)))
     for o in images:
         own, first = _own_depth(o, focal)
         unit[o.pair[o.second_count :]] = first
@@ -45,25 +50,6 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
         pair_error=np.zeros((len(edges), 6)),
         log_depth=[np.log(z) + scale for z, scale in zip(depth, log_scale, strict=True)],
     )
-
-
-def _focal(images: list[ImageObservations]) -> float:
-    """Estimate fx as the median of pixel radius / tangent of the angle off the optical axis.
-
-    The median is over all pixels of pointmaps in their own camera's frame. Raises RejectedError where none of these has
-    points in front of its camera.
-    """
-    ratios = []
-    for o in images:
-        forward, aside = (
-            o.direction[o.second_count :, 2],
-            np.hypot(*o.direction[o.second_count :, :2].swapaxes(0, 1)),
-        )
-        usable = (forward > 1e-3) & (aside > 1e-3) & (o.weight[o.second_count :] > 0)
-        ratios.append((np.hypot(*o.pixel_offset) * forward)[usable] / aside[usable])
-    if not sum(ratio.size for ratio in ratios):
-        raise RejectedError("no first view of a pair has points in front of its camera")
-    return float(np.median(np.concatenate(ratios)))
 
 
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:

@@ -45,8 +45,36 @@ class AlignmentProblem:
         return np.log(np.maximum(confidence, 1.0)) if self.log_weight else confidence
 
     def observe_all(self, count: int) -> "list[ImageObservations]":
-        """Return the pointmaps of all pairs at about `count` pixels of every image."""
-        return [observe(self, k, pixels) for k, pixels in enumerate(_choose_pixels(self, count))]
+        """Return the pointmaps of all pairs at the most confident pixel of each of about `count` equal cells per image.
+
+        Equal cells cover the whole field of view, which a ranking by confidence alone would not. Cells without a
+        confident pixel (sky) are left out. Raises InputError for an image without any confidence.
+        """
+        predictions = self.predictions
+        height, width = predictions.conf.shape[1:]
+        side = np.sqrt(max(1.0, height * width / count))
+        rows, columns = max(1, round(height / side)), max(1, round(width / side))
+        y, x = np.indices((height, width)).reshape(2, -1)
+        cell = y * rows // height * columns + x * columns // width
+        by_cell = np.argsort(cell, kind="stable")
+        starts = np.searchsorted(cell[by_cell], np.arange(rows * columns))
+
+        total = np.zeros((predictions.image_count, height * width), np.float32)
+        for edge, *confidences in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
+            for image, confidence in zip(edge, confidences, strict=True):
+                total[image] += confidence.ravel()
+        shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
+        chosen = []
+        for k, weight in enumerate(self.weigh(total / shown[:, None])):
+            best = np.maximum.reduceat(weight[by_cell], starts)
+            if best.max() <= 0:
+                raise InputError(
+                    f"no pixel of image {predictions.names[k]} has any confidence; leave the image out"
+                )
+            winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
+            winners = winners[np.unique(cell[winners], return_index=True)[1]]
+            chosen.append(observe(self, k, winners[best > POOR * np.quantile(best, 0.9)]))
+        return chosen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,39 +100,6 @@ class ImageObservations:
     log_range: Float[ndarray, "k m"]
     """Log of the points' distance from the observer, in the pair's unit."""
     weight: Float[ndarray, "k m"]
-
-
-def _choose_pixels(problem: AlignmentProblem, count: int) -> list[Int[ndarray, " _"]]:
-    """Choose in each image the most confident pixel of each of about `count` equal cells; return flat indices.
-
-    Equal cells cover the whole field of view, which a ranking by confidence alone would not. Cells without a confident
-    pixel (sky) are left out. Raises InputError for an image without any confidence.
-    """
-    predictions = problem.predictions
-    height, width = predictions.conf.shape[1:]
-    side = np.sqrt(max(1.0, height * width / count))
-    rows, columns = max(1, round(height / side)), max(1, round(width / side))
-    y, x = np.indices((height, width)).reshape(2, -1)
-    cell = y * rows // height * columns + x * columns // width
-    by_cell = np.argsort(cell, kind="stable")
-    starts = np.searchsorted(cell[by_cell], np.arange(rows * columns))
-
-    total = np.zeros((predictions.image_count, height * width), np.float32)
-    for edge, *confidences in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
-        for image, confidence in zip(edge, confidences, strict=True):
-            total[image] += confidence.ravel()
-    shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
-    chosen = []
-    for k, weight in enumerate(problem.weigh(total / shown[:, None])):
-        best = np.maximum.reduceat(weight[by_cell], starts)
-        if best.max() <= 0:
-            raise InputError(
-                f"no pixel of image {predictions.names[k]} has any confidence; leave the image out"
-            )
-        winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
-        winners = winners[np.unique(cell[winners], return_index=True)[1]]
-        chosen.append(winners[best > POOR * np.quantile(best, 0.9)])
-    return chosen
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:

@@ -108,6 +108,24 @@ def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray,
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
 
 
+def residual_weights(
+    o: ImageObservations, r: Residuals, noise: ResidualSpread
+) -> tuple[Float[ndarray, "k m"], Float[ndarray, "k m"]]:
+    """Return the weights of the squares of the residuals across and along the line of sight, for least squares.
+
+    Confidences are scaled to mean 1, so that the weights are the information of the pointmaps.
+    """
+    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
+    across, along = (
+        robust / (std**2 * inflation)[:, None]
+        for std, inflation in (
+            (noise.across, noise.across_inflation),
+            (noise.along, noise.along_inflation),
+        )
+    )
+    return across, along
+
+
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[ResidualSpread]:
     """Estimate the spread of the residuals (`misfit`) of every pointmap of each image.
 
@@ -115,7 +133,13 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
     pointmap's own, but at least a third of the median of its kind, so that no pair dominates by a lucky fit. The
     inflations are the median of the kind.
     """
-    own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
+    own = []
+    for o, r in zip(images, misfit, strict=True):
+        across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
+        along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
+        weight = o.weight * geman_mcclure_weights(r, ResidualSpread(across, along, across, along))
+        inflations = _inflation(o, weight, r.across), _inflation(o, weight, r.along[:, None])
+        own.append(np.stack([across, along, *inflations]))
     is_second = [np.arange(len(o.pair)) < o.second_count for o in images]
     values, second = np.concatenate(own, axis=1), np.concatenate(is_second)
     usual = {kind: np.median(values[:, second == kind], axis=1) for kind in set(second.tolist())}
@@ -124,17 +148,6 @@ def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> l
         of_kind = np.stack([usual[kind] for kind in kinds.tolist()], axis=1)
         result.append(ResidualSpread(*np.maximum(noise[:2], of_kind[:2] / 3), *of_kind[2:]))
     return result
-
-
-def _own_noise(o: ImageObservations, r: Residuals) -> Float[ndarray, "4 k"]:
-    """Return for each of k pointmaps: standard deviation across and along, then variance inflation across and along.
-
-    Standard deviations come from medians, inflations from the means of coarse cells.
-    """
-    across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
-    along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
-    weight = o.weight * geman_mcclure_weights(r, ResidualSpread(across, along, across, along))
-    return np.stack([across, along, _inflation(o, weight, r.across), _inflation(o, weight, r.along[:, None])])
 
 
 def _inflation(
@@ -171,9 +184,9 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
 def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Estimate the depth of the m observed pixels by Gauss-Newton with fixed cameras; return it with mean weights.
+    """Estimate the depth (recon units) of the m observed pixels by Gauss-Newton with fixed cameras.
 
-    The pointmaps count as independent, weighted by confidence, agreement and noise.
+    The pointmaps count as independent, weighted by confidence, agreement and noise. Returns depths and mean weights.
     """
     log_depth, weight = np.log(initial_depth(o, state)), o.weight
     for _ in range(DEPTH_ITERATIONS):
