@@ -155,15 +155,6 @@ def test_images_of_one_viewpoint_are_no_partners():
         assert len(set(others.tolist())) >= 4
 
 
-def test_all_repeats_are_tied_together_in_proportion_to_their_number():
-    pairs = near_pairs(motions(repeated(16, 12)), 4)
-    assert len(pairs) <= 4 * 16 * 12
-    group = np.arange(16 * 12)
-    for i, j in pairs:
-        group[group == group[j]] = group[i]
-    assert (group == group[0]).all()
-
-
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 
 

@@ -202,19 +202,6 @@ def test_a_camera_that_repeats_or_changes_its_size_is_named_and_nothing_is_kept(
     assert frames_in(tmp_path / "c") == ["images/000.png"]
 
 
-def test_a_clock_that_is_set_back_stops_neither_camera_nor_arm(tmp_path: Path, tabletop: Path):
-    image, poses = still(tabletop, 0), list(jcr.read_capture(tabletop).base_from_gripper)
-    times = [1e6, *(0.25 * k for k in range(20))]
-    session, _ = a_capture(tmp_path / "c", (Frame(image, time_s) for time_s in times))
-    assert take_all(session, poses[:1])[0]["accepted"]
-
-    def states() -> Iterator[RobotState]:
-        for k in range(200):
-            yield RobotState(1e6 + 0.1 * k if k < 3 else 0.1 * k, poses[0])
-
-    assert np.allclose(next_rest(states, None, MOVED_ON).base_from_gripper, poses[0])
-
-
 def test_poses_that_stop_end_the_capture_in_one_line_with_all_that_was_taken(tmp_path: Path, tabletop: Path):
     poses = list(jcr.read_capture(tabletop).base_from_gripper)
     session, scripted = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 0)))
