@@ -147,8 +147,11 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     )
     seen = f"a point seen at {significant(1e-3 * required.distance_mm)} m {within}"
     assert f"{written['verdict'].capitalize()}: {seen}" in elements.text
-    for std in written["uncertainty"]["translation_std_mm"]:
-        assert f"±{significant(std)} mm" in elements.text
+    mm, deg = (written["uncertainty"][name] for name in ("translation_std_mm", "rotation_std_deg"))
+    stated = (
+        f"translation ±{', '.join(map(significant, mm))} mm, rotation ±{', '.join(map(significant, deg))}°"
+    )
+    assert stated in elements.text and all(f"±{significant(std)} mm" in elements.text for std in mm)
     for image in written["images"]:
         if image["used"]:
             assert f"{significant(image['reprojection_px'])} px" in elements.text
