@@ -173,7 +173,7 @@ def test_without_matches_the_cameras_have_the_published_errors(capture: Capture,
     assert found.predicted_focal[0] == pytest.approx(INTRINSICS.fx, rel=1e-3)
 
 
-COUNT = 3
+VIEWS = 3
 UNIT = 0.37
 """Metres that a network without a metric scale calls one."""
 
@@ -190,7 +190,7 @@ class Scene:
         v, u = np.mgrid[:height, :width]
         ramp = np.stack([(u + 0.5) / width, (v + 0.5) / height, np.zeros((height, width))], -1)
         # Dithered: eight bits alone are steps of four pixels.
-        noise = np.random.default_rng(0).uniform(0, 1, (COUNT, height, width, 3))
+        noise = np.random.default_rng(0).uniform(0, 1, (VIEWS, height, width, 3))
         self.colors = np.clip(np.floor(255 * ramp + noise), 0, 255).astype(np.uint8)
 
     def seen(self, images: ndarray) -> tuple[ndarray, ndarray]:
@@ -261,7 +261,7 @@ def test_an_adapter_undoes_its_packages_conventions(size: tuple[int, int]) -> No
     assert all(edge % 14 == 0 for edge in grid.size) and not found.is_metric
     # The grid is where the adapter says, so that the true intrinsics on it give the true rays and depth.
     known = grid.grid_intrinsics(scene.pinhole)
-    depth = scene.depths(np.tile(known.matrix, (COUNT, 1, 1)), grid.size[1], grid.size[0])
+    depth = scene.depths(np.tile(known.matrix, (VIEWS, 1, 1)), grid.size[1], grid.size[0])
     off = np.linalg.norm(UNIT * found.x_in_camera - rays(known) * depth[..., None], axis=-1) / depth
     there = found.confidence > 0
     assert np.median(off[there]) < 5e-4 and there.mean() > 0.99
