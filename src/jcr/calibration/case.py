@@ -12,6 +12,7 @@ from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
+from jcr.camera import usable_intrinsics
 from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
@@ -103,7 +104,9 @@ class Case:
             return camera_with_prior(found, {"f": self.reconstruction.predicted_focal[1], **of_center})
         if found.model == "thin_prism" and (given is None or given.model != found.model):
             return camera_with_prior(found, {**(ESTIMATED if given is None else MEASURED), **PRISM})
-        return camera_about(found, given is not None, self.capture.intrinsics_std)
+        # A distortion that folds over is not used, so that nothing is known of it.
+        of_distortion = not usable_intrinsics(given)[1]
+        return camera_about(found, given is not None, self.capture.intrinsics_std, of_distortion)
 
     @cached_property
     def tracks(self) -> Tracks:

@@ -94,15 +94,23 @@ def camera_with_prior(
     return CameraPrior(intrinsics=intrinsics, directions=directions, std=np.array(list(known.values())))
 
 
-def camera_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> CameraPrior:
+def camera_about(
+    found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None, distortion_given: bool = True
+) -> CameraPrior:
     """Return the prior of a camera with mean `found`.
 
     If the intrinsics were `given`, `std` are their standard deviations; None: MEASURED. If a reconstruction estimated
-    them, the standard deviations are ESTIMATED.
+    them, or the distortion alone where it is not `distortion_given`, the standard deviations are ESTIMATED.
     """
     if not given:
         return camera_with_prior(found, ESTIMATED)
-    return camera_with_prior(found, MEASURED if std is None else std)
+    names = parameter_names(found)
+    unknown = {} if distortion_given else {name: ESTIMATED[name] for name in names[4:] if name in ESTIMATED}
+    if std is None:
+        return camera_with_prior(found, {**MEASURED, **unknown})
+    return camera_with_prior(
+        found, np.array([unknown.get(name, one) for name, one in zip(names, std, strict=True)])
+    )
 
 
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:

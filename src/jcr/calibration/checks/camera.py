@@ -26,7 +26,7 @@ from jcr.estimation.hypotheses import (
     first_x,
     test_combinations,
 )
-from jcr.estimation.intrinsics_prior import TYPICAL, CameraPrior
+from jcr.estimation.intrinsics_prior import ESTIMATED, TYPICAL, CameraPrior
 from jcr.estimation.problem import OF_IMAGE, PRISM, Problem, State, spanned
 from jcr.estimation.solve import Solution
 from jcr.findings import Concerns, Finding, FindingKind, joined
@@ -349,8 +349,19 @@ def hypotheses(state: CameraAdjustment) -> list[CameraEffect]:
 
 
 def _freed(state: CameraAdjustment) -> tuple[str, ...]:
-    """Return the names of the parameters that the effect "wrong intrinsics" tests; for estimated ones fx, p1, p2."""
-    return tuple(name for name in (INTRINSICS if state.is_given else ASPECT) if name in state.equations.names)
+    """Return the names of the parameters that the effect "wrong intrinsics" tests; for estimated ones fx, p1, p2.
+
+    A given distortion that folds over was not used, which its prior shows; it is not tested either.
+    """
+    prior = state.prior
+    std = np.sqrt(prior.directions**2 @ prior.std**2)
+    loose = {
+        name
+        for name, one in zip(state.equations.names, std, strict=True)
+        if one >= ESTIMATED.get(name, np.inf)
+    }
+    tested = (name for name in INTRINSICS if name not in loose - {"cx", "cy"}) if state.is_given else ASPECT
+    return tuple(name for name in tested if name in state.equations.names)
 
 
 def camera_finding(after: CameraAdjustment, before: CameraAdjustment) -> Finding:

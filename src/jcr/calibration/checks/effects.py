@@ -16,6 +16,7 @@ from numpy import ndarray
 from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case, some_points
 from jcr.calibration.checks.camera import (
+    FOCUS,
     LOG_P,
     MATERIAL,
     MIN_IMAGES,
@@ -60,6 +61,9 @@ SHARES = frozenset({FindingKind.SLIP, FindingKind.BASE_MOVED, FindingKind.DRIFT}
 """Effects with one motion times a known factor per image; also compared with other orders of the images."""
 EFFECTS = kinds_of("camera", "strain") | SHARES | {FindingKind.DELAY}
 """Kinds of findings that these tests make."""
+TINY_PX, TINY = 0.5, 0.1
+"""Displacement in the corner of the image (px), and change of the calibration in units of LARGE_MOTION, up to which
+different focal lengths are a remark and no warning."""
 LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
 """Motion of the camera or the base (m, rad) above which the calibration is rejected; a smaller motion is added to the
 uncertainty."""
@@ -282,7 +286,20 @@ def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...])
         rest = tuple(one for one in state.found if one.kind not in of_camera)
         kept = tuple(one for one in findings if one.kind not in of_camera)
         return _adopted(case, replace(state, found=rest), kept)
+    adopted = tuple(as_remark(one, moved, case.capture.image_size) for one in adopted)
     return fewer.after(adopted, refined, adjusted)
+
+
+def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int, int]) -> Finding:
+    """Return the finding of a tiny difference of focal lengths, which the calibration includes, as a remark.
+
+    Hundreds of images show differences that no user needs to correct: in the corner of the image by less than TINY_PX,
+    with a change `moved` of the calibration (m, rad) by less than TINY of the accuracy that grasping needs.
+    """
+    metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1) / LARGE_MOTION
+    corner_px = float(np.hypot(*image_size)) / 2 * abs(found.value or 0.0)
+    is_tiny = found.kind in FOCUS and corner_px < TINY_PX and max(metres, radians) < TINY
+    return replace(found, severity="informs") if is_tiny else found
 
 
 def with_effects(
