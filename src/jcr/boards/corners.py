@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.boards.detection import boards, most_seen
+from jcr.boards.detection import FEWEST_POINTS, boards, most_seen
 from jcr.boards.proposal import board_in_view
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
@@ -20,8 +20,6 @@ from jcr.geometry import apply, inverse, nearest_to_lines
 from jcr.progress import Progress, silent
 from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Tracks
 
-FEWEST_POINTS = 4
-"""Least number of corners of a body that an image must show to be used."""
 FEWEST_IMAGES = 2
 """Least number of images that must show a body; each of its corners needs as many to be triangulated."""
 SAME_PLACE = 0.006

@@ -26,6 +26,8 @@ INK = 120
 """Least difference of a pixel's strongest and weakest channel (0 to 255) that is too colourful for a grey board."""
 LARGEST = 1.0
 """Largest length of a square or tag, m; a larger number was meant in millimetres."""
+FEWEST_POINTS = 4
+"""Least number of points of a board or tag that an image must show to be used."""
 PRINTED = 0.002
 """Relative standard deviation of a printed board's size."""
 SIDE, MARKER = "SIDE", "MARKER"
@@ -141,6 +143,7 @@ def _charuco(
 
 
 def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
+    """Return the detector of the inner corners of a ChArUco board."""
     detector = cv2.aruco.CharucoDetector(board)
     corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()
 
@@ -168,6 +171,7 @@ def _charuco_shift_px() -> float:
 
 
 def _chessboard(count: tuple[int, int], square: float) -> Detector:
+    """Return the detector of a chessboard with `count` inner corners (columns, rows) and squares of side `square`, m."""
     across, down = count
     if (across + down) % 2 == 0:
         raise ValueError(
@@ -196,6 +200,7 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
 
 
 def _circles(count: tuple[int, int], spacing: float) -> Detector:
+    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart."""
     across, down = count
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
@@ -220,6 +225,7 @@ def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
 
 
 def _single_tags(side: float, tags: cv2.aruco.Dictionary) -> Detector:
+    """Return the detector of single tags of a dictionary, whose black squares have this side, m."""
     parameters = cv2.aruco.DetectorParameters()
     # Fits lines to the edges; sub-pixel corners are drawn inwards by blur, 0.1 to 0.4 px. AprilTag's corners are counted
     # from the corner of the image.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.boards.detection import Board, Sighting, boards, most_seen
+from jcr.boards.detection import FEWEST_POINTS, Board, Sighting, boards, most_seen
 from jcr.camera import WITHIN_FOLD, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
@@ -23,7 +23,6 @@ from jcr.geometry import apply, inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
-FEWEST_POINTS = 4
 WORST_PX = 3.0
 """Largest rms reprojection error of a body's points; above it the board is bent, or another one."""
 GATE_PX = 10.0
