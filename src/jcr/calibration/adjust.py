@@ -35,7 +35,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.records import LeaveOneOut, PaperResiduals, Tracks
+from jcr.records import PaperResiduals, Tracks
 
 FEWEST = 6
 """Fewest observations of an image; with fewer, the camera's motion due to wrong intrinsics is not computed."""
@@ -50,9 +50,29 @@ def with_adjusted_images(case: Case) -> Case:
     A rejected fit is replaced too, because without given intrinsics its camera poses are poor. For
     correspondences between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
     decreases. The fit is kept if the motions are degenerate, or if the adjustment fails (points behind the cameras).
+    A fit that cannot be adjusted gets the uncertainty of the intrinsics in its covariance.
     """
+    if not case.is_adjustable and case.reconstruction.predicted_focal is not None:
+        # Camera poses of a network do not depend on the focal length. An error of the principal point rotates their
+        # hand-eye transform; the joint covariance contains this correlation.
+        hand_eye, camera, x = case.hand_eye, case.camera, case.hand_eye.gripper_from_camera
+        root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
+        by_camera = np.zeros((7, len(root)))
+        by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
+        by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
+        moved = by_camera @ root
+        uncertainty = hand_eye.uncertainty.with_error(moved @ moved.T, "intrinsics")
+        joint = joint_covariance(uncertainty.covariance, moved @ root.T, root @ root.T, camera.intrinsics)
+        return replace(case, hand_eye=judged(hand_eye.with_uncertainty(replace(uncertainty, joint=joint))))
     if not case.is_adjustable:
-        return _considered(case)
+        made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
+        if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
+            return case
+        poses = case.base_from_gripper[case.used], case.recon_from_camera[case.used]
+        found = with_intrinsics_considered(
+            case.hand_eye, *poses, case.tracks, case.camera, case.priors, case.systematic
+        )
+        return replace(case, hand_eye=judged(found))
     try:
         found = adjust_case(case, combinations=case.free_focus if case.shows_camera else None)
     except np.linalg.LinAlgError:
@@ -76,16 +96,15 @@ def with_adjusted_images(case: Case) -> Case:
 def adjust_case(
     case: Case,
     *,
-    prior: CameraPrior | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
     confirmed_errors: Float[ndarray, "s b"] | None = None,
 ) -> Solution:
     """Adjust the used images and gripper poses of a case, starting from its last adjustment or its fit to camera poses.
 
-    `prior` replaces the case's prior of the intrinsics. `combinations` (e,p) are p additional parameters to estimate,
-    each a combination of the e candidate parameters in hypotheses.Alternatives. `confirmed_errors` (s,b) are b error
-    patterns of the gripper poses, s = 6 per used image, one standard deviation each. The initial robot pose noise is
-    taken from the residuals of the fit: a smaller one needs ten times the steps if poses and images contradict.
+    `combinations` (e,p) are p directions in the e parameters of the camera (hypotheses.Row) to estimate in addition.
+    `confirmed_errors` (s,b) are b error patterns of the gripper poses, s = 6 per used image, one standard deviation
+    each. The initial robot pose noise is taken from the residuals of the fit: a smaller one needs ten times the steps
+    if poses and images contradict.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
@@ -94,39 +113,13 @@ def adjust_case(
         replace(arm, carries=case.carries, confirmed_errors=confirmed_errors),
         (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
         case.recon_from_camera[case.used],
-        case.camera if prior is None else prior,
+        case.camera,
         case.tracks,
         noise=case.options.robot_noise_m_rad,
         combinations=combinations,
         near=case.adjusted,
         start_noise=(max(START_NOISE[0], metres), max(START_NOISE[1], radians)),
     )
-
-
-def _considered(case: Case) -> Case:
-    """Return the case with the uncertainty of the intrinsics in its covariance, which a fit to camera poses lacks.
-
-    Camera poses of a network do not depend on the focal length. An error of the principal point rotates their hand-eye
-    transform; the joint covariance contains this correlation.
-    """
-    hand_eye, camera, x = case.hand_eye, case.camera, case.hand_eye.gripper_from_camera
-    if case.reconstruction.predicted_focal is not None:
-        root, names = camera.directions * camera.std, parameter_names(camera.intrinsics)
-        by_camera = np.zeros((7, len(root)))
-        by_camera[3:6, names.index("cx")] = x[:3, 1] / camera.intrinsics.fx
-        by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
-        moved = by_camera @ root
-        uncertainty = hand_eye.uncertainty.with_error(moved @ moved.T, "intrinsics")
-        joint = joint_covariance(uncertainty.covariance, moved @ root.T, root @ root.T, camera.intrinsics)
-        return replace(case, hand_eye=judged(hand_eye.with_uncertainty(replace(uncertainty, joint=joint))))
-    made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
-    if case.capture.intrinsics is None or not made_with_them or not hand_eye.converged:
-        return case
-    gripper, cameras = case.base_from_gripper[case.used], case.recon_from_camera[case.used]
-    considered = with_intrinsics_considered(
-        hand_eye, gripper, cameras, case.tracks, camera, case.priors, case.systematic
-    )
-    return replace(case, hand_eye=judged(considered))
 
 
 def with_intrinsics_considered(
@@ -191,6 +184,16 @@ def refined_by(case: Case, found: Solution) -> Calibration:
     reprojection = np.full(len(gripper), np.nan)
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
     reasons = [image.reason for image in fit.images]
+    # Each gripper pose is predicted without its own image. The reprojection error refers to cameras that are displaced
+    # by the leave-one-out residuals of their gripper poses.
+    left_out, likely = found.leave_one_out[0], found.most_likely
+    x_likely, z, displaced = likely.x[0], likely.z[0], likely.world_from_rig.copy()
+    gripper_likely = predicted_gripper_poses(x_likely, likely.scale, z, displaced[rigs])
+    in_metres = inverse(z) @ retract(gripper_likely, -left_out) @ x_likely
+    displaced[rigs] = scale_translation(in_metres, 1 / likely.scale)
+    moved = view_of(found.problem, replace(found.images.state, world_from_rig=displaced))
+    reprojection_px = float(np.median(median_reprojection_px(found.problem, moved)))
+    how = "each image's gripper pose predicted by the others"
     return replace(
         fit,
         on_gripper=x,
@@ -202,21 +205,5 @@ def refined_by(case: Case, found: Solution) -> Calibration:
         images=image_verdicts(case.names, fit.inliers, reasons, metres, radians, reprojection),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, fit.inliers)),
         robot_noise=found.noise,
-        held_out=_leave_one_out(found),
+        held_out=leave_one_out(left_out, how, reprojection_px),
     )
-
-
-def _leave_one_out(found: Solution) -> LeaveOneOut | None:
-    """Return the mean leave-one-out error of an adjustment: each gripper pose is predicted without its own image.
-
-    Return None for fewer than four images.
-    """
-    left_out, likely = found.leave_one_out[0], found.most_likely
-    # The reprojection error refers to cameras that are displaced by the leave-one-out residuals of their gripper poses.
-    x, z, own, rigs = likely.x[0], likely.z[0], found.problem.arms[0].rigs, likely.world_from_rig.copy()
-    gripper = predicted_gripper_poses(x, likely.scale, z, rigs[own])
-    in_metres = inverse(z) @ retract(gripper, -left_out) @ x
-    rigs[own] = scale_translation(in_metres, 1 / likely.scale)
-    moved = view_of(found.problem, replace(found.images.state, world_from_rig=rigs))
-    reprojection_px = float(np.median(median_reprojection_px(found.problem, moved)))
-    return leave_one_out(left_out, "each image's gripper pose predicted by the others", reprojection_px)

@@ -120,7 +120,7 @@ class Case:
     def free_focus(self) -> Float[ndarray, "e p"] | None:
         """Additional parameters that give each used image its own focal length; None if the option `focus` is "fixed".
 
-        Matrix (e,p): each column is one parameter, a combination of the e candidates in hypotheses.Alternatives.
+        Matrix (e,p): each column is a direction in the e parameters of the camera (hypotheses.Row).
         """
         if self.options.focus == "fixed":
             return None

@@ -193,8 +193,8 @@ def image_verdicts(
 ) -> tuple[ImageVerdict, ...]:
     """Return a record of each registered image: whether it is used, its residuals, and the reason if it is rejected.
 
-    `metres` and `radians` are the sizes of each image's residual. `reprojection_px` is the median reprojection error,
-    NaN for an image without one; None: the images were not adjusted.
+    `metres` (m) and `radians` (rad) are the sizes of each image's residual. `reprojection_px` is the median
+    reprojection error, NaN for an image without one; None: the images were not adjusted.
     """
     px = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
     return tuple(

@@ -175,7 +175,10 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
-    """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention."""
+    """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention.
+
+    `robot` is the error prior of the gripper poses of `pairs`.
+    """
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     gripper, camera, height = pairs.base_from_gripper, pairs.recon_from_camera, options.known_height

@@ -19,7 +19,7 @@ from jcr.findings import (
     verdict_of,
     without_consequences,
 )
-from jcr.records import BoardFound, Budget, LeaveOneOut, SeenAndCorners, WithGivenIntrinsics, share_of
+from jcr.records import BoardFound, LeaveOneOut, SeenAndCorners, WithGivenIntrinsics, share_of
 from jcr.rounding import labelled, significant, with_std
 
 NEGLIGIBLE = 0.02
@@ -197,26 +197,21 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
         f"positions, {'part of the scale' if one.used else 'not used'}"
         for one in content.lengths
     }
-    budget = None if content.uncertainty is None else content.uncertainty.budget
+    budget, parts = None if content.uncertainty is None else content.uncertainty.budget, dict[str, str]()
+    if budget is not None:
+        shares = {name: share_of(getattr(budget, part)) for name, part in PARTS.items()}
+        sizes = {name: np.array([one.translation_mm, one.rotation_deg]) for name, one in shares.items()}
+        least = NEGLIGIBLE * np.max(list(sizes.values()), axis=0)
+        for name, size in sorted(sizes.items(), key=lambda item: -item[1][0]):
+            if (size > least).any():
+                parts[name] = f"{size[0]:.2f} mm {size[1]:.3f}°"
     return {
         "Time": time,
-        "Uncertainty, 1 σ per axis": {} if budget is None else _budget(budget),
+        "Uncertainty, 1 σ per axis": parts,
         "Lengths": lengths,
         "Depth camera": depth,
         "Robot": robot,
         "Board": {} if content.board is None else _board(content.board),
-    }
-
-
-def _budget(budget: Budget) -> dict[str, str]:
-    """Return the size (mm, degrees) of each part of the uncertainty budget, largest first, without negligible ones."""
-    shares = {name: share_of(getattr(budget, part)) for name, part in PARTS.items()}
-    sizes = {name: np.array([one.translation_mm, one.rotation_deg]) for name, one in shares.items()}
-    least = NEGLIGIBLE * np.max(list(sizes.values()), axis=0)
-    return {
-        name: f"{size[0]:.2f} mm {size[1]:.3f}°"
-        for name, size in sorted(sizes.items(), key=lambda item: -item[1][0])
-        if (size > least).any()
     }
 
 

@@ -20,8 +20,7 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case
 from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
-from jcr.calibration.checks.camera import of_case
-from jcr.calibration.checks.effects import EFFECTS, effects, with_effects
+from jcr.calibration.checks.effects import POLICIES, effects, of_case, with_effects
 from jcr.calibration.hand_eye import judged, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -115,7 +114,7 @@ def refined(
         intrinsics=intrinsics,
         robot_noise=answer.noise,
         next_poses=(),
-        findings=tuple(one for one in found.findings if one.kind not in EFFECTS),
+        findings=tuple(one for one in found.findings if one.kind not in POLICIES),
     )
     return judged(with_findings(judged(again), effects_found)).on_fixed_camera()
 

@@ -44,7 +44,7 @@ class CellImages:
     ) -> "CellImages":
         """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
 
-        `combinations` (e,p) are p directions in the e parameters of hypotheses.Alternatives. `errors` (s,b) are the
+        `combinations` (e,p) are p directions in the e parameters of hypotheses.Row. `errors` (s,b) are the
         pose errors by b confirmed effects of one standard deviation each. None: nothing is added.
         """
         problem = self.problem

@@ -251,7 +251,7 @@ class Rigs:
         case = self.case
         poses = case.capture.base_from_gripper[self.rows]
         kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
-        bent = [row.prior_std * row.columns for row in arm_rows(poses) if row.kind in kinds]
+        bent = [row.unit * row.columns for row in arm_rows(poses) if row.kind in kinds]
         arms = [
             ReportedPoses(
                 rigs=np.arange(len(poses)),

@@ -14,7 +14,6 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.calibration.case import Case
-from jcr.calibration.checks.camera import CameraAdjustment
 from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
 from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
@@ -25,6 +24,7 @@ from jcr.cell.images import CellImages, cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
+from jcr.estimation.hypotheses import Adjustment
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.problem import State
 from jcr.estimation.solve import Solution
@@ -148,30 +148,30 @@ def _examined(
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
-        prior = images.problem.cameras[one.number]
         # Exact intrinsics are not tested, and neither is a camera that is known to have moved.
-        if not len(prior.std) or any(fault.shift is not None for fault in one.findings):
+        if not len(images.problem.cameras[one.number].std) or any(
+            fault.shift is not None for fault in one.findings
+        ):
             found.append(())
             continue
         placed = _placement(one, solution, hand_eye)
         assert placed.covariance is not None
         state, faults = effects(
-            CameraAdjustment(
-                adjusted=solution,
-                adjust=lambda _, combinations, errors, images=images, one=one: images.with_freed(
+            Adjustment(
+                solution=solution,
+                adjust=lambda combinations, errors, images=images, one=one: images.with_freed(
                     one.number, combinations, one.arm, errors
                 ).solved(),
                 arm=one.arm or None,
                 names=one.names,
                 is_given=one.camera.intrinsics is not None,
-                prior=prior,
                 std=np.sqrt(np.diag(placed.covariance)) * placed.converged,
                 camera=one.number,
                 place=one.parent_from_camera,
             )
         )
-        if state.found:
-            images = images.with_freed(one.number, state.combinations)
+        if (free := state.combinations) is not None:
+            images = images.with_freed(one.number, free)
             solution = images.solved()
             faults = tuple(
                 as_adopted(fault) if fault.kind.row.group == "camera" else fault for fault in faults

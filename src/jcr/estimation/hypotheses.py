@@ -1,13 +1,13 @@
-"""Tests of additional effects on gripper poses and cameras: Rao's score test ranks, Wald's test confirms.
+"""Tests of effects that the model lacks, on gripper poses and cameras: Rao's score test ranks, Wald's test confirms.
 
 The score test (Proc. Cambridge Phil. Soc. 44, 1948) uses the error sizes of the solution, which absorb part of an
-effect. The confirmation estimates the sizes again together with the effect and averages F tests over the sizes (Seber
-and Lee, Linear Regression Analysis, 2003, chapter 4).
+effect. The confirmation estimates the sizes again together with the effect (Seber and Lee, Linear Regression Analysis,
+2003, chapter 4).
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,51 +18,40 @@ from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.elimination import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, image_evidence
+from jcr.estimation.intrinsics_prior import ESTIMATED
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
 from jcr.estimation.pose_equations import PoseEquations, pose_equations
 from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
     UNKNOWNS,
+    Problem,
     State,
+    columns_of_arm,
     rows_of,
-    spanned,
     with_free,
 )
 from jcr.estimation.robot_noise import (
     Equations,
-    LogSizes,
     most_likely,
     over_sizes,
     solve_equations,
 )
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
-from jcr.geometry import Poses, Transform, skew
+from jcr.geometry import Poses, Transform, skew, step_between
 from jcr.records import Intrinsics, JointOffsets, RobotNoise
 
-CONFIRMED_AT_MOST = 3
-"""Number of kinds of effects that are confirmed, those with the largest gains of the score test."""
 ORDERS = 200
 """Number of random image orders in a permutation test."""
 BY_CHANCE = 0.02
 """Largest share of random orders with at least the gain of the actual order."""
-LEAST_PART = 3
-"""Smallest number of images before and after a change, such as a slip; fewer are single wrong poses."""
+LEAST_PART, LEAST_ZOOMED = 3, 2
+"""Smallest number of images before and after a slip or a push, of which fewer are single wrong poses; and a zoom."""
 MANY_PLACES = 60
-"""Largest number of images at which a change is tested; longer captures are sampled evenly."""
+"""Largest number of images at which a slip is tested; longer captures are sampled evenly."""
 UP = np.array([0.0, 0.0, 1.0])
 """Direction against gravity in the base frame."""
-PLAUSIBLE: dict[FindingKind, tuple[float, float]] = {
-    FindingKind.SLIP: (0.12, np.radians(45.0)),
-    FindingKind.BASE_MOVED: (0.2, np.radians(20.0)),
-    FindingKind.DRIFT: (0.03, np.radians(10.0)),
-    FindingKind.DELAY: (1.0, 0.0),
-    FindingKind.LENGTHS: (0.1, 0.0),
-    FindingKind.BASE_LEANS: (0.3, 0.0),
-    FindingKind.TOOL_SAGS: (0.3, 0.0),
-}
-"""Largest plausible estimate of each effect: (m, rad) of a motion with six parameters, else the parameters' norm."""
 STRAINS = np.zeros((5, 3, 3))
 """Orthonormal basis of the traceless symmetric strain matrices; the trace is a scale, which is unobservable."""
 STRAINS[0], STRAINS[1] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2), np.diag([-1.0, -1.0, 2.0]) / np.sqrt(6)
@@ -72,15 +61,75 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One possible effect on the n gripper poses: its d parameters, and the derivative of the residuals by them."""
+    """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
+
+    The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
+    intrinsics in the units of problem.rows_of; then focal lengths, shears, x and y offsets of its images; then s1 to s4
+    of the thin prism.
+    """
 
     kind: FindingKind
-    columns: Float[ndarray, "s d"]
-    """Derivative of the s = 6n residuals (m, rad; base axes) by the parameters."""
+    columns: Float[ndarray, "c d"]
+    """Derivative of the c coordinates by the d parameters."""
+    nuisance: Float[ndarray, "c q"] | None = None
+    """Directions that are free with and without the effect; None: none."""
+    motion: Float[ndarray, "c 6"] | None = None
+    """Derivative of the residuals by a motion that acts on all images alike; None for other effects."""
+    share: Float[ndarray, " n"] | None = None
+    """Factor of `motion` at each of n poses, so that `columns` is their product."""
     place: int = 0
     """First image after the change; 0 for an effect that is not a change at one image."""
-    prior_std: float = 0.1
-    """Prior standard deviation of the parameters when the effect is adopted, large enough to have little influence."""
+    places: int = 1
+    """Number of alternative rows with this and other places, by which p-values are multiplied."""
+    unit: float = 1.0
+    """Prior standard deviation of the parameters of adopted errors of poses; for a camera, factor of the stated size."""
+
+    @property
+    def of_camera(self) -> bool:
+        """Whether the parameters are those of a camera."""
+        return self.kind.row.group == "camera"
+
+    @property
+    def beside(self) -> Float[ndarray, "c q"]:
+        """Directions that are free with and without the effect."""
+        return self.columns[:, :0] if self.nuisance is None else self.nuisance
+
+    @property
+    def both(self) -> Float[ndarray, "c r"]:
+        """Directions that are free with the effect: `beside`, then `columns`."""
+        return np.concatenate([self.beside, self.columns], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Quadratic cost of c coordinates, of which a row frees some directions, with all adjusted unknowns eliminated."""
+
+    information: Float[ndarray, "c c"]
+    gradient: Float[ndarray, " c"]
+    """Negative gradient of half the cost."""
+    freedom: int
+    """Degrees of freedom of the reported poses' residuals, used for F tests; images have far more."""
+    dispersion: float = 1.0
+    """Ratio of the gradient's actual variance to the variance that the weights imply."""
+
+    def gain(self, free: Float[ndarray, "c r"]) -> tuple[float, int]:
+        """Return the decrease of the cost along the directions `free`, and their rank.
+
+        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information.
+        """
+        information, right = free.T @ self.information @ free, free.T @ self.gradient
+        scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
+        values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+        kept = values > 1e-9 * values.max(initial=1e-300)
+        whitened = vectors[:, kept].T @ (scale * right) / np.sqrt(values[kept])
+        return float(whitened @ whitened), int(kept.sum())
+
+    def log_p(self, row: Row) -> float:
+        """Return the log p-value of the score test of a row: the chance of its gain without the effect."""
+        (without, fewer), (gain, more) = self.gain(row.beside), self.gain(row.both)
+        d = max(more - fewer, 1)
+        ratio = max(gain - without, 0.0) / self.dispersion / d
+        return float(f_distribution.logsf(ratio, d, self.freedom) + np.log(row.places))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,55 +144,134 @@ class Test:
     log_p: float
     """Log p-value: chance of such an estimate without the effect, times the number of places tested."""
     shift: Float[ndarray, " p"]
-    """Change of the p unknowns when the effect is estimated too."""
+    """Change when the effect is estimated too: of the camera's pose (m, rad; axes of its parent) and of log scale, 7
+    numbers; of all p unknowns in the result of `confirm_in_equations`."""
     noise: RobotNoise
     """Robot pose noise estimated together with the effect."""
+    after: "Adjustment | None" = None
+    """Adjustment with the effect; None for an effect on the poses."""
 
-    def is_within(self, limits: tuple[float, float]) -> bool:
-        """Return whether the estimate is within limits: (m, rad) for a motion with six parameters.
 
-        Other effects are compared by the norm of their parameters with the first limit.
+@dataclass(frozen=True, kw_only=True)
+class Adjustment:
+    """Adjustment of images and reported poses with the confirmed effects; one camera and one arm are tested."""
+
+    solution: Solution
+    adjust: Callable[[Float[ndarray, "e p"] | None, Float[ndarray, "s b"] | None], Solution]
+    """Function that adjusts again with p free directions of the camera, and b error patterns of the arm's poses (one
+    standard deviation each)."""
+    names: Sequence[str]
+    """Names of the images."""
+    std: Float[ndarray, "6"]
+    """Standard deviations of the camera's pose (m, rad) without effects; 0 for a rejected calibration."""
+    is_given: bool = False
+    """Whether the intrinsics were given; otherwise the reconstruction estimated them."""
+    camera: int | None = 0
+    """Index of the camera among the adjusted cameras; None: the problem has no observations."""
+    place: Callable[[State], Transform] = lambda state: state.x[0]
+    """Function that returns the camera's pose, in the gripper or base frame, from the state."""
+    arm: int | None = 0
+    """Index of the arm whose poses are tested; None if another camera's tests include them."""
+    rows: tuple[Row, ...] = ()
+    """Confirmed effects, whose parameters are estimated."""
+
+    @property
+    def combinations(self) -> Float[ndarray, "e p"] | None:
+        """Free directions of the camera, of all confirmed effects on it; None without such effects."""
+        each = [row.both for row in self.rows if row.of_camera]
+        return np.concatenate(each, axis=1) if each else None
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Intrinsics of the camera after the adjustment."""
+        assert self.camera is not None
+        return self.solution.images.view.cameras[self.camera]
+
+    @property
+    def poses(self) -> tuple[Poses, slice]:
+        """Used poses of the tested arm, and their rows among the pose equations: 6 per pose, arm after arm."""
+        used, arms, arm = self.solution.poses.used, self.solution.problem.arms, self.arm or 0
+        first = sum(len(one.rigs) for one in arms[:arm])
+        own = used[first : first + len(arms[arm].rigs)]
+        start = 6 * int(used[:first].sum())
+        return arms[arm].base_from_gripper[own], slice(start, start + 6 * int(own.sum()))
+
+    @cached_property
+    def pose_scores(self) -> Scores:
+        """Cost of the residuals of the reported poses."""
+        at = self.solution.at_mode
+        freedom = max(len(at.weighed_left) - self.solution.problem.arm_unknowns, 1)
+        return Scores(information=at.projection, gradient=at.weighed_left, freedom=freedom)
+
+    @cached_property
+    def camera_scores(self) -> Scores:
+        """Cost of the parameters of the camera."""
+        assert self.camera is not None
+        return camera_scores(self.solution, self.camera)
+
+    def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
+        """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
+
+        Raises LinAlgError if the problem becomes singular.
         """
-        if self.row.columns.shape[1] != 6:
-            return bool(np.linalg.norm(self.estimate) <= limits[0])
-        return bool((np.linalg.norm(self.estimate.reshape(2, 3), axis=1) <= limits).all())
+        free, own = replace(self, rows=tuple(rows)), self.poses[1]
+        errors = [row.unit * row.columns[own] for row in rows if not row.of_camera]
+        bent = np.concatenate(errors, axis=1) if errors else None
+        return replace(free, solution=self.adjust(free.combinations, bent))
 
 
-def rank(equations: Equations, log_sizes: LogSizes, every: Sequence[Float[ndarray, "s _"]]) -> list[float]:
-    """Return how much each candidate effect would reduce the weighted squared residuals (gain of the score test).
+def rank(model: Adjustment, rows: Sequence[Row]) -> list[tuple[Row, float]]:
+    """Return the rows with the log p-values of their score tests, the most significant row first."""
+    each = [(model.camera_scores if row.of_camera else model.pose_scores).log_p(row) for row in rows]
+    return sorted(zip(rows, each, strict=True), key=lambda one: one[1])
 
-    Each matrix A in `every` is the derivative of the residuals by an effect's parameters. The gain is gᵀS⁻¹g with g =
-    AᵀV⁻¹(r + Jθ) and S = AᵀPA; V, r + Jθ and P are the covariance, residuals and `projection` of the fit without the
-    effect.
+
+def confirm(model: Adjustment, row: Row) -> Test:
+    """Return Wald's test of an effect, with the error sizes estimated together with the effect.
+
+    An effect on the camera is estimated by an adjustment, which raises LinAlgError if it is singular.
     """
-    solution = solve_equations(equations, log_sizes)
-    projection, left = solution.projection, solution.weighed_left
-    return [float(left @ a @ np.linalg.lstsq(a.T @ projection @ a, a.T @ left, rcond=1e-9)[0]) for a in every]
-
-
-def best_tests(equations: Equations, log_sizes: LogSizes, rows: Sequence[Row]) -> list[Test]:
-    """Return Wald's tests of the most promising effects, at most one row of each kind, the smallest p-value first.
-
-    A p-value is multiplied by the number of rows of the same kind, since the best of these rows was selected.
-    """
-    # The penalty d · log(s) of Schwarz (1978).
-    penalty = [np.log(len(equations.residual)) * row.columns.shape[1] for row in rows]
-    gain = np.subtract(rank(equations, log_sizes, [row.columns for row in rows]), penalty)
-    best: dict[FindingKind, int] = {}
-    for k in np.argsort(-gain).tolist():
-        best.setdefault(rows[k].kind, k)
-    places = Counter(row.kind for row in rows)
-    chosen = list(best.items())[:CONFIRMED_AT_MOST]
-    return sorted(
-        (confirm(equations, rows[k], places[kind]) for kind, k in chosen), key=lambda one: one.log_p
+    if not row.of_camera:
+        test = confirm_in_equations(model.solution.equations, row)
+        own = test.shift[columns_of_arm(model.arm or 0)[:6]]
+        return replace(test, shift=np.r_[own, 0.0])
+    after = model.with_rows((*model.rows, row))
+    assert model.camera is not None
+    problem, solution, d = after.solution.problem, after.solution, row.columns.shape[1]
+    # The effect is the part of the freed directions along its columns, which no nuisance direction shares.
+    rows, units, _ = _rows_of(problem, model.camera)
+    freed = slice(problem.columns.cameras.stop - len(problem.freed_std), problem.columns.cameras.stop)
+    along = np.linalg.pinv(row.both)[-d:] @ (problem.directions[rows, freed] / units[:, None])
+    unknowns = solution.camera_unknowns(freed)
+    estimate = along @ solution.images.state.camera_steps[freed]
+    covariance = along @ solution.covariance[unknowns, unknowns] @ along.T
+    # As in the score test, the dispersion is that of the residuals without the effect.
+    scores = model.camera_scores
+    ratio = mean_square(estimate, covariance) / scores.dispersion
+    step = step_between(model.place(model.solution.state), model.place(solution.state))
+    growth = np.log(solution.state.scale / model.solution.state.scale)
+    return Test(
+        row=row,
+        estimate=estimate,
+        covariance=_dispersion(solution.images) * covariance,
+        log_p=float(f_distribution.logsf(ratio, d, scores.freedom) + np.log(row.places)),
+        shift=np.r_[step, growth],
+        noise=solution.noise,
+        after=after,
     )
 
 
-def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | None = None) -> Test:
-    """Return Wald's test of an effect, with the error sizes estimated together with the effect.
+def mean_square(estimate: Float[ndarray, " d"], covariance: Float[ndarray, "d d"]) -> float:
+    """Return eᵀC⁻¹e / d of an estimate e of d parameters with covariance C: the statistic of Wald's test."""
+    size = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    inverse = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9)
+    return float((estimate / size) @ inverse @ (estimate / size)) / len(estimate)
 
-    The p-value is averaged over the sizes and multiplied by `places`, the number of alternatives from which `row` was
-    selected. `freedom` is the denominator's degrees of freedom of each F test; None: those of all residuals, which is
+
+def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None) -> Test:
+    """Return Wald's test of an effect on the poses, averaged over the error sizes; its `shift` is that of p unknowns.
+
+    `freedom` is the denominator's degrees of freedom of each F test; None: those of all residuals, which is
     conservative.
     """
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
@@ -168,55 +296,66 @@ def confirm(equations: Equations, row: Row, places: int = 1, freedom: float | No
         row=row,
         estimate=found.step[count:],
         covariance=found.covariance[count:, count:],
-        log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(places)),
+        log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(row.places)),
         shift=found.step[:count] - without.step,
         noise=free.noise(likeliest),
     )
 
 
-def explains_by_order(
-    equations: Equations,
-    log_sizes: LogSizes,
-    by_motion: Float[ndarray, "n 6 6"],
-    share: Float[ndarray, " n"],
-    own: slice,
-) -> bool:
+def explains_by_order(scores: Scores, row: Row) -> bool:
     """Return whether a motion explains the residuals better than it does in nearly all random orders of the images.
 
-    `by_motion` is the derivative of the residuals by a motion, `share` (n,) the motion's factor at each image; the
-    factors of the images `own` are permuted. This permutation test of the score gain allows for errors with heavy tails
-    and single wrong poses.
+    This permutation test of the score gain allows for errors with heavy tails and single wrong poses.
     """
-    rng, centred, shares = np.random.default_rng(0), share[own] - share[own].mean(), [share]
+    assert row.motion is not None and row.share is not None
+    rng, own = np.random.default_rng(0), row.motion[::6].any(axis=1)
+    centred, shares = row.share[own] - row.share[own].mean(), [row.share]
     for _ in range(ORDERS):
         order = rng.permutation(centred)
         # A constant is absorbed by the hand-eye transform and the sign is arbitrary: such orders are equivalent.
         if not (np.allclose(order, centred) or np.allclose(order, -centred)):
-            shares.append(share.copy())
+            shares.append(row.share.copy())
             shares[-1][own] = order
-    found, *others = rank(equations, log_sizes, [_flat(by_motion * s[:, None, None]) for s in shares])
+    found, *others = (scores.gain(row.motion * np.repeat(share, 6)[:, None])[0] for share in shares)
     return sum(one >= found - 1e-9 for one in others) <= BY_CHANCE * len(others)
 
 
-def order_rows(
-    base_from_gripper: Poses, by_x: Float[ndarray, "n 6 6"], by_z: Float[ndarray, "n 6 6"]
-) -> Iterator[Row]:
-    """Yield the effects that depend on the image order: slip of the camera, base moved, drift, delayed poses.
+def pose_rows(model: Adjustment) -> Iterator[Row]:
+    """Yield the effects on the poses of the tested arm: those of the image order, then those of the gripper pose.
 
-    `by_x` and `by_z` are the derivatives of the residuals by the hand-eye transform X and by Z (base_from_recon). Slip
-    and moved base have one row for each of several images at which they may happen.
+    They are slip of the camera, base moved, drift and delayed poses; strain, lean and sag of the arm. Slip and moved
+    base have one row for each of several images at which they may happen. The arm needs six poses or more.
     """
-    n = len(base_from_gripper)
+    # These imports are slow and rarely needed.
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    gripper, own = model.poses
+    n, jacobian = len(gripper), model.solution.equations.jacobian
+    by_x, by_z = np.split(jacobian[:, columns_of_arm(model.arm or 0)], 2, axis=1)
+
     count = min(n - 2 * LEAST_PART + 1, MANY_PLACES)
-    if count < 1:
-        return
-    for k in np.unique(np.linspace(LEAST_PART, n - LEAST_PART, count).astype(int)).tolist():
-        after = (np.arange(n) >= k).astype(float)[:, None, None]
-        yield Row(kind=FindingKind.SLIP, columns=_flat(by_x * after), place=k)
-        yield Row(kind=FindingKind.BASE_MOVED, columns=_flat(by_z * after), place=k)
-    share = np.linspace(-0.5, 0.5, n)[:, None, None]
-    yield Row(kind=FindingKind.DRIFT, columns=_flat(by_x * share))
-    yield Row(kind=FindingKind.DELAY, columns=_flat(velocity(base_from_gripper)[..., None]))
+    places = np.unique(np.linspace(LEAST_PART, n - LEAST_PART, count).astype(int)).tolist()
+    changes = [(FindingKind.DRIFT, by_x, np.linspace(-0.5, 0.5, n), 0)]
+    for k in places:
+        after = (np.arange(n) >= k).astype(float)
+        changes += [(FindingKind.SLIP, by_x, after, k), (FindingKind.BASE_MOVED, by_z, after, k)]
+    for kind, motion, factor, k in changes:
+        share = np.zeros(len(jacobian) // 6)
+        share[own.start // 6 : own.stop // 6] = factor
+        columns = motion * np.repeat(share, 6)[:, None]
+        count = len(places) if k else 1
+        yield Row(kind=kind, columns=columns, motion=motion, share=share, place=k, places=count)
+    # The velocity (m, rad per image) at each pose, by splines through all poses.
+    moment, little = np.arange(n, dtype=float), 1e-3
+    rotation = RotationSpline(moment, Rotation.from_matrix(gripper[:, :3, :3]))
+    turned = (rotation(moment + little) * rotation(moment - little).inv()).as_rotvec()
+    velocity = np.concatenate(
+        [CubicSpline(moment, gripper[:, :3, 3])(moment, 1), turned / (2 * little)], axis=1
+    )
+    late = Row(kind=FindingKind.DELAY, columns=velocity.reshape(-1, 1))
+    for one in (late, *arm_rows(gripper)):
+        yield replace(one, columns=np.pad(one.columns, ((own.start, len(jacobian) - own.stop), (0, 0))))
 
 
 def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
@@ -225,31 +364,15 @@ def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
     strain[:, :3] = np.einsum("kab,nb->nak", STRAINS, position)
-    yield Row(kind=FindingKind.LENGTHS, columns=_flat(strain), prior_std=0.1)
+    yield Row(kind=FindingKind.LENGTHS, columns=_flat(strain), unit=0.1)
     # The base leans towards the gripper by 1 rad per metre of horizontal distance.
     lean = np.cross(position, UP)
-    yield Row(
-        kind=FindingKind.BASE_LEANS,
-        columns=_flat(np.concatenate([np.cross(lean, position), lean], axis=1)[..., None]),
-        prior_std=0.2,
-    )
+    columns = _flat(np.concatenate([np.cross(lean, position), lean], axis=1)[..., None])
+    yield Row(kind=FindingKind.BASE_LEANS, columns=columns, unit=0.2)
     # The gripper rotates under a weight on a lever along each of its axes, by 1 rad for a horizontal lever.
     sag = np.zeros((n, 6, 3))
     sag[:, 3:] = -rotation @ skew(rotation[:, 2])
-    yield Row(kind=FindingKind.TOOL_SAGS, columns=_flat(sag), prior_std=0.1)
-
-
-def velocity(base_from_gripper: Poses) -> Float[ndarray, "n 6"]:
-    """Return the gripper's velocity at each of n poses (m, rad per image; base axes), by splines through all poses."""
-    # These imports are slow and rarely needed.
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, RotationSpline
-
-    moment, little = np.arange(len(base_from_gripper), dtype=float), 1e-3
-    position = CubicSpline(moment, base_from_gripper[:, :3, 3])
-    rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
-    rotation_between = rotation(moment + little) * rotation(moment - little).inv()
-    return np.concatenate([position(moment, 1), rotation_between.as_rotvec() / (2 * little)], axis=1)
+    yield Row(kind=FindingKind.TOOL_SAGS, columns=_flat(sag), unit=0.1)
 
 
 def _flat(columns: Float[ndarray, "n 6 d"]) -> Float[ndarray, "s d"]:
@@ -274,158 +397,123 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
     return JointOffsets(offset, size * np.sqrt(np.maximum(1 - size**2 * known, 0.0)), size)
 
 
+TESTED_IF_GIVEN = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+"""Intrinsics that are tested if they were given."""
+TESTED_IF_ESTIMATED = ("fx", "p1", "p2")
+"""Intrinsics that are tested of estimated ones, for which fx = fy and p1 = p2 = 0 was assumed."""
 OfImage = Literal["focal", "shear", "x", "y"]
 """Names of the OF_IMAGE parameters of each image, in the order of the rows of `Problem.directions`."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Alternatives:
-    """Normal equations of e parameters of one camera that may be freed; all adjusted unknowns are eliminated.
+def tested_intrinsics(model: Adjustment) -> list[str]:
+    """Return the names of the parameters that the row "intrinsics contradict the images" tests.
 
-    The e parameters are the camera's q intrinsics in `units`; then focal lengths, shears, x and y offsets of its m
-    images (problem.OF_IMAGE); then s1 to s4 of the thin prism.
+    A given distortion that folds over was not used, which its prior shows; it is not tested either.
     """
-
-    hessian: Float[ndarray, "e e"]
-    right: Float[ndarray, " e"]
-    """Negative gradient."""
-    total: Float[ndarray, " e"]
-    """Present value of each parameter from `Problem.freed`, 0 if none was freed."""
-    place_by_column: Float[ndarray, "6 e"]
-    """Derivative of the camera's pose (m, rad; axes of its parent) by each parameter."""
-    images: int
-    """Number of images of the camera."""
-    freedom: int
-    """Degrees of freedom of the reported poses' residuals, used for F tests; images have far more."""
-    dispersion: float
-    """Ratio of the gradient's actual variance to the variance that the observations' weights imply."""
-    names: tuple[str, ...]
-    """Names of the camera's parameters."""
-    units: Float[ndarray, " q"]
-    """Unit of each intrinsic parameter: fx and fy for focal lengths, image width for cx and cy, else 1."""
-    distance: Float[ndarray, " m"]
-    """Median depth of the points of each image (m)."""
-    down_in_camera: Float[ndarray, "m 3"]
-    """Direction of gravity (−z of the base) in the camera frame of each image."""
-
-    @property
-    def columns(self) -> int:
-        """Number e of parameters that may be freed."""
-        return len(self.right)
-
-    def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
-        """Return p unit vectors (columns), each of which selects one of the camera's intrinsics by its name."""
-        return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
-
-    def of_images(self, parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Return p directions (columns) that change one parameter of the m images by the columns of `shares`."""
-        out = np.zeros((self.columns, shares.shape[1]))
-        first = len(self.names) + get_args(OfImage).index(parameter) * self.images
-        out[first : first + self.images] = shares
-        return out
+    assert model.camera is not None
+    prior, tested = model.solution.problem.cameras[model.camera], TESTED_IF_ESTIMATED
+    names, loose = parameter_names(prior.intrinsics), set[str]()
+    if model.is_given:
+        std, tested = np.sqrt(prior.directions**2 @ prior.std**2), TESTED_IF_GIVEN
+        each = zip(names[4:], std[4:], strict=True)
+        loose = {name for name, one in each if one >= ESTIMATED.get(name, np.inf)}
+    return [name for name in tested if name in names and name not in loose]
 
 
-@dataclass(frozen=True)
-class ScoreTest:
-    """Result of the score test of p linear combinations of camera parameters."""
+def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
+    """Yield the effects on the tested camera: focal lengths, shears and offsets of its images, thin prism, intrinsics.
 
-    log_p: float
-    """Log p-value: chance of this gain or a larger one without the effect."""
-    covariance: Float[ndarray, "p p"]
-    """Covariance of the p coefficients."""
-    shift: Float[ndarray, "6"]
-    """Change of the camera's pose when the combinations are free (m, rad; axes of its parent)."""
-
-
-def first_x(state: State) -> Transform:
-    """Return gripper_from_camera of the arm's first wrist camera."""
-    return state.x[0]
-
-
-def alternatives(
-    solution: Solution,
-    camera: int = 0,
-    place: Callable[[State], Transform] = first_x,
-    model_error_std: float | None = None,
-) -> Alternatives:
-    """Return the normal equations of all parameters of one camera that may be freed, or were freed, about a solution.
-
-    `place` returns the pose of the camera on its parent (gripper or base). `model_error_std` is the size (image widths)
-    of the distortion that no camera model expresses; None: as estimated.
+    A common error of the focal length is free beside all others. With fewer than `min_images` images, wrong intrinsics
+    are the only effect. A change of the focal length has one row for each image at which it may happen.
     """
-    problem, images = solution.problem, solution.images
-    observations = problem.observations
-    assert observations is not None
-    mine = np.flatnonzero(observations.camera == camera)
-    units, names = (
-        rows_of(problem, camera, mine, problem.n_images)[1],
-        parameter_names(problem.cameras[camera].intrinsics),
+    problem, state = model.solution.problem, model.solution.state
+    observations, view = problem.observations, model.solution.images.view
+    assert observations is not None and model.camera is not None
+    camera, mine = (
+        problem.cameras[model.camera].intrinsics,
+        np.flatnonzero(observations.camera == model.camera),
     )
-    wider, total, first = _with_one_camera_free(solution, camera, mine, model_error_std)
+    names, m = parameter_names(camera), len(mine)
+    every = np.eye(len(names) + OF_IMAGE * m + PRISM)
+
+    def of_images(parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Return the directions that change one parameter of the m images by the columns of `shares`."""
+        first = len(names) + get_args(OfImage).index(parameter) * m
+        return every[:, first : first + m] @ shares
+
+    tested = every[:, [names.index(name) for name in tested_intrinsics(model)]]
+    yield Row(kind=FindingKind.INTRINSICS, columns=tested)
+    if m < min_images:
+        return
+    common = every[:, :2].sum(1, keepdims=True)
+    of_centre = np.concatenate([common, every[:, 2:4]], axis=1)
+    # An image without points gets the median distance.
+    distance = np.array([np.median(view.depth[observations.image == k]) if (observations.image == k).any() else np.nan
+                         for k in mine])  # fmt: skip
+    far = np.log(np.where(np.isfinite(distance), distance, np.nanmedian(distance)))
+    by_distance = of_images("focal", (far - far.mean())[:, None])
+    unit, each = float(np.ptp(far)), of_images("focal", differences(m))
+    yield Row(kind=FindingKind.FOCUS_BY_DISTANCE, columns=by_distance, nuisance=common, unit=unit)
+    yield Row(kind=FindingKind.FOCUS_BY_IMAGE, columns=each, nuisance=common)
+    for kind, shares in (
+        (FindingKind.ROLLING_SHUTTER, np.ones((m, 1))),
+        (FindingKind.ROLLING_SHUTTER_BY_IMAGE, np.eye(m)),
+    ):
+        yield Row(kind=kind, columns=of_images("shear", shares), nuisance=common, unit=camera.fx)
+    # Gravity in the camera frame: −z of the base.
+    base_from_camera = (
+        state.z[0] @ state.world_from_rig[observations.rig[mine]] @ state.rig_from_camera[model.camera]
+    )
+    down = -base_from_camera[:, 2, :3, None]
+    sag = np.concatenate([of_images("x", down[:, 0]), of_images("y", down[:, 1])], axis=1)
+    yield Row(kind=FindingKind.CENTRE_SAGS, columns=sag, nuisance=of_centre, unit=camera.width)
+    places = range(LEAST_ZOOMED, m - LEAST_ZOOMED + 1)
+    for k in places:
+        after = of_images("focal", ((np.arange(m) >= k) - (m - k) / m)[:, None])
+        yield Row(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
+    if len(problem.cameras) == 1:  # all images have the same lens
+        yield Row(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
+
+
+def camera_scores(solution: Solution, camera: int) -> Scores:
+    """Return the cost of changes of the e parameters of one camera (`Row`) from their values in a solution.
+
+    What the solution has freed already remains free.
+    """
+    problem, likely, state = solution.problem, solution.most_likely, solution.images.state
+    rows, units, weak = _rows_of(problem, camera)
+    first = problem.columns.cameras.stop
+    each = np.zeros((len(problem.directions), len(rows)))
+    each[rows] = np.diag(units)
+    freed = np.concatenate([problem.directions[:, first - len(problem.freed_std) :], each], axis=1)
+    wider = image_evidence(
+        with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std, weak]),
+        replace(state, camera_steps=np.insert(state.camera_steps, first, np.zeros(len(rows)))),
+    )
     # The arms are at the most likely state, the images at the state of the evidence.
-    at, likely, begin = wider.state, solution.most_likely, problem.arm_unknowns
-    at = replace(at, x=likely.x, scale=likely.scale, z=likely.z)
+    at = replace(wider.state, x=likely.x, scale=likely.scale, z=likely.z)
     equations = pose_equations(wider.problem, at, wider).equations
     found = solve_equations(equations, solution.log_sizes)
     hessian = equations.jacobian.T @ found.weighed + equations.prior_information
     right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
-    rest = begin + first + np.arange(len(units))
+    rest = problem.arm_unknowns + first + np.arange(len(rows))
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
     coupling = hessian[np.ix_(kept, rest)]
     by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
-    # The camera's pose does not depend on intrinsics or parameters of images.
-    derivative = solution.derivative(place)
-    after = derivative.shape[1] - begin - problem.columns.boards.start
-    by_kept = np.zeros((6, len(hessian)))
-    by_kept[:, :begin] = derivative[:, :begin]
-    by_kept[:, len(hessian) - after :] = derivative[:, derivative.shape[1] - after :]
-    now, rig, image = solution.state, observations.rig[mine], observations.image
-    # An image without points gets the median distance.
-    depth = wider.view.depth
-    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
-    return Alternatives(
-        hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
-        right=right[rest] - by_column.T @ right[kept],
-        total=total,
-        place_by_column=-by_kept[:, kept] @ by_column,
-        images=len(mine),
-        freedom=max(len(equations.residual) - begin, 1),
-        dispersion=_dispersion(images),
-        names=names,
-        units=units[: len(names)],
-        distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
-        down_in_camera=-(now.z[0] @ now.world_from_rig[rig] @ now.rig_from_camera[camera])[:, 2, :3],
+    return Scores(
+        information=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
+        gradient=right[rest] - by_column.T @ right[kept],
+        freedom=max(len(equations.residual) - problem.arm_unknowns, 1),
+        dispersion=_dispersion(solution.images),
     )
 
 
-def _with_one_camera_free(
-    solution: Solution, camera: int, mine: Int[ndarray, " m"], model_error_std: float | None
-) -> tuple[ImageEvidence, Float[ndarray, " f"], int]:
-    """Return the images' evidence with all parameters of one camera free.
-
-    Also return the present values of these parameters, in their units, and the first of their columns. `mine` are the
-    images of the camera. The new columns replace those that were freed for this camera.
-    """
-    problem, state = solution.problem, solution.images.state
-    rows, units, weak = rows_of(problem, camera, mine, problem.n_images)
-    own = len(problem.directions.T) - len(problem.freed_std)
-    before, steps = problem.directions[:, own:], state.camera_steps[own : problem.columns.cameras.stop]
-    others, each = ~before[rows].any(0), np.zeros((len(before), len(rows)))
-    each[rows] = np.diag(units)
-    total, sizes = before[rows] @ steps / units, state.model_error_std
-    camera_steps = np.r_[
-        state.camera_steps[:own], steps[others], total, state.camera_steps[own + len(steps) :]
-    ]
-    freed = np.concatenate([before[:, others], each], axis=1)
-    wider = image_evidence(
-        with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std[others], weak]),
-        replace(
-            state,
-            camera_steps=camera_steps,
-            model_error_std=sizes if model_error_std is None else np.full_like(sizes, model_error_std),
-        ),
-    )
-    return wider, total, own + int(others.sum())
+def _rows_of(
+    problem: Problem, camera: int
+) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
+    """Return problem.rows_of for a camera of a problem with observations: rows, units and weak prior std."""
+    assert problem.observations is not None
+    return rows_of(problem, camera, np.flatnonzero(problem.observations.camera == camera), problem.n_images)
 
 
 def _dispersion(images: ImageEvidence) -> float:
@@ -442,7 +530,7 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return directions (columns) in the e parameters of `Alternatives` that give each of p images its own focal length.
+    """Return directions (columns) in the e parameters of a camera (`Row`) that give each of p images a focal length.
 
     The first column is the common focal length, the others are differences between images; `images` is p.
     """
@@ -456,35 +544,3 @@ def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
 def differences(count: int) -> Float[ndarray, "n d"]:
     """Return an orthonormal basis (columns) of the vectors of length n = `count` whose sum is 0; d = n − 1."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
-
-
-def test_combinations(
-    equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"]
-) -> ScoreTest:
-    """Return the score test of p directions `free` (columns over the e parameters of `equations`).
-
-    The q directions `beside` are free in both hypotheses.
-    """
-    q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
-    fewer, more = spanned(beside), spanned(both)
-    (without, gain_without, _), (step, gain, covariance) = (_step(equations, one) for one in (fewer, more))
-    spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
-    to_value = np.linalg.pinv(both)[q:] @ more
-    return ScoreTest(
-        float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
-        spread * to_value @ covariance @ to_value.T,
-        equations.place_by_column @ (more @ step - fewer @ without),
-    )
-
-
-def _step(
-    equations: Alternatives, free: Float[ndarray, "e r"]
-) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
-    """Return the estimate of r coefficients, the gain (decrease of twice the cost), and the estimate's covariance.
-
-    The coefficients belong to the columns of `free`, directions in the e parameters of `equations`.
-    """
-    covariance = np.linalg.inv(free.T @ equations.hessian @ free)
-    right = free.T @ equations.right
-    step = covariance @ right
-    return step, float(right @ step), covariance

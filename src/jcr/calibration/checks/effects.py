@@ -1,72 +1,127 @@
-"""Forward selection of additional effects on the camera and on the gripper poses, until none is significant.
+"""Forward selection of effects that the model lacks, on the camera and on the gripper poses, until none is significant.
 
-In each round the best effect on the camera (checks/camera.py) competes with the best one on the poses
-(estimation/hypotheses.py). If both are significant, the cause is the one that makes the other insignificant. Confirmed
-effects are estimated in all further tests, and the final adjustment includes those that its model can represent.
+In each round the best effect on the camera competes with the best one on the poses (estimation/hypotheses.py). If both
+are significant, the cause is the one that makes the other insignificant. Confirmed effects are estimated in all further
+tests, and the final adjustment includes those that its model can represent.
 """
 
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
 from jcr.calibration.case import Case, some_points
-from jcr.calibration.checks.camera import (
-    FOCUS,
-    LOG_P,
-    MATERIAL,
-    MIN_IMAGES,
-    MOST_BYTES,
-    CameraAdjustment,
-    CameraEffect,
-    best_camera_effect,
-    camera_finding,
-    is_material,
-    of_case,
-    rows_of_arm,
-    with_effect_free,
-)
 from jcr.calibration.hand_eye import judged, poses_agree
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
-from jcr.camera import parameters, with_thin_prism
+from jcr.camera import parameter_names, parameters, with_thin_prism
+from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import (
-    PLAUSIBLE,
     STRAINS,
+    TESTED_IF_GIVEN,
+    Adjustment,
+    Row,
     Test,
-    arm_rows,
-    best_tests,
+    camera_rows,
+    confirm,
     explains_by_order,
-    order_rows,
+    mean_square,
+    pose_rows,
+    rank,
+    tested_intrinsics,
 )
-from jcr.estimation.pose_equations import Region, pose_equations
-from jcr.estimation.problem import SCALE, UNKNOWNS, columns_of_arm, pose_problem
-from jcr.estimation.robot_noise import Equations, LogSizes, most_likely, solve_equations
-from jcr.estimation.solve import Solution
-from jcr.findings import Finding, FindingKind, kinds_of
+from jcr.estimation.pose_equations import Region
+from jcr.estimation.problem import OF_IMAGE, SCALE, UNKNOWNS, pose_problem
+from jcr.estimation.robot_noise import solve_equations
+from jcr.estimation.solve import Solution, solve
+from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
 from jcr.geometry import Poses, step_between
+from jcr.rounding import significant
 
 AT_ONCE = 3
 """Largest number of effects that are reported for one capture."""
-LOG_ALPHA = {kind: np.log(1e-6) for kind in kinds_of("strain")}
-"""Largest log p-value of significant effects of the arm. In 132 simulated captures of 8 to 20 images without such
-effects, 72 of them by arms with joint offsets up to 1° and link errors of 1 mm, no p-value is below 1e-5."""
-LOG_ALPHA_OF_ORDER = np.log(1e-4)
-"""Largest log p-value of significant effects that depend on the order of the images."""
-SHARES = frozenset({FindingKind.SLIP, FindingKind.BASE_MOVED, FindingKind.DRIFT})
-"""Effects with one motion times a known factor per image; also compared with other orders of the images."""
-EFFECTS = kinds_of("camera", "strain") | SHARES | {FindingKind.DELAY}
-"""Kinds of findings that these tests make."""
-TINY_PX, TINY = 0.5, 0.1
-"""Displacement in the corner of the image (px), and change of the calibration in units of LARGE_MOTION, up to which
-different focal lengths are a remark and no warning."""
+MATERIAL = 0.5
+"""Smallest shift of the camera, in standard deviations on at least one axis, for which an effect is reported."""
+MIN_IMAGES = 6
+"""Fewest images with which effects other than wrong intrinsics are tested."""
+MOST_POINTS = 800
+"""Largest number of points in these tests; more points do not make them more sensitive."""
+MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
+"""Largest size (bytes) of the Jacobian by the parameters of each image, and its size per observation and image: 58 000
+observations of 200 images would need 740 MB, and the equations several times that."""
 LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
 """Motion of the camera or the base (m, rad) above which the calibration is rejected; a smaller motion is added to the
 uncertainty."""
+TINY_PX, TINY = 0.5, 0.1
+"""Displacement in the corner of the image (px), and change of the calibration in units of LARGE_MOTION, up to which
+different focal lengths are a remark and no warning."""
+OFF = 0.01, 0.01, 0.015, 0.015
+"""Differences of fx, fy, cx, cy from given ones, relative to the focal length, up to which Wald's test is not applied:
+factory values and calibrations of another day are off by 0.3 to 0.9 % and a few pixels."""
+SURE = 2.0
+"""Smallest reported size, in standard deviations, of an effect with a parameter per image: with many images, smaller
+ones become significant as soon as the noise is slightly underestimated."""
+PAIRS = (
+    (("fx", "fy"), "focal lengths of", " px", 1),
+    (("cx", "cy"), "a principal point of", " px", 1),
+    (("k1", "k2"), "a distortion k1, k2 of", "", 3),
+    (("p1", "p2"), "a distortion p1, p2 of", "", 4),
+)
+"""Parameters that the message states together: their names, words, unit and number of decimals."""
+NAMED = 4.0
+"""Difference of a parameter, in standard deviations, from which the message states its value (4: p = 6e-5)."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Significance level, plausible size and finding of one kind of effect."""
+
+    concerns: Concerns
+    """Part of the capture that the remedy changes."""
+    alpha: float
+    """Largest significant p-value, corrected for the number of tested places."""
+    largest: tuple[float, float] = (np.inf, np.inf)
+    """Largest plausible estimate: (m, rad) of a motion, else the parameters' norm and no second limit."""
+    least_px: float = 0.0
+    """Smallest reported size (px); smaller ones are remaining errors of the distortion model."""
+
+
+OF_STRAIN = 1e-6
+"""Significance level of effects of the arm: in 132 simulated captures of 8 to 20 images without such effects, 72 of
+them by arms with joint offsets up to 1° and link errors of 1 mm, no p-value is below 1e-5."""
+POLICIES = {
+    FindingKind.SLIP: Policy("mount", 1e-4, (0.12, np.radians(45.0))),
+    FindingKind.BASE_MOVED: Policy("poses", 1e-4, (0.2, np.radians(20.0))),
+    FindingKind.DRIFT: Policy("mount", 1e-4, (0.03, np.radians(10.0))),
+    FindingKind.DELAY: Policy("poses", 1e-4, (1.0, np.inf)),
+    FindingKind.LENGTHS: Policy("robot", OF_STRAIN, (0.1, np.inf)),
+    FindingKind.BASE_LEANS: Policy("robot", OF_STRAIN, (0.3, np.inf)),
+    FindingKind.TOOL_SAGS: Policy("robot", OF_STRAIN, (0.3, np.inf)),
+    FindingKind.FOCUS_BY_DISTANCE: Policy("images", 1e-6),
+    FindingKind.FOCUS_BY_IMAGE: Policy("images", 1e-6),
+    FindingKind.ZOOM: Policy("images", 1e-6),
+    FindingKind.ROLLING_SHUTTER: Policy("images", 1e-6, least_px=3.0),
+    FindingKind.ROLLING_SHUTTER_BY_IMAGE: Policy("images", 1e-6, least_px=3.0),
+    FindingKind.CENTRE_SAGS: Policy("mount", 1e-6, least_px=3.0),
+    FindingKind.THIN_PRISM: Policy("intrinsics", 1e-6, least_px=1.0),
+    FindingKind.INTRINSICS: Policy("intrinsics", 1e-6),
+}
+"""Effects that are tested, by the kind of their finding."""
+ALPHA_IF_GIVEN = 1e-4
+"""Policy.alpha of wrong intrinsics that were given: a single hypothesis, which must also exceed OFF or MATERIAL."""
+FOCUS = {FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE, FindingKind.ZOOM}
+"""Effects of a focal length that differs between images; at most one is reported, and its size is signed."""
+NEARLY_ALL = 0.9
+"""Fraction of the squared focal-length differences that a simpler effect must explain to replace FOCUS_BY_IMAGE."""
+CONFIRMED_AT_MOST = {True: 2, False: 3}
+"""Number of kinds of effects that are confirmed, on the camera (True), each by an adjustment, and on the poses."""
+OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
+"""Effects with a separate parameter for each image."""
 
 
 def check_effects(case: Case) -> Case:
@@ -77,7 +132,14 @@ def check_effects(case: Case) -> Case:
     """
     if not case.is_open:
         return case
-    longer = _with_rejected_runs(case)
+    longer, in_order = case, with_rejected_runs(case.hand_eye.inliers)
+    if (in_order != case.hand_eye.inliers).any():
+        # A slip of the camera may reject consecutive images, which are then used again.
+        longer = replace(case, hand_eye=case.hand_eye.with_used(in_order), chosen_tracks=None, adjusted=None)
+        try:
+            longer = longer if case.adjusted is None else replace(longer, adjusted=adjust_case(longer))
+        except np.linalg.LinAlgError:
+            longer = case
     if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
         evidence = case.reconstruction.evidence
         found = effects_of_fit(
@@ -91,156 +153,237 @@ def check_effects(case: Case) -> Case:
             priors=case.priors,
         )
         return case.after(found)
-    state, findings = effects(of_case(longer))
-    return case.after(findings) if longer is not case else _adopted(case, state, findings)
+    model, findings = effects(of_case(longer))
+    return case.after(findings) if longer is not case else _adopted(case, model, findings)
 
 
-def effects(state: CameraAdjustment) -> tuple[CameraAdjustment, tuple[Finding, ...]]:
-    """Return the adjustment with all confirmed effects on one camera and its gripper poses, and a finding per effect.
-
-    A camera effect is not reported if gripper poses and images contradict each other even with the effect estimated.
-    """
-    findings, dismissed, passed = list[Finding](), list[CameraEffect](), set[FindingKind]()
-    camera_explains = True
-    while len(findings) < AT_ONCE:
-        of_camera, log_chance = best_camera_effect(state, dismissed) if camera_explains else (None, 0.0)
-        poses = _tested_poses(state)
-        test = None if state.arm is None else best_pose_effect(poses, passed)
-        if test is not None and (of_camera is None or _explains(state, test, of_camera, log_chance)):
-            passed.add(test.row.kind)
-            found = pose_finding(test, poses, state.names, state.std)
-            if found is not None:
-                findings.append(found)
-                state = state.with_free(state.found, (*state.poses, test.row))
-        elif of_camera is not None:
-            after = with_effect_free(state, of_camera)
-            found = None if after is None else camera_finding(after, state)
-            camera_explains = after is None or poses_agree(after.adjusted.noise)
-            if after is None or found is None or not camera_explains or not is_material(found, after):
-                dismissed.append(of_camera)
-                continue
-            state = after
-            findings.append(found)
-        else:
-            break
-    return state, tuple(findings)
-
-
-def _explains(state: CameraAdjustment, test: Test, of_camera: CameraEffect, log_chance: float) -> bool:
-    """Return True if the pose effect `test` is the cause of the misfit, False if the camera effect `of_camera` is.
-
-    Both are significant; each is tested again with the other one estimated. `log_chance` is the logarithm of the camera
-    effect's p-value.
-    """
-    with_camera = with_effect_free(state, of_camera)
-    if with_camera is None:
-        return True
-    left = best_pose_effect(_tested_poses(with_camera), {row.kind for row in state.poses})
-    poses_remain = left is not None and left.row.kind is test.row.kind
-    camera_remains = state.with_free(state.found, (*state.poses, test.row)).log_p(of_camera) <= LOG_P
-    return test.log_p < log_chance if poses_remain == camera_remains else poses_remain
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmEquations:
-    """Equations of all gripper poses, with the rows, the columns and the poses of one arm."""
-
-    equations: Equations
-    log_sizes: LogSizes
-    """Logarithms of the sizes of the robot errors."""
-    base_from_gripper: Poses
-    """Reported gripper poses of the arm."""
-    rows: slice
-    """Rows of the arm's poses, 6 per pose."""
-    columns: Int[ndarray, "12"]
-    """Columns of the arm's gripper_from_camera (6), then of its base_from_recon (6)."""
-
-
-def _tested_poses(state: CameraAdjustment) -> ArmEquations:
-    """Return the gripper pose equations of the arm that is tested together with the camera."""
-    adjusted, arm = state.adjusted, state.arm or 0
-    return ArmEquations(
-        equations=adjusted.equations,
-        log_sizes=adjusted.log_sizes,
-        base_from_gripper=adjusted.problem.arms[arm].base_from_gripper,
-        rows=rows_of_arm(adjusted.problem, arm),
-        columns=columns_of_arm(arm),
+def of_case(case: Case) -> Adjustment:
+    """Return the case's adjustment in the form that the tests of effects need; many points are reduced to a subset."""
+    tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
+    free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
+    if len(case.used) >= MIN_IMAGES and is_many:
+        case = replace(case, chosen_tracks=some_points(tracks, most, MOST_POINTS))
+        case = replace(case, adjusted=adjust_case(case, combinations=free))
+    assert case.adjusted is not None
+    return Adjustment(
+        solution=case.adjusted,
+        adjust=lambda combinations, errors: adjust_case(
+            case, combinations=combinations, confirmed_errors=errors
+        ),
+        names=[case.names[row] for row in case.used],
+        std=np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged,
+        is_given=case.capture.intrinsics is not None,
+        rows=() if free is None else (Row(kind=FindingKind.FOCUS_BY_IMAGE, columns=free),),
     )
 
 
-def best_pose_effect(poses: ArmEquations, passed: Collection[FindingKind]) -> Test | None:
-    """Return the test of the most significant effect on the poses of an arm; kinds in `passed` are not tested.
+def effects_of_fit(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    hand_eye: Calibration,
+    names: Sequence[str],
+    **known: Any,
+) -> tuple[Finding, ...]:
+    """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
-    Return None without a significant effect, if the effect is implausibly large, or if poses and images contradict each
-    other even with the effect estimated: the poses then have another fault. A motion counts only if it is more
-    significant in the true order of the images than in nearly all random orders.
+    Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
+    `known` are keyword arguments of `pose_problem`, such as the covariance of the camera poses.
     """
-    equations, own, gripper = poses.equations, poses.rows, poses.base_from_gripper
-    n, s = len(gripper), len(equations.residual)
-    if n < MIN_IMAGES:
-        return None
-    by_motion = equations.jacobian[own][:, poses.columns].reshape(n, 6, 12)
-    by_x, by_z = by_motion[:, :, :6], by_motion[:, :, 6:]
-    rows = [
-        replace(row, columns=np.pad(row.columns, ((own.start, s - own.stop), (0, 0))))
-        for row in (*order_rows(gripper, by_x, by_z), *arm_rows(gripper))
-        if row.kind not in passed
-    ]
-    for test in best_tests(equations, poses.log_sizes, rows):
-        kind, place = test.row.kind, test.row.place
-        if test.log_p > LOG_ALPHA.get(kind, LOG_ALPHA_OF_ORDER):
+    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
+    problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
+    used = with_rejected_runs(hand_eye.inliers)
+    solution = solve(replace(problem, used=used), state, averaged=False)
+    model = Adjustment(
+        solution=solution,
+        adjust=lambda _, __: solution,
+        names=[names[k] for k in np.flatnonzero(used).tolist()],
+        std=np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged,
+        camera=None,
+    )
+    # Errors of camera poses resemble effects of the arm, which only a bundle adjustment separates from them.
+    return effects(model, kinds_of("strain"), at_most=1)[1]
+
+
+def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
+    """Return the mask of the used images, extended by rejected images whose neighbour is rejected too."""
+    rejected = np.pad(~used, 1)
+    return used | rejected[:-2] | rejected[2:]
+
+
+def effects(
+    model: Adjustment, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
+) -> tuple[Adjustment, tuple[Finding, ...]]:
+    """Return the adjustment with at most `at_most` confirmed effects on one camera and its arm, and their findings.
+
+    Effects of the kinds `passed` are not tested.
+    """
+    findings, passed = list[Finding](), {*passed, *(row.kind for row in model.rows)}
+    while len(findings) < at_most:
+        of_camera, of_poses = (_best(model, passed, camera) for camera in (True, False))
+        best = of_camera or of_poses
+        if best is None:
+            break
+        if (
+            of_camera is not None
+            and of_poses is not None
+            and _explains(model, of_poses[0], of_camera[0], passed)
+        ):
+            best = of_poses
+        test, found = best
+        findings.append(found)
+        passed.add(test.row.kind)
+        rows = (*model.rows, test.row)
+        is_last = len(findings) == at_most
+        model = test.after or (replace(model, rows=rows) if is_last else model.with_rows(rows))
+    return model, tuple(findings)
+
+
+def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
+    """Return the most significant effect on the camera, or else on the poses, and its finding; None without one.
+
+    Kinds in `passed` are not tested. There is no effect if the best estimate is implausibly large, or if poses and
+    images contradict each other even with the effect estimated: they then have another fault. A motion counts only if
+    it is more significant in the true order of the images than in nearly all random orders.
+    """
+    tests = list[Test]()
+    for row in _promising(model, passed, of_camera):
+        with suppress(np.linalg.LinAlgError):
+            tests.append(confirm(model, row))
+    for test in sorted(tests, key=lambda one: one.log_p):
+        kind, log_p = test.row.kind, test.log_p
+        if kind is FindingKind.INTRINSICS:
+            test = replace(test, log_p=(log_p := min(log_p, log_p_of_given(model))))
+        if log_p > _log_alpha(kind, model) or _has_simpler_cause(test, tests):
             continue
-        if not test.is_within(PLAUSIBLE[kind]) or not poses_agree(test.noise):
+        is_motion = test.row.motion is not None
+        sizes = np.linalg.norm(test.estimate.reshape(1 + is_motion, -1), axis=1)
+        if (sizes > POLICIES[kind].largest).any() or not poses_agree(test.noise):
             return None
-        if kind in SHARES:
-            share = np.linspace(-0.5, 0.5, n) if place == 0 else (np.arange(n) >= place).astype(float)
-            others, by = (
-                (own.start // 6, (s - own.stop) // 6),
-                by_z if kind is FindingKind.BASE_MOVED else by_x,
-            )
-            by, share = np.pad(by, (others, (0, 0), (0, 0))), np.pad(share, others)
-            images = slice(own.start // 6, own.stop // 6)
-            if not explains_by_order(equations, poses.log_sizes, by, share, images):
-                continue
-        return test
+        if is_motion and not explains_by_order(model.pose_scores, test.row):
+            continue
+        if (found := finding_of(test, model)) is not None:
+            return test, found
     return None
 
 
-def pose_finding(
-    test: Test, poses: ArmEquations, names: Sequence[str], std: Float[ndarray, "6"]
-) -> Finding | None:
-    """Return the finding of a significant effect on the poses; None if it moves the camera by less than 0.5 `std`.
+def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> list[Row]:
+    """Return the rows to confirm, of the camera or else of the poses, the smallest p-value of the score test first.
 
-    `test` was made with the equations `poses`. `names` are the image names in order, `std` the standard deviations of
-    the camera's pose (m, rad).
+    The score test finds every effect on the camera, except given intrinsics that are wrong, because the model includes
+    their errors; these are compared with the adjusted ones. Effects on the poses are found by the confirmation alone.
     """
-    own, moved = test.shift[poses.columns[:6]], test.estimate
-    kind, place, p = test.row.kind, test.row.place, float(np.exp(max(test.log_p, -700)))
-    if kind.row.group == "strain":
-        columns = test.row.prior_std * test.row.columns
-        straight = straight_shift(poses.equations, poses.log_sizes, columns)[poses.columns[:6]]
-        if not (np.abs([own, straight]) > MATERIAL * std).any():
-            return None
-        return Finding.of(kind, "warns", "robot", p=p, **_size_of_strain(test))
-    if kind is FindingKind.DELAY:
-        moved = own
-    if not (np.abs(moved) > MATERIAL * std).any():
+    if of_camera and model.camera is not None:
+        passed = {*passed, *(FOCUS if FOCUS & {*passed} else ())}
+        ranked = rank(model, [row for row in camera_rows(model, MIN_IMAGES) if row.kind not in passed])
+        rows = [row for row, log_p in ranked if log_p <= _log_alpha(row.kind, model)]
+        if not rows and not any(row.of_camera for row in model.rows):
+            limit = _log_alpha(FindingKind.INTRINSICS, model)
+            is_off = log_p_of_given(model) <= limit
+            rows = [row for row, _ in ranked if row.kind is FindingKind.INTRINSICS and is_off]
+    elif not of_camera and model.arm is not None and len(model.poses[0]) >= MIN_IMAGES:
+        rows = [row for row, _ in rank(model, [one for one in pose_rows(model) if one.kind not in passed])]
+    else:
+        return []
+    best: dict[FindingKind, Row] = {}
+    for row in rows:
+        best.setdefault(row.kind, row)
+    return list(best.values())[: CONFIRMED_AT_MOST[of_camera]]
+
+
+def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
+    """Return the logarithm of the largest significant p-value of a kind of effect; given intrinsics have another one."""
+    is_given = kind is FindingKind.INTRINSICS and model.is_given
+    return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
+
+
+def _has_simpler_cause(test: Test, tests: Sequence[Test]) -> bool:
+    """Return whether `test` is one focal length per image, and a simpler effect of `tests` explains nearly as much.
+
+    The simpler effect is a focal length that follows the distance or changes once.
+    """
+    if test.row.kind is not FindingKind.FOCUS_BY_IMAGE:
+        return False
+    focal = test.row.columns @ test.estimate
+    simple = [one.row.columns[:, 0] for one in tests if one.row.kind in FOCUS - {test.row.kind}]
+    return any((along @ focal) ** 2 > NEARLY_ALL * (along @ along) * (focal @ focal) for along in simple)
+
+
+def _explains(model: Adjustment, of_poses: Test, of_camera: Test, passed: Collection[FindingKind]) -> bool:
+    """Return True if the effect on the poses is the cause of the misfit, False if the effect on the camera is.
+
+    Both are significant; each is tested again with the other one estimated.
+    """
+    assert of_camera.after is not None
+    left = _best(of_camera.after, passed, False)
+    poses_remain = left is not None and left[0].row.kind is of_poses.row.kind
+    ((_, log_p),) = rank(model.with_rows((*model.rows, of_poses.row)), [of_camera.row])
+    camera_remains = log_p <= np.log(POLICIES[of_camera.row.kind].alpha)
+    return of_poses.log_p < of_camera.log_p if poses_remain == camera_remains else poses_remain
+
+
+def log_p_of_given(model: Adjustment) -> float:
+    """Return the logarithm of the p-value of Wald's test that the given focal lengths and principal point are exact.
+
+    It is 0 (p = 1) for differences below OFF (1 to 1.5 % of the focal length), and without given intrinsics.
+    """
+    assert model.camera is not None
+    given = model.solution.problem.cameras[model.camera].intrinsics
+    by = (parameters(model.intrinsics) - parameters(given))[:4]
+    if not model.is_given or (np.abs(by) <= given.fx * np.array(OFF)).all():
+        return 0.0
+    ratio = mean_square(by, model.solution.intrinsics_covariance(model.camera)[:4, :4])
+    return float(f_distribution.logsf(ratio, 4, model.pose_scores.freedom))
+
+
+def finding_of(test: Test, model: Adjustment) -> Finding | None:
+    """Return the finding of a significant effect, which `test` found in `model`; None if it is small.
+
+    A small effect moves the camera by less than half a standard deviation (MATERIAL), or is small in pixels. Given
+    intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
+    """
+    row, kind, after, std, estimate = test.row, test.row.kind, test.after, model.std, test.estimate
+    policy, severity, images = POLICIES[kind], "warns", ()
+    known, shift, moves = dict[str, Any](), test.shift, [test.shift]
+    if after is not None:
+        known = _size_of_camera_effect(test, after)
+        by = (parameters(after.intrinsics) - parameters(model.intrinsics)).tolist()
+        known |= {"intrinsics_shift": tuple(by)}
+        if kind is not FindingKind.INTRINSICS:
+            least = SURE * known["std"] if kind in OF_EACH else -np.inf
+            if known["value"] < max(least, policy.least_px or -np.inf):
+                return None
+        if kind is FindingKind.INTRINSICS and log_p_of_given(after) < 0:
+            std = np.zeros(6)
+        elif not std.any():
+            # The effect may be why the calibration is rejected, so the uncertainty after its adjustment is the measure.
+            std = np.sqrt(np.diag(after.solution.transform(after.place)[1]))
+        images = after.names[row.place - 1 : row.place + 1] if row.place else ()
+    elif row.motion is not None:
+        # The shift of the finding is the effect on gripper_from_camera; for a motion of the base, that on the fit.
+        moves = [estimate]
+        shift = np.r_[{FindingKind.SLIP: estimate, FindingKind.DRIFT: estimate / 2}.get(kind, shift[:6]), 0.0]
+        metres, radians = np.linalg.norm(estimate.reshape(2, 3), axis=1).tolist()
+        known = {"value": metres, "rotation": radians}
+        if row.place:
+            images = model.names[row.place - 1 : row.place + 1]
+            if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1]:
+                severity = "rejects"
+            count, longer = max((row.place, "before"), (len(model.names) - row.place, "after"))
+            known |= {"longer": longer, "count": float(count)}
+    elif kind is FindingKind.DELAY:
+        known = {
+            "value": float(estimate[0]),
+            "std": float(np.sqrt(test.covariance[0, 0])),
+            "unit": "interval",
+        }
+    else:
+        moves = [shift, straight_shift(model.solution, row.unit * row.columns)]
+        known, shift = _size_of_strain(test), None
+    if not any((np.abs(one[:6]) > MATERIAL * std).any() for one in moves):
         return None
-    # The shift of the finding is the effect on gripper_from_camera; for a motion of the base, that on the fit.
-    shift = {FindingKind.SLIP: moved, FindingKind.DRIFT: moved / 2}.get(kind, own)
-    known: dict[str, Any] = {"p": p, "shift": (*shift.tolist(), 0.0)}
-    if kind is FindingKind.DELAY:
-        size = {"value": float(test.estimate[0]), "std": float(np.sqrt(test.covariance[0, 0]))}
-        return Finding.of(kind, "warns", "poses", unit="interval", **size, **known)
-    metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1).tolist()
-    known |= {"value": metres, "rotation": radians}
-    if kind is FindingKind.DRIFT:
-        return Finding.of(kind, "warns", "mount", **known)
-    count, longer = max((place, "before"), (len(names) - place, "after"))
-    severity = "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns"
-    concerns = "mount" if kind is FindingKind.SLIP else "poses"
-    known |= {"longer": longer, "count": float(count)}
-    return Finding.of(kind, severity, concerns, names[place - 1], names[place], **known)
+    p = float(np.exp(max(test.log_p, -700)))
+    known |= {"p": p, "shift": None if shift is None else tuple(shift.tolist())}
+    return Finding.of(kind, severity, policy.concerns, *images, **known)
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
@@ -262,18 +405,69 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     return {"value": value, "std": std, "frame": frame, **dict(zip("xyz", axis.tolist(), strict=True))}
 
 
-def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]) -> Case:
+def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
+    """Return the fields of a finding for the size of an effect on the camera, and its standard deviation.
+
+    The size is the rms of the effect's parameters; for a thin prism it is the largest displacement of a point (px); for
+    wrong intrinsics each parameter is stated. `after` is the adjustment with the effect.
+    """
+    row, value, std = test.row, test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0.0))
+    problem = after.solution.problem
+    if row.kind is FindingKind.INTRINSICS:
+        return _intrinsics(after, std)
+    if row.kind is FindingKind.THIN_PRISM:
+        moved = problem.prism @ value
+        k = int(np.linalg.norm(moved, axis=1).argmax())
+        size = float(np.linalg.norm(moved[k]))
+        along = moved[k] / max(size, 1e-12) @ problem.prism[k]
+        return {"value": size, "std": float(np.sqrt(along @ test.covariance @ along))}
+    typical, count = row.unit * float(np.median(std)), len(value)
+    if row.kind in OF_EACH:
+        return {"value": row.unit * float(np.sqrt(value @ value / len(after.names))), "std": typical}
+    size = value[0] if row.kind in FOCUS else np.sqrt(np.mean(value**2))
+    return {"value": row.unit * float(size), "std": typical / float(np.sqrt(count))}
+
+
+def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]:
+    """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
+
+    `stds` holds the standard deviation of each tested parameter, in the units of `rows_of`.
+    """
+    assert after.camera is not None
+    camera, shown = after.solution.problem.cameras[after.camera].intrinsics, list[str]()
+    names = parameter_names(camera)
+    given, now = (
+        dict(zip(names, parameters(one).tolist(), strict=True)) for one in (camera, after.intrinsics)
+    )
+    units = {"fx": camera.fx, "fy": camera.fy, "cx": camera.width, "cy": camera.width}
+    tested = zip(tested_intrinsics(after), stds, strict=True)
+    std = {name: float(one) * units.get(name, 1.0) for name, one in tested}
+    before = "is given" if after.is_given else "was estimated first"
+    for pair, what, unit, digits in PAIRS:
+        if any(abs(now[name] - given[name]) > NAMED * std[name] for name in pair if name in std):
+            found, was = (", ".join(f"{of[name]:.{digits}f}" for name in pair) for of in (now, given))
+            surest = significant(max(std[name] for name in pair if name in std))
+            shown.append(f"{what} ({found}) ± {surest}{unit} where ({was}) {before}")
+    unsure = "other intrinsics than those used, no one of them surely by itself"
+    details: dict[str, Any] = {"source": "images", "shown": joined(shown or [unsure])}
+    for name in filter(now.__contains__, TESTED_IF_GIVEN):
+        details |= {name: now[name], f"{name}_given": given[name]}
+    details |= {f"{name}_std": one for name, one in std.items()}
+    return details if after.is_given else details | {"estimated": 1.0}
+
+
+def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Case:
     """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
     The effects were found with a subset of the points, and are now estimated from all points that memory permits.
     Camera effects that then change the calibration by at most half a standard deviation (MATERIAL) are dropped.
     """
-    free = state.combinations
+    free = model.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
     fewer = case
     if len(case.tracks.image) > most:
         fewer = replace(case, chosen_tracks=some_points(case.tracks, most), adjusted=None)
-    adjusted, adopted = with_effects(fewer, state, findings)
+    adjusted, adopted = with_effects(fewer, model, findings)
     if adjusted is None:
         return case.after(findings)
     before, refined = case.hand_eye, judged(refined_by(fewer, adjusted))
@@ -283,9 +477,9 @@ def _adopted(case: Case, state: CameraAdjustment, findings: tuple[Finding, ...])
     moved = np.abs(step_between(before.gripper_from_camera, refined.gripper_from_camera))
     std = np.sqrt(np.diag(before.covariance)[:6]) * before.converged
     if of_camera and not (moved > MATERIAL * std).any():
-        rest = tuple(one for one in state.found if one.kind not in of_camera)
+        rest = tuple(row for row in model.rows if row.kind not in of_camera)
         kept = tuple(one for one in findings if one.kind not in of_camera)
-        return _adopted(case, replace(state, found=rest), kept)
+        return _adopted(case, replace(model, rows=rest), kept)
     adopted = tuple(as_remark(one, moved, case.capture.image_size) for one in adopted)
     return fewer.after(adopted, refined, adjusted)
 
@@ -303,7 +497,7 @@ def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int,
 
 
 def with_effects(
-    case: Case, state: CameraAdjustment, findings: tuple[Finding, ...]
+    case: Case, model: Adjustment, findings: tuple[Finding, ...]
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
     """Return an adjustment with the effects on camera and arm as parameters, and the findings with remaining shifts.
 
@@ -311,19 +505,19 @@ def with_effects(
     the transform for the true poses, and the possible error of the scale, are the remaining shifts. A thin prism
     becomes part of the intrinsics. Return None as adjustment if there is no effect on camera or arm.
     """
-    strains = [row for row in state.poses if row.kind.row.group == "strain"]
+    strains = [row for row in model.rows if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):
         return None, findings
-    free = state.combinations
-    if any(one.kind is FindingKind.THIN_PRISM for one in state.found) and state.intrinsics.model != "fisheye":
-        camera = with_thin_prism(case.reconstruction.intrinsics)
-        case = replace(case, reconstruction=replace(case.reconstruction, intrinsics=camera), adjusted=None)
-        found = tuple(one for one in state.found if one.kind is not FindingKind.THIN_PRISM)
-        if (free := replace(state, found=found).combinations) is not None:
+    free, camera = model.combinations, model.intrinsics
+    if any(row.kind is FindingKind.THIN_PRISM for row in model.rows) and camera.model != "fisheye":
+        prism = with_thin_prism(case.reconstruction.intrinsics)
+        case = replace(case, reconstruction=replace(case.reconstruction, intrinsics=prism), adjusted=None)
+        rest = tuple(row for row in model.rows if row.kind is not FindingKind.THIN_PRISM)
+        if (free := replace(model, rows=rest).combinations) is not None:
             # Rows for the new camera parameters are inserted after those of the previous camera model.
-            before, now = len(parameters(state.intrinsics)), len(parameters(camera))
+            before, now = len(parameters(camera)), len(parameters(prism))
             free = np.insert(free, [before] * (now - before), 0.0, axis=0)
-    bent = np.concatenate([row.prior_std * row.columns for row in strains], axis=1) if strains else None
+    bent = np.concatenate([row.unit * row.columns for row in strains], axis=1) if strains else None
     adjusted, remaining = adjust_case(case, combinations=free, confirmed_errors=bent), list[Finding]()
     for one in findings:
         if one.kind.row.group == "camera":
@@ -332,7 +526,7 @@ def with_effects(
             # The shift due to all effects of the arm together belongs to the first finding.
             straight = np.zeros(7)
             if one.kind is strains[0].kind:
-                straight = straight_shift(adjusted.equations, adjusted.log_sizes, bent)[:7]
+                straight = straight_shift(adjusted, bent)[:7]
             if one.kind is FindingKind.LENGTHS and one.value is not None:
                 # One of three axes has another scale; no image shows which scale is the true metre.
                 jacobian = adjusted.equations.jacobian[:, :UNKNOWNS]
@@ -349,66 +543,10 @@ def as_adopted(found: Finding) -> Finding:
     return replace(found, shift=None, intrinsics_shift=None)
 
 
-def straight_shift(
-    equations: Equations, log_sizes: LogSizes, columns: Float[ndarray, "s b"]
-) -> Float[ndarray, " p"]:
+def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
     """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    `log_sizes` are the logarithms of the sizes of the robot errors. `columns` (s,b) are the b confirmed error patterns
-    of the poses, one standard deviation each.
+    `columns` (s,b) are the b confirmed error patterns of the poses, one standard deviation each.
     """
-    straight = replace(equations, confirmed=columns @ columns.T)
-    return solve_equations(straight, log_sizes).step - solve_equations(equations, log_sizes).step
-
-
-def _with_rejected_runs(case: Case) -> Case:
-    """Return the case that again uses consecutive rejected images, because a slip of the camera may reject them."""
-    in_order = with_rejected_runs(case.hand_eye.inliers)
-    if (in_order == case.hand_eye.inliers).all():
-        return case
-    longer = replace(case, hand_eye=case.hand_eye.with_used(in_order), chosen_tracks=None, adjusted=None)
-    if case.adjusted is None:
-        return longer
-    try:
-        return replace(longer, adjusted=adjust_case(longer))
-    except np.linalg.LinAlgError:
-        return case
-
-
-def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
-    """Return the mask of the used images, extended by rejected images whose neighbour is rejected too."""
-    rejected = np.pad(~used, 1)
-    return used | rejected[:-2] | rejected[2:]
-
-
-def effects_of_fit(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    hand_eye: Calibration,
-    names: Sequence[str],
-    **known: Any,
-) -> tuple[Finding, ...]:
-    """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
-
-    `names` are the images of the poses; `known` are keyword arguments of `pose_problem`.
-    """
-    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
-    problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
-    used = with_rejected_runs(hand_eye.inliers)
-    equations = pose_equations(replace(problem, used=used), state, None).equations
-    poses = ArmEquations(
-        equations=equations,
-        log_sizes=most_likely(equations)[0],
-        base_from_gripper=base_from_gripper[used],
-        rows=slice(0, 6 * int(used.sum())),
-        columns=columns_of_arm(0),
-    )
-    # Errors of camera poses resemble effects of the arm, which only a bundle adjustment separates from them.
-    test = best_pose_effect(poses, kinds_of("strain"))
-    std = np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged
-    found = (
-        None
-        if test is None
-        else pose_finding(test, poses, [names[k] for k in np.flatnonzero(used).tolist()], std)
-    )
-    return () if found is None else (found,)
+    straight = replace(solution.equations, confirmed=columns @ columns.T)
+    return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step

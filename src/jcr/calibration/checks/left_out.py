@@ -1,8 +1,6 @@
 """Check of the reported gripper poses of images that a calibration does not use: exchanged or contradicted poses."""
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
@@ -43,8 +41,19 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
     cannot be registered give no finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
-    right = set(made.image_index[hand_eye.inliers].tolist())
-    for row, pose in _shown_poses(capture, made, hand_eye).items():
+    used = set(made.image_index[hand_eye.inliers].tolist())
+    camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
+    unseen = [row for row in range(len(capture)) if row not in camera]
+    if unseen:
+        older, new = (
+            [read_image(capture.folder / capture.images[row]) for row in rows]
+            for rows in (made.image_index, unseen)
+        )
+        places = zip(unseen, register(made, older, new), strict=True)
+        camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
+    x, scale, z, right = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid, {*used}
+    for row in (row for row in camera if row not in used):
+        pose = predicted_gripper_poses(x, scale, z, camera[row][None])[0]
         by = np.linalg.norm(step_between(capture.base_from_gripper, pose).reshape(-1, 2, 3), axis=2)
         if (by[row] < SAME).all():
             right.add(row)
@@ -64,28 +73,3 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
         image = capture.images[row]
         findings.append(Finding.of(FindingKind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
     return tuple(findings)
-
-
-def _shown_poses(
-    capture: Capture, made: Reconstruction, hand_eye: Calibration
-) -> dict[int, Float[ndarray, "4 4"]]:
-    """Return the base_from_gripper that follows from each unused image's camera pose; keys are rows of the capture.
-
-    Images without a camera pose are registered in the reconstruction first; images that fail are missing.
-    """
-    used = set(made.image_index[hand_eye.inliers].tolist())
-    camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
-    unseen = [row for row in range(len(capture)) if row not in camera]
-    if unseen:
-        older, new = (
-            [read_image(capture.folder / capture.images[row]) for row in rows]
-            for rows in (made.image_index, unseen)
-        )
-        places = zip(unseen, register(made, older, new), strict=True)
-        camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
-    x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
-    return {
-        row: predicted_gripper_poses(x, scale, z, one[None])[0]
-        for row, one in camera.items()
-        if row not in used
-    }

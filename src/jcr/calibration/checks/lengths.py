@@ -238,6 +238,8 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
     """
     if capture.depths is None:
         return None
+    from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
+
     measured, predicted, image = _depths(capture, reconstruction, hand_eye.scale)
     off = np.log(measured / predicted)
     rows, count = np.unique(image, return_counts=True)
@@ -251,7 +253,13 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
     std = np.hypot(1.2533 * spread / np.sqrt(len(rows)), hand_eye.uncertainty.std[6])
     same = np.abs(off - common) < OUTSIDE
     depth = predicted[same]
-    noise_m, noise_per_m = _noise(depth, measured[same] / np.exp(common) - depth)
+    # The variance of the residuals at depth z is a² + (b z²)², with a and b fitted in bins of z. The rows are divided by
+    # the variance, because the error of an estimated variance is proportional to it.
+    residual, bins = measured[same] / np.exp(common) - depth, np.array_split(np.argsort(depth), BINS)
+    z = np.array([np.median(depth[rows]) for rows in bins])
+    variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
+    design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
+    noise_m, noise_per_m = np.sqrt(nnls(design, np.ones(BINS))[0]).tolist()
     near, far = np.percentile(depth, [5, 95])
     return DepthCheck(
         off_percent=100 * float(np.expm1(common)),
@@ -286,16 +294,3 @@ def _depths(
         parts.append(np.stack([around[4][whole], scale * z[whole], np.full(whole.sum(), k)]))
     measured, predicted, image = np.concatenate(parts, axis=1)
     return measured, predicted, image.astype(int)
-
-
-def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
-    """Return a (m) and b (1/m) of the variance a² + (b z²)² of residuals (m) at depths z (m), fitted in bins of z."""
-    from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
-
-    bins = np.array_split(np.argsort(depth), BINS)
-    z = np.array([np.median(depth[rows]) for rows in bins])
-    variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
-    # The rows are divided by the variance, because the error of an estimated variance is proportional to it.
-    design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
-    (constant, growing), _ = nnls(design, np.ones(BINS))
-    return float(np.sqrt(constant)), float(np.sqrt(growing))
