@@ -66,9 +66,9 @@ def align_tracks(
     # The normal of a point's assumed plane is the sum of the unit vectors from the point to its cameras. Planes through
     # neighbouring points gave the same result, because the affine part of a warp is free.
     x_in_recon = tracks.points_in_recon[point]
-    toward = recon_from_camera[image, :3, 3] - x_in_recon
+    toward = recon_from_camera[tracks.image, :3, 3] - tracks.points_in_recon[tracks.point]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    facing = np.stack([np.bincount(point, along) for along in toward.T], axis=1)[point]
+    facing = np.stack([np.bincount(tracks.point, along) for along in toward.T], axis=1)[point]
     # An area on this plane appears in an image with a factor det [J; nᵀ], times the same constant in all images.
     camera_from_recon = inverse(recon_from_camera)[image]
     by_recon = by_point(intrinsics, _x_in_b(camera_from_recon, x_in_recon)) @ camera_from_recon[:, :3, :3]
