@@ -14,9 +14,9 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.live.next_pose import AIMED, ELSEWHERE_M, joints_at, propose
-from jcr.live.progress import Notation, pose_lines
+from jcr.live.progress import Notation, Progress, next_lines
 from jcr.live.robot import typed_poses
-from jcr.records import Capture, Uncertainty
+from jcr.records import Capture, NextPose, Uncertainty
 from scenes import capture_of
 from simulation.poses import looking_at
 
@@ -107,7 +107,10 @@ def test_numbers_of_poses_lead_back(convention: str, units: str):
 
 
 def test_a_ur_is_named_what_its_pendant_shows_and_a_line_to_run():
-    shown, line = pose_lines(POSES[0], Notation("ur"))
+    sizes = {"within_95_mm": 1.0, "rotation_95_deg": 0.1, "moved_m": 0.1, "rotation_rad": 0.5}
+    new = NextPose(base_from_gripper=POSES[0], expected_std=np.ones(7), like="images/000.png", **sizes)
+    about, shown, line = next_lines(Progress(images=(), next_pose=new), Notation("ur"))
+    assert about.startswith("100 mm and 29° from images/000.png")
     numbers = [float(text) for text in re.findall(r"-?\d+\.\d+", line.split("]")[0])]
     back = poses_from_numbers(np.array([numbers]), "ur", "auto", "here")[0]
     assert line.startswith("URScript: movel(p[") and np.allclose(back, POSES[0], atol=1e-5)

@@ -156,7 +156,7 @@ def test_the_server_answers_until_the_page_has_the_result_and_its_report(
     with LiveServer(live) as page:
         reading = threading.Thread(target=read)
         reading.start()
-        until(lambda: page._page_version >= 0 or page._page_s > 0)
+        until(lambda: page.page_version >= 0 or page.page_s > 0)
         live.finish()
     reading.join()
     assert got["report"] == "<p>the report</p>" and got["last"]

@@ -87,8 +87,6 @@ _DISK = {
     errno.ENAMETOOLONG: "choose a shorter name",
 }
 """Remedies of operating-system errors that the user can correct, by errno."""
-
-
 LONGEST_LINE = 2000
 """Largest number of characters of an error message."""
 
@@ -98,7 +96,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    _open_closed_streams()
+    # Closed standard streams are opened on the null device; the next opened file would otherwise become such a stream.
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or os.fdopen(os.dup(1), "w")
+    sys.stderr = sys.stderr or os.fdopen(os.dup(2), "w")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an ASCII terminal cannot print ±
     status = dispatch(sys.argv[1:] if arguments is None else arguments)
@@ -107,19 +112,6 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         with contextlib.suppress(OSError):
             stream.flush()
     os._exit(status)
-
-
-def _open_closed_streams() -> None:
-    """Open closed standard streams on the null device; the next opened file would otherwise become such a stream."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)
-    if sys.stdout is None:
-        sys.stdout = os.fdopen(os.dup(1), "w")
-    if sys.stderr is None:
-        sys.stderr = os.fdopen(os.dup(2), "w")
 
 
 def _dispatched(arguments: Sequence[str]) -> int:
@@ -171,10 +163,8 @@ def dispatch(arguments: Sequence[str]) -> int:
         status = _dispatched(arguments)
         sys.stdout.flush()
         return status
-    except InputError as error:
-        return _fail(2, str(error))
-    except RejectedError as error:
-        return _fail(3, str(error))
+    except (InputError, RejectedError) as error:
+        status, message = 2 if isinstance(error, InputError) else 3, str(error)
     except BrokenPipeError:
         _write_no_more()  # the reader of the output closed it
         return 0
@@ -185,32 +175,23 @@ def dispatch(arguments: Sequence[str]) -> int:
             _write_no_more()
         # If a file could not be renamed, filename2 is the file that would have been replaced.
         named = error.filename2 or error.filename or "the output"
-        return _fail(2, f"{named}: {error.strerror}; {_DISK[error.errno]}")
+        status, message = 2, f"{named}: {error.strerror}; {_DISK[error.errno]}"
     except MemoryError as error:
-        return _fail(2, f"out of memory ({error or 'no more is given'}); {MORE_MEMORY}")
+        status, message = 2, f"out of memory ({error or 'no more is given'}); {MORE_MEMORY}"
     except BaseException as error:
-        if not _interrupted(error):
+        cause = error  # libraries raise errors of their own after Ctrl-C
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
             raise
-        return _fail(130, "interrupted; finished stages are kept and the same command resumes")
+        status, message = 130, "interrupted; finished stages are kept and the same command resumes"
+    line = printable(" ".join(message.split()))
+    # Messages quote the content of files, in which a name may have a million letters.
+    sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
+    return status
 
 
 def _write_no_more() -> None:
     """Discard all later standard output, because its reader has closed it."""
     with contextlib.suppress(OSError):  # in tests stdout is no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _interrupted(error: BaseException | None) -> bool:
-    """Test whether Ctrl-C caused `error`, directly or as the cause of another library's error."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
-def _fail(status: int, message: str) -> int:
-    line = printable(" ".join(message.split()))
-    # Messages quote the content of files, in which a name may have a million letters.
-    sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
-    return status

@@ -76,9 +76,8 @@ class CaptureCommand:
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
     """Port of the live page and of samples on this machine alone; 0: any free one."""
     listen: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Serve other machines too, at this address and under this host name only; needs a token."""
-    token: str | None = None
-    """Key of the session instead of a random one; better set as JCR_TOKEN, which other users cannot see."""
+    """Serve other machines too, at this address and under this host name only; needs the key of the session in the
+    environment variable JCR_TOKEN. Without JCR_TOKEN the key is random."""
     timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
     """Time limit for --poses http: stop after this many seconds without a pose."""
     intrinsics_from: Path | None = None
@@ -88,7 +87,7 @@ class CaptureCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Take a capture, or list the arms; return the exit status."""
+        """Take images until the user ends or `--until-accurate` is met, and calibrate with all; or list the arms."""
         if self.robot == "list":
             arms = [arm_named(name) for name in ROBOT_NAMES]
             lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
@@ -97,50 +96,45 @@ class CaptureCommand:
             return 0
         if self.out is None:
             raise InputError("OUT: required, and not given (jcr capture --help)")
-        return _take(self, self.out, self.robot)
+        from jcr.live.calibration import LiveCalibration
+        from jcr.live.folder import LiveFolder
+        from jcr.live.server import LOOPBACK, LiveServer
 
+        options, out = self.session, self.out
+        if options.until_accurate and options.require is None:
+            raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
+        states, address = states_of(self.poses), (LOOPBACK, self.page_port)
+        if self.listen is not None:
+            address = address_of(self.listen, 7464, "--listen ")
+        given = None if self.intrinsics_from is None else read_intrinsics(self.intrinsics_from)
+        if states is None and self.poses not in ("typed", "http"):
+            raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
+        answers: list[Answer] = []
 
-def _take(arguments: CaptureCommand, out: Path, robot: RobotName | None) -> int:
-    """Take images until the user ends or `--until-accurate` is met; calibrate with all; return the exit status."""
-    from jcr.live.calibration import LiveCalibration
-    from jcr.live.folder import LiveFolder
-    from jcr.live.server import LOOPBACK, LiveServer
+        def tell(answer: Answer, lines: list[str]) -> None:
+            """Print the lines of an answer, and keep the answer for --json."""
+            answers.append(answer)
+            _print("\n".join(lines))
 
-    options, token = arguments.session, arguments.token or os.environ.get("JCR_TOKEN") or None
-    if options.until_accurate and options.require is None:
-        raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-    states, address = states_of(arguments.poses), (LOOPBACK, arguments.page_port)
-    if arguments.listen is not None:
-        address = address_of(arguments.listen, 7464, "--listen ")
-    source = arguments.intrinsics_from
-    given = None if source is None else read_intrinsics(source)
-    if states is None and arguments.poses not in ("typed", "http"):
-        raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
-    answers: list[Answer] = []
-
-    def tell(answer: Answer, lines: list[str]) -> None:
-        """Print the lines of an answer, and keep the answer for --json."""
-        answers.append(answer)
-        _print("\n".join(lines))
-
-    with locked(out), open_camera(arguments.camera, arguments.settings) as camera:
-        folder = LiveFolder(out, given or camera.intrinsics, robot)
-        calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
-        gripper = None if states is None else lambda: next(states())
-        convention = arguments.pose_convention
-        for kind in KINDS if convention == "auto" else ():
-            convention = kind if arguments.poses.startswith(f"{kind}:") else convention
-        notation = Notation(convention, arguments.pose_units, calibration.arm)
-        session = LiveSession(calibration, camera, options, tell, notation, gripper)
-        try:
-            with LiveServer(session, *address, token, arguments.poses == "http") as server:
-                _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
-                session.run(_source(arguments, session, states, server))
-                result = session.finish()
-        finally:
-            calibration.close()
-    facts = {"capture": str(out), "images": folder.names, "answers": answers}
-    return _conclude(arguments, facts, result, calibration.progress.requirement_met)
+        with locked(out), open_camera(self.camera, self.settings) as camera:
+            folder = LiveFolder(out, given or camera.intrinsics, self.robot)
+            calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
+            convention: ConventionName = self.pose_convention
+            if convention == "auto" and states is not None:
+                convention = next(kind for kind in KINDS if self.poses.startswith(f"{kind}:"))
+            notation = Notation(convention, self.pose_units, calibration.arm)
+            gripper = None if states is None else lambda: next(states())
+            session = LiveSession(calibration, camera, options, tell, notation, gripper)
+            token = os.environ.get("JCR_TOKEN") or None
+            try:
+                with LiveServer(session, *address, token, self.poses == "http") as server:
+                    _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
+                    session.run(_source(self, session, states, server))
+                    result = session.finish()
+            finally:
+                calibration.close()
+        facts = {"capture": str(out), "images": folder.names, "answers": answers}
+        return _conclude(self, facts, result, calibration.progress.requirement_met)
 
 
 def _conclude(

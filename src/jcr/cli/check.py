@@ -3,6 +3,7 @@
 import shlex
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -10,7 +11,6 @@ import tyro
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
-from jcr.cli.run import looked_at
 from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
 from jcr.pipeline.options import VerifyOptions
@@ -69,10 +69,9 @@ class CheckCommand:
             raise InputError(f"--suggest {self.suggest}: give how many poses to propose, 0 or more")
         options = CalibrateOptions(robot_noise=self.robot_noise)
         check_options(options)
-        with (
-            progress_bars() as progress,
-            looked_at(self.capture, self.read, read_and_compare, progress) as (capture, read),
-        ):
+        # Frames of a recording are extracted to a temporary folder.
+        with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
+            capture, read = read_and_compare(self.capture, self.read, into=scratch, progress=progress)
             found = check_capture(
                 capture,
                 self.suggest,
@@ -103,6 +102,7 @@ def _check_lines(
 ) -> list[str]:
     """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, proposed poses."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
+    from jcr.pipeline.check import QUICK
 
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"
     if not isinstance(capture, PosePairs):
@@ -115,7 +115,24 @@ def _check_lines(
     if not is_rejected:
         rotation = np.degrees(found.largest_rotation_rad)
         motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
-        lines += [*labelled("Motion", motion), *_expected(len(capture), found)]
+        lines, fitted = [*lines, *labelled("Motion", motion)], found.hand_eye
+        if found.expected is not None and (seen := found.expected.seen) is not None:
+            std = found.expected.std
+            sizes = (1e3 * std[:3], np.degrees(std[3:6]))
+            offset, turn = (" ".join(significant(float(value)) for value in part) for part in sizes)
+            lines += labelled(
+                "Expected",
+                f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
+                f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; "
+                f"errors as {'usual' if fitted is None else 'found in the images'}",
+                f"1σ: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
+            )
+        if fitted is not None:
+            noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(fitted.inliers)} images"
+            if len(fitted.inliers) == QUICK < len(capture):
+                looked += f"; distortion and focus show with all {len(capture)}: --thorough"
+            agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
+            lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
         run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
         closing = shlex.join([*run, *read_arguments(read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
@@ -131,34 +148,6 @@ def _check_lines(
         near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {pose.like}"
         lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
     return [*lines, *labelled("Next", closing)]
-
-
-def _expected(images: int, found: "Examination") -> list[str]:
-    """Return lines with the expected accuracy of a calibration, and with the agreement of poses and images.
-
-    `images` is the number of images.
-    """
-    from jcr.pipeline.check import QUICK
-
-    lines, fitted = list[str](), found.hand_eye
-    if found.expected is not None and (seen := found.expected.seen) is not None:
-        std = found.expected.std
-        sizes = (1e3 * std[:3], np.degrees(std[3:6]))
-        offset, rotation = (" ".join(significant(float(value)) for value in part) for part in sizes)
-        lines = labelled(
-            "Expected",
-            f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
-            f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; "
-            f"errors as {'usual' if fitted is None else 'found in the images'}",
-            f"1σ: {offset} mm, {rotation}°, scale {significant(100 * std[6])} %",
-        )
-    if fitted is not None:
-        noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(fitted.inliers)} images"
-        if len(fitted.inliers) == QUICK < images:
-            looked += f"; distortion and focus show with all {images}: --thorough"
-        agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
-    return lines
 
 
 def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str, Any]:
@@ -278,16 +267,13 @@ class VerifyCommand:
         from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 
-        with (
-            progress_bars() as progress,
-            looked_at(self.capture, self.read, read_capture, progress, at_least=1) as capture,
-        ):
+        with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
+            capture = read_capture(self.capture, self.read, into=scratch, progress=progress, at_least=1)
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
+        lines = [line for one in cameras for line in _drift_lines(one, self.output.verbose)]
         facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}
-        self.output.result(
-            (line for one in cameras for line in _drift_lines(one, self.output.verbose)), facts
-        )
+        self.output.result(lines, facts)
         return 3 if any(one.moved for one in cameras) else 0
 
 

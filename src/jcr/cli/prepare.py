@@ -76,7 +76,8 @@ class DocsCommand:
             text = page(self.name)
             self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
             return 0
-        titles = {name: title(path) for name, path in pages().items()}
+        headings = ((name, path.read_text("utf-8").partition("\n")[0]) for name, path in pages().items())
+        titles = {name: heading.removeprefix("# ").strip() for name, heading in headings}
         self.output.result((f"{name:<22} {heading}" for name, heading in titles.items()), {"pages": titles})
         return 0
 
@@ -104,12 +105,6 @@ def page(name: str) -> str:
         there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
         raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; there are: {there}")
     return found[name].read_text(encoding="utf-8")
-
-
-def title(path: Path) -> str:
-    """Return the first heading of a page."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return next((line[2:].strip() for line in lines if line.startswith("# ")), path.stem)
 
 
 @dataclass(frozen=True, kw_only=True)

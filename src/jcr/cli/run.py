@@ -3,10 +3,8 @@
 import re
 import shlex
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +15,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
+from jcr.files import locked
 from jcr.pipeline.options import BatchOptions
 from jcr.progress import Progress, progress_bars
 from jcr.reconstruct import ReconstructOptions
@@ -26,8 +25,6 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.cell.placement import CameraPlacement
-    from jcr.pipeline.batch import BatchRow
     from jcr.result import RunOptions, RunResult
 
 
@@ -58,9 +55,11 @@ class CalibrateCommand:
         from jcr.calibration.stage import is_one
         from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
+        from jcr.result import CAPTURE
 
         with progress_bars() as progress:
-            capture = _source(self, read_source, progress)
+            with locked(self.out):
+                capture = read_source(self.capture, self.read, into=self.out / CAPTURE, progress=progress)
             if not isinstance(capture, PosePairs):
                 return show(_run(self, capture, run_options(self, map=None), progress), self.output)
             result = calibrate_poses(capture, self.out, self.calibrate)
@@ -94,10 +93,12 @@ class RunCommand(CalibrateCommand):
     def main(self) -> int:
         """Run every stage, print the result and return the exit status."""
         from jcr.capture.read import read_capture
+        from jcr.result import CAPTURE
 
         options = run_options(self, map=None if self.no_map else self.map)
         with progress_bars() as progress:
-            capture = _source(self, read_capture, progress)
+            with locked(self.out):
+                capture = read_capture(self.capture, self.read, into=self.out / CAPTURE, progress=progress)
             result = _run(self, capture, options, progress)
         lines = [note for note in result.calibration.notes if note.startswith("no map was made")]
         if (self.out / "map.safetensors").is_file():
@@ -141,7 +142,14 @@ class BatchCommand:
         *captures, out = self.paths
         with progress_bars() as progress:
             rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
-        summary, lines = out / "summary.html", [_line(rank, row) for rank, row in enumerate(rows, start=1)]
+        summary, lines = out / "summary.html", list[str]()
+        for rank, row in enumerate(rows, start=1):
+            std = (
+                "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
+            )
+            used = f"{row.used:3d}/{row.images:<3d}"
+            line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
+            lines.append(line.rstrip())
         self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})
         if doubtful := sum(not row.is_accepted for row in rows):
             raise RejectedError(f"{doubtful} of {len(rows)} captures failed or are rejected; see {summary}")
@@ -201,30 +209,6 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     return RunOptions(**given | chosen)
 
 
-def _source(command: CalibrateCommand, read: Callable[..., Any], progress: Progress) -> Any:
-    """Return the capture of a command, read by the function `read`, such as read_capture.
-
-    Frames of a recording are extracted into the run folder.
-    """
-    from jcr.files import locked
-    from jcr.result import CAPTURE
-
-    with locked(command.out):
-        return read(command.capture, command.read, into=command.out / CAPTURE, progress=progress)
-
-
-@contextmanager
-def looked_at(
-    path: Path, options: ReadOptions, read: Callable[..., Any], progress: Progress, **more: Any
-) -> Iterator[Any]:
-    """Yield the capture at a path, read by the function `read` (such as read_capture) with the arguments `more`.
-
-    Frames of a recording are extracted to a temporary folder, which is deleted afterwards.
-    """
-    with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
-        yield read(path, options, into=scratch, progress=progress, **more)
-
-
 def _run(
     command: CalibrateCommand, capture: Capture, options: "RunOptions", progress: Progress
 ) -> "RunResult":
@@ -236,21 +220,15 @@ def _run(
     from jcr.pipeline.selection import NothingFoundError
     from jcr.result import load_run
 
-    out, shown = command.out, list[object]()
-
-    def show_early(result: "RunResult") -> None:
-        """Print the calibration before depth and map are made."""
-        show_calibration(result, capture, command.output)
-        shown.append(result)
-
+    show_early = partial(show_calibration, capture=capture, output=command.output)
     try:
-        result = run(capture, out, options, progress=progress, calibrated=show_early)
+        result = run(capture, command.out, options, progress=progress, calibrated=show_early)
+        if not result.is_unchanged:
+            return result
+        sys.stderr.write(f"unchanged: {command.out} is the run of this capture with these options\n")
     except NothingFoundError:
-        result = load_run(out)
-    if result.is_unchanged:
-        sys.stderr.write(f"unchanged: {out} is the run of this capture with these options\n")
-    if not shown:
-        show_calibration(result, capture, command.output)
+        result = load_run(command.out)
+    show_early(result)
     return result
 
 
@@ -287,28 +265,16 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     # A driver often publishes the optical frame below a root link of the camera.
     export = f"jcr export {shlex.quote(str(out))} ros2  # frames: --parent-frame tool0, --to-root camera_link"
     following = export if content.converged else "jcr docs troubleshooting"
-    lines = [line for camera in placed for line in labelled("Camera", _camera_in_words(camera))]
+    lines = list[str]()
+    for camera in placed:
+        about = f"REJECTED: {camera.doubt}"
+        if camera.doubt is None and (found := camera.uncertainty) is not None:
+            mm, deg = (significant(max(std)) for std in (found.translation_std_mm, found.rotation_std_deg))
+            about = f"{camera.verdict.upper()}, {camera.mount}_from_camera ±{mm} mm, {deg}°"
+            about += " (1σ, worst axis; cameras.json)"
+        lines += labelled("Camera", f"{camera.name}: {about}")
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
         lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
     output.result(lines, facts)
     return 0 if content.converged and all(camera.converged for camera in placed) else 3
-
-
-def _camera_in_words(camera: "CameraPlacement") -> str:
-    """Return one line on a camera other than the calibrated one: verdict, and uncertainty or reason of the rejection."""
-    if camera.doubt is not None or camera.uncertainty is None:
-        return f"{camera.name}: REJECTED: {camera.doubt}"
-    stds = camera.uncertainty.translation_std_mm, camera.uncertainty.rotation_std_deg
-    mm, deg = (significant(max(std)) for std in stds)
-    return (
-        f"{camera.name}: {camera.verdict.upper()}, {camera.mount}_from_camera ±{mm} mm, {deg}° (1σ, worst axis; "
-        "cameras.json)"
-    )
-
-
-def _line(rank: int, row: "BatchRow") -> str:
-    """Return the line of one capture in the table of a batch: rank, name, status, used images, uncertainty, reason."""
-    std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
-    used = f"{row.used:3d}/{row.images:<3d}"
-    return f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}".rstrip()

@@ -39,7 +39,32 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
     """
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
-        raise InputError(f"{_complaint(event, record, program, arguments)} ({program} --help)")
+        """Raise InputError that states what is wrong with the arguments."""
+        known, why = {*_flags(record), "--help"}, "the arguments cannot be understood"
+        options = (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--"))
+        match event:
+            case _ if unknown := next((word for word in options if word not in known), None):
+                why = f"{program} has no option {unknown}{did_you_mean(unknown, known)}"
+            case _errors.MissingArgs(missing_arguments=missing):
+                names = ", ".join(str(one.arg.lowered.metavar) for one in missing)
+                why = f"{names}: required, and not given"
+            case _errors.UnrecognizedArgs(tokens=[first, *_]):
+                why = f"{first!r}: one argument too many for {program}"
+            case _errors.InvalidChoice(argument=argument, value=value):
+                choices = sorted(set(event.choices) - {"None"})  # None stands for an omitted option
+                like, name = did_you_mean(value, choices), argument.display_name()
+                why = f"invalid choice {value!r} for {name}{like}; choose from {', '.join(choices)}"
+            case _errors.BadValue(argument=argument) | _errors.InstantiationFailure(argument=argument) if (
+                argument
+            ):
+                name = argument.display_name()
+                words = [part for word in arguments for part in word.split("=", 1)]
+                after = words[words.index(name) + 1 :] if name in words else []
+                given = ", ".join(map(repr, takewhile(lambda word: not word.startswith("--"), after)))
+                why = f"{name} takes {argument.lowered.metavar}, not {given or 'none'}"
+            case _errors.InstantiationFailure(message=message):
+                why = message
+        raise InputError(f"{why} ({program} --help)")
 
     with _errors.on_parse_error(refuse), _wrapped_paragraphs():
         return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
@@ -65,9 +90,7 @@ def _wrapped_paragraphs() -> Iterator[None]:
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:
     """Write a shell script that completes all commands and options, as `--tyro-write-completion SHELL FILE` requests.
 
-    `records` are the classes of the commands by name.
-
-    Raises InputError for another shell, or without a file.
+    `records` are the classes of the commands by name. Raises InputError for another shell, or without a file.
     """
     if len(arguments) != 3 or arguments[1] not in SHELLS:
         raise InputError(f"{arguments[0]}: give a shell ({', '.join(SHELLS)}) and the file of the script")
@@ -79,33 +102,6 @@ def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> N
     lines = script.read_text("utf-8").split("\n")
     whole = (line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC") else line for line in lines)
     script.write_text("\n".join(whole), "utf-8")
-
-
-def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, arguments: Sequence[str]) -> str:
-    known = {*_flags(record), "--help"}
-    options = (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--"))
-    if unknown := next((word for word in options if word not in known), None):
-        return f"{program} has no option {unknown}{did_you_mean(unknown, known)}"
-    match event:
-        case _errors.MissingArgs(missing_arguments=missing):
-            return f"{', '.join(str(one.arg.lowered.metavar) for one in missing)}: required, and not given"
-        case _errors.UnrecognizedArgs(tokens=[first, *_]):
-            return f"{first!r}: one argument too many for {program}"
-        case _errors.InvalidChoice(argument=argument, value=value):
-            choices = sorted(set(event.choices) - {"None"})  # None stands for an omitted option
-            like = did_you_mean(value, choices)
-            return f"invalid choice {value!r} for {argument.display_name()}{like}; choose from {', '.join(choices)}"
-        case _errors.BadValue(argument=argument) | _errors.InstantiationFailure(argument=argument) if (
-            argument
-        ):
-            name = argument.display_name()
-            words = [part for word in arguments for part in (word.split("=", 1) if "=" in word else [word])]
-            after = words[words.index(name) + 1 :] if name in words else []
-            given = ", ".join(map(repr, takewhile(lambda word: not word.startswith("--"), after)))
-            return f"{name} takes {argument.lowered.metavar}, not {given or 'none'}"
-        case _errors.InstantiationFailure(message=message):
-            return message
-    return "the arguments cannot be understood"
 
 
 def _flags(record: Any) -> Iterator[str]:

@@ -5,7 +5,7 @@ import sys
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 import tyro
@@ -155,25 +155,26 @@ class QueryCommand:
         summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}"
         answers: dict[str, object] = {"label_names": list(scene.label_names)}
         if self.output.json:
-            answers |= dict(zip(_COLUMNS.split(","), map(_finite, columns), strict=True))
+            for name, column in zip(_COLUMNS.split(","), columns, strict=True):  # JSON has no NaN
+                rounded = (
+                    column.tolist() if column.dtype.kind != "f" else column.astype(float).round(6).tolist()
+                )
+                answers[name] = [None if value != value else value for value in rounded]
         if self.write or not self.output.json:
             path = self.write or self.points.with_suffix(".answers.csv")
-            _write(path, np.rec.fromarrays(columns, names=_COLUMNS))  # pyright: ignore[reportArgumentType]
+            rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
+            if path.suffix == ".npy":
+                buffer = io.BytesIO()
+                np.save(buffer, np.asarray(rows))
+                write_bytes(path, buffer.getvalue())
+            elif path.suffix == ".csv":
+                lines = (_FORMATS % tuple(row) for row in rows.tolist())
+                write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
+            else:
+                raise InputError(f"{path}: answers are written as .csv or .npy")
             summary = f"wrote {path}: {summary}"
         self.output.result([summary], answers)
         return 0
-
-
-def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
-    """Write the rows of a query's result as .npy or .csv, depending on the ending of the path."""
-    if path.suffix == ".npy":
-        buffer = io.BytesIO()
-        np.save(buffer, np.asarray(rows))
-        write_bytes(path, buffer.getvalue())
-    elif path.suffix == ".csv":
-        write_text(path, "\n".join([_COLUMNS, *(_FORMATS % tuple(row) for row in rows.tolist())]) + "\n")
-    else:
-        raise InputError(f"{path}: answers are written as .csv or .npy")
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
@@ -206,13 +207,6 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
     if not (finite := np.isfinite(points).all(1)).all():
         raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
     return points
-
-
-def _finite(column: ndarray) -> list:
-    """Return the column of a query's result as a list for JSON, in which None replaces NaN."""
-    if column.dtype.kind != "f":
-        return column.tolist()
-    return [None if np.isnan(value) else round(float(value), 6) for value in column]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,6 @@ from jaxtyping import Float, UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.robot_errors import robot_errors
@@ -21,6 +21,7 @@ from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.prediction import FEWEST
+from jcr.files import locked
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
@@ -70,8 +71,6 @@ class LiveCalibration:
         self._opened = ExitStack()
         if not isinstance(folder, LiveFolder):
             if exclusive:
-                from jcr.files import locked
-
                 self._opened.enter_context(locked(Path(folder)))
             given = None if intrinsics is None else IntrinsicsEntry.of(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
@@ -104,8 +103,8 @@ class LiveCalibration:
     ) -> Progress:
         """Add an image (h,w,3) uint8 and its gripper pose (4,4) to the capture, and calibrate all images again.
 
-        `joints` are the joint angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) is the image
-        of a depth camera, and `color` is the order of the channels ("bgr" for OpenCV); grey images are converted.
+        `joints` are the joint angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) is the depth
+        of its pixels (0: unknown), and `color` is the order of the channels ("bgr" for OpenCV). Grey images are valid.
         Raises InputError for an array that is no image or no rigid pose, a pose that is not in metres, an image of
         another size than the others, and an image that repeats another. The capture is then unchanged. Several threads
         may call this at the same time; the calls are served one after the other.
@@ -202,12 +201,8 @@ class LiveCalibration:
         # Joint angles of a kinematic model that contradicts the gripper poses would be wrong.
         arm = self.arm if robot.unused is None else None
         found = None if case is None else case.hand_eye
-
-        def propose_next() -> dict[str, Any]:
-            """Return the fields `next_pose` and `next_joints` of Progress, distant from the poses without an image."""
-            return propose(capture, rows, found, case, arm=arm, box=self._box, refused=self._refused)
-
-        self._propose = propose_next
+        where = {"arm": arm, "box": self._box, "refused": self._refused}
+        self._propose = partial(propose, capture, rows, found, case, **where)
         state = replace(state, registered=tuple(names[row] for row in rows), **self._propose())
         if case is None:
             findings += [] if robot.unused is None else [robot.unused]
@@ -217,23 +212,24 @@ class LiveCalibration:
                 kind = FindingKind.NO_RECONSTRUCTION
                 few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)
             return replace(state, findings=strongest_first([*findings, few]))
-        hand_eye = case.hand_eye
+        hand_eye, tracks = case.hand_eye, case.reconstruction.tracks
         for one in hand_eye.images if hand_eye.is_sound else ():
             metres = 1e-3 * (one.translation_residual_mm or 0.0)
             radians = float(np.radians(one.rotation_residual_deg or 0.0))
             if not one.used and (metres > SAME[0] or radians > SAME[1]):
                 kind = FindingKind.POSE_CONTRADICTS_IMAGE
                 findings.append(Finding.of(kind, "warns", "poses", one.image, value=metres, rotation=radians))
+        # The points shown are observed by three images or more.
+        seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
+        points = tracks.points_in_recon[seen[:: max(1, len(seen) // MOST_POINTS)]]
+        found = strongest_first([*findings, *hand_eye.findings])
         return replace(
-            state,
-            hand_eye=hand_eye,
-            findings=strongest_first([*findings, *hand_eye.findings]),
-            points_in_base=_points(case),
+            state, hand_eye=hand_eye, findings=found, points_in_base=hand_eye.base_from_recon(points)
         )
 
 
 def _longest(tracks: Tracks, most: int) -> Tracks:
-    """Return the observations of board points, and of the points that most images observe, up to `most` observations.
+    """Return the tracks of board points and of the points that the most images observe, up to `most` observations.
 
     Among points with equally many observations, the fractional part of a pixel coordinate decides: this is as good as a
     random choice, and does not depend on the order of the images.
@@ -245,11 +241,3 @@ def _longest(tracks: Tracks, most: int) -> Tracks:
     chosen = tracks.on_board
     chosen[order[np.cumsum(count[order]) <= most]] = True
     return tracks.only(chosen[tracks.point])
-
-
-def _points(case: Case) -> Float[ndarray, "p 3"]:
-    """Return up to about MOST_POINTS points (m, base frame) of the reconstruction that three or more images observe."""
-    tracks, hand_eye = case.reconstruction.tracks, case.hand_eye
-    seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
-    some = seen[:: max(1, len(seen) // MOST_POINTS)]
-    return hand_eye.base_from_recon(tracks.points_in_recon[some])

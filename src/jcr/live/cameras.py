@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -23,14 +24,8 @@ from jcr.records.capture_json import IntrinsicsEntry
 
 TIMEOUT_S = 10.0
 """Time without an image (s) after which a camera counts as lost."""
-V4L2_MANUAL_EXPOSURE = 1
-"""Value of V4L2's control exposure_auto that selects manual exposure."""
 REALSENSE = "realsense"
 """Prefix of a RealSense camera in `--camera`; `:SERIAL` or the file of a recording, `:FILE`, may follow."""
-SIZE = (1280, 720)
-"""Default width and height (px) of a RealSense's colour image, available on every D400."""
-DEPTH_LIMIT_MM = 65_535
-"""Largest depth (mm) that a uint16 depth image can store."""
 FITTED_PX = 0.05
 """Largest accepted difference (px) between OpenCV's distortion, with fitted coefficients, and the maker's model."""
 
@@ -71,63 +66,57 @@ class Camera:
     """Intrinsics that the maker stored in the camera; None if it stores none that OpenCV's model can express."""
 
 
-class Frames:
-    """Iterator over the frames of a camera or recording; a thread reads cameras, so that no old frames are buffered."""
+@contextmanager
+def _read_by(
+    read: Callable[[], Frame | None], name: str | None, intrinsics: IntrinsicsEntry | None = None
+) -> Iterator[Camera]:
+    """Yield the camera whose next frame the function `read` waits for and returns; `read` returns None at the end.
 
-    def __init__(self, read: Callable[[], Frame | None], name: str | None) -> None:
-        """Start the thread of a device or stream called `name`; None: a recording, which is read without a thread.
+    A thread reads the device or stream called `name`, so that no old frames are buffered. `name` None: a recording,
+    which is read without a thread.
+    """
+    newest, arrived, is_closed = deque[Frame](maxlen=1), threading.Condition(), threading.Event()
 
-        `read` waits for the next frame and returns it; it returns None at the end.
-        """
-        self._read, self._name, self._is_open = read, name, True
-        self._arrived, self._frame = threading.Condition(), None
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        if name is not None:
-            self._thread.start()
+    def watch() -> None:
+        """Read frames until the source ends or the camera is closed; keep only the newest frame."""
+        while not is_closed.is_set() and (frame := read()) is not None:
+            with arrived:
+                newest.append(frame)
+                arrived.notify_all()
+        with arrived:
+            is_closed.set()
+            arrived.notify_all()
 
-    def latest(self) -> Frame | None:
-        """Return the last frame that was read; None before the first one."""
-        return self._frame
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield, for each request, a frame taken after it; of a recording, the next frame.
-
-        Raises InputError if a camera gives no frame for 10 s.
-        """
-        if self._name is None:
-            for frame in iter(self._read, None):
-                self._frame = frame
-                yield frame
-            return
+    def frames() -> Iterator[Frame]:
+        """Yield, for each request, a frame taken after it; of a recording, the next frame."""
+        while name is None:
+            if (frame := read()) is None:
+                return
+            newest.append(frame)
+            yield frame
         while True:
             asked = time.monotonic()
-            end = asked + TIMEOUT_S
-            with self._arrived:
-                while self._frame is None or self._frame.time_s < asked:
-                    left_s = end - time.monotonic()
-                    if left_s <= 0 or not self._thread.is_alive():
-                        raise InputError(
-                            f"--camera {self._name}: gives no more images; check its cable and start again: the same "
-                            "command resumes"
-                        )
-                    self._arrived.wait(left_s)
-                frame = self._frame
+            with arrived:
+                arrived.wait_for(
+                    lambda asked=asked: is_closed.is_set() or (newest and newest[0].time_s >= asked),
+                    TIMEOUT_S,
+                )
+                if not newest or newest[0].time_s < asked:
+                    raise InputError(
+                        f"--camera {name}: gives no more images; check its cable, and run the same command to resume"
+                    )
+                frame = newest[0]
             yield frame
 
-    def close(self) -> None:
-        """Stop reading and wait for the thread to end."""
-        self._is_open = False
-        if self._name is not None:
-            self._thread.join(TIMEOUT_S)
-
-    def _watch(self) -> None:
-        """Read frames in a thread until the source ends or `close` is called; keep only the newest frame."""
-        while self._is_open and (frame := self._read()) is not None:
-            with self._arrived:
-                self._frame = frame
-                self._arrived.notify_all()
-        with self._arrived:
-            self._arrived.notify_all()
+    thread = threading.Thread(target=watch, daemon=True)
+    if name is not None:
+        thread.start()
+    try:
+        yield Camera(frames(), lambda: newest[0] if newest else None, intrinsics)
+    finally:
+        is_closed.set()
+        if name is not None:
+            thread.join(TIMEOUT_S)
 
 
 @contextmanager
@@ -180,9 +169,7 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
             good, pixels = video.read()
             return Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), time_s) if good else None
 
-        frames = Frames(read, None if is_file else source)
-        stack.callback(frames.close)
-        yield Camera(frames, frames.latest)
+        yield stack.enter_context(_read_by(read, None if is_file else source))
 
 
 def apply_options(video: Any, options: CameraOptions, source: str) -> None:
@@ -204,7 +191,7 @@ def apply_options(video: Any, options: CameraOptions, source: str) -> None:
     # Autofocus is switched off because the focus changes the intrinsics. Some cameras have no such setting.
     video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
     if options.exposure is not None:
-        video.set(cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_MANUAL_EXPOSURE)
+        video.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)  # manual, in V4L2's control exposure_auto
     wanted = (
         (cv2.CAP_PROP_EXPOSURE, options.exposure, "--exposure"),
         (cv2.CAP_PROP_FOCUS, options.focus, "--focus"),
@@ -238,7 +225,8 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
     else:
         if serial:
             config.enable_device(serial)
-        config.enable_stream(rs.stream.color, *(options.camera_size or SIZE), rs.format.rgb8)
+        size = options.camera_size or (1280, 720)  # every D400 has this size
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8)
         config.enable_stream(rs.stream.depth)
     try:
         profile = pipeline.start(config)
@@ -255,14 +243,28 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
             with suppress(RuntimeError):
                 pipeline.stop()
 
+        device, exposure, focus = profile.get_device(), rs.option.exposure, rs.option.focus_position
         if is_file:
-            profile.get_device().as_playback().set_real_time(False)
-        else:
-            _apply_realsense_options(rs, profile, options)
+            device.as_playback().set_real_time(False)
+        for option, value, flag in (
+            (exposure, options.exposure, "--exposure"),
+            (focus, options.focus, "--focus"),
+        ):
+            if value is None or is_file:
+                continue
+            sensor = device.first_color_sensor()
+            if not sensor.supports(option):
+                raise InputError(f"{flag} {value:g}: this camera has no such setting; leave the option out")
+            if option == exposure:
+                sensor.set_option(rs.option.enable_auto_exposure, 0)
+            limits = sensor.get_option_range(option)
+            if not limits.min <= value <= limits.max:
+                raise InputError(f"{flag} {value:g}: this camera takes {limits.min:g} to {limits.max:g}")
+            sensor.set_option(option, value)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
-        frames = Frames(_realsense_reader(rs, pipeline, profile, is_file), None if is_file else name)
-        stack.callback(frames.close)
-        yield Camera(frames, frames.latest, _realsense_intrinsics(rs, stored))
+        intrinsics = _realsense_intrinsics(rs, stored)
+        read = _realsense_reader(rs, pipeline, profile, is_file)
+        yield stack.enter_context(_read_by(read, None if is_file else name, intrinsics))
 
 
 def _realsense_reader(
@@ -289,7 +291,7 @@ def _realsense_reader(
         if has_depth:
             frames = aligned.process(frames)
             raw = np.asanyarray(frames.get_depth_frame().get_data())
-            depth_mm = np.rint(unit_mm * raw).clip(0, DEPTH_LIMIT_MM).astype(np.uint16)
+            depth_mm = np.rint(unit_mm * raw).clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
         color = frames.get_color_frame()
         pixels = np.asanyarray(color.get_data()).copy()
         if color.get_profile().format() == rs.format.bgr8:
@@ -297,24 +299,6 @@ def _realsense_reader(
         return Frame(pixels, stamp, depth_mm)
 
     return read
-
-
-def _apply_realsense_options(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
-    """Set exposure and focus; raise InputError if the camera has no such setting or the value is out of its range."""
-    sensor = profile.get_device().first_color_sensor()
-    wanted = [
-        (rs.option.exposure, options.exposure, "--exposure"),
-        (rs.option.focus_position, options.focus, "--focus"),
-    ]
-    for option, value, flag in (row for row in wanted if row[1] is not None):
-        if not sensor.supports(option):
-            raise InputError(f"{flag} {value:g}: this camera has no such setting; leave the option out")
-        if flag == "--exposure":
-            sensor.set_option(rs.option.enable_auto_exposure, 0)
-        limits = sensor.get_option_range(option)
-        if not limits.min <= value <= limits.max:
-            raise InputError(f"{flag} {value:g}: this camera takes {limits.min:g} to {limits.max:g}")
-        sensor.set_option(option, value)
 
 
 def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None:
@@ -377,9 +361,10 @@ class ImageSummary:
 def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patience_s: float) -> Frame | str:
     """Return the first frame at rest that can be kept; after `patience_s` seconds, the reason why none can be kept.
 
-    `kept` are the images taken at other gripper poses, from which the frame must differ. Raises StopIteration at the
-    end of a video file.
+    A frame is at rest if it shows the same as a frame 0.2 s earlier. `kept` are the images taken at other gripper
+    poses, from which the frame must differ. Raises StopIteration at the end of a video file.
     """
+    usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
     earlier = next(frames)
     end = earlier.time_s + patience_s
     while True:
@@ -389,32 +374,20 @@ def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patienc
             earlier, end = frame, frame.time_s + patience_s
         if frame.time_s - earlier.time_s < REST_S:
             continue
-        fault = _fault(earlier, frame, kept)
-        if fault is None:
+        now = ImageSummary.of(frame.image)
+        if earlier.image.shape != frame.image.shape:
+            fault = "the size of the camera's images changes; fix it with --camera-size"
+        elif not now.is_like(ImageSummary.of(earlier.image)):
+            fault = "the image is not still; wait until the arm and everything in view is at rest"
+        elif (exposure := exposure_fault(brightness_and_sharpness(frame.image)[0])) is not None:
+            fault = f"the image is {exposure}; change light or exposure"
+        elif now.sharpness < BLURRED * usual:
+            fault = f"the image is blurred ({100 * now.sharpness / usual:.0f} % of the usual sharpness)"
+        # LiveFolder.add refuses images whose size differs from the kept ones.
+        elif any(now.is_like(one) for one in kept):
+            fault = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
+        else:
             return frame
         if frame.time_s > end:
             return fault
         earlier = frame
-
-
-def _fault(earlier: Frame, frame: Frame, kept: Sequence[ImageSummary]) -> str | None:
-    """Return the reason why a frame cannot be kept, such as motion or blur; None if it can be kept.
-
-    `earlier` is a frame taken at least 0.2 s before `frame`; `kept` are the images at other gripper poses.
-    """
-    if earlier.image.shape != frame.image.shape:
-        return "the size of the camera's images changes; fix it with --camera-size"
-    now = ImageSummary.of(frame.image)
-    usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
-    if not now.is_like(ImageSummary.of(earlier.image)):
-        return "the image is not still; wait until the arm and everything in view is at rest"
-    if (fault := exposure_fault(brightness_and_sharpness(frame.image)[0])) is not None:
-        return f"the image is {fault}; change light or exposure"
-    if now.sharpness < BLURRED * usual:
-        return f"the image is blurred ({100 * now.sharpness / usual:.0f} % of the usual sharpness)"
-    # LiveFolder.add refuses images whose size differs from the kept ones.
-    if any(now.is_like(one) for one in kept):
-        return (
-            "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
-        )
-    return None

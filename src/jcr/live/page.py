@@ -14,15 +14,7 @@ from jcr.calibration.options import GRASPING
 from jcr.calibration.words import leave_one_out_text
 from jcr.capture.images import read_image
 from jcr.findings import reached_in_words, sentence
-from jcr.live.progress import (
-    FIRST_ADVICE,
-    Notation,
-    accuracy_line,
-    faults,
-    finding_lines,
-    next_lines,
-    next_sentence,
-)
+from jcr.live.progress import FIRST_ADVICE, accuracy_line, faults, finding_lines, next_lines
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
 from jcr.report.render import render
@@ -62,8 +54,20 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 
     `has_report`: the report of the final calibration exists and can be opened.
     """
-    required = session.options.require or GRASPING
-    content = page_content(state, required, session.notation, has_report)
+    # "kind" selects the colour of the headline; "images" are the cards of the list, the newest first.
+    kind, *lines = verdict_lines(state)
+    headline, *below = (line[:1].upper() + line[1:] for line in lines)
+    content = {
+        "kind": kind,
+        "headline": headline,
+        "lines": below,
+        "is_over": state.is_over,
+        "has_report": has_report,
+        "can_undo": state.can_undo,
+        "tiles": _tiles(state, session.options.require or GRASPING),
+        "next": next_lines(state.progress, session.notation) if _is_proposed(state) else [],
+        "images": _cards(state)[::-1],
+    }
     return {
         "version": state.version,
         "is_over": state.is_over,
@@ -72,31 +76,6 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
         "images": len(state.images),
         "parts": {name: render(f"{name}.html", {"state": content}, PACKAGE) for name in PARTS},
         "scene": json.dumps(_scene(state)),
-    }
-
-
-def page_content(
-    state: SessionState, required: tuple[float, float], notation: Notation, has_report: bool = False
-) -> dict[str, Any]:
-    """Return the values that the page's templates show for a state; `required` is the required accuracy (mm, degrees).
-
-    "kind" selects the colour of the headline ("good", "fair", "bad" or empty). "images" are the cards of the list, the
-    newest first.
-    """
-    progress, has_next = state.progress, _is_proposed(state)
-    kind, *lines = _verdict(state)
-    headline, *below = (line[:1].upper() + line[1:] for line in lines)
-    return {
-        "kind": kind,
-        "headline": headline,
-        "lines": below,
-        "is_over": state.is_over,
-        "has_report": has_report,
-        "can_undo": state.can_undo,
-        "tiles": _tiles(state, required),
-        "next_pose": next_sentence(progress) if has_next else "",
-        "next_lines": next_lines(progress, notation) if has_next else [],
-        "images": _cards(state)[::-1],
     }
 
 
@@ -120,7 +99,7 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
     ]
 
 
-def _verdict(state: SessionState) -> list[str]:
+def verdict_lines(state: SessionState) -> list[str]:
     """Return a list: colour of the headline ("good", "fair", "bad" or empty), headline, and the lines below it."""
     progress, result, count = state.progress, state.result, len(state.images)
     wrong = faults(progress)
@@ -147,12 +126,8 @@ def _verdict(state: SessionState) -> list[str]:
         return ["good", "Requirement met, press Finish", *lines]
     if wrong:
         return ["fair", *lines]
-    return [
-        "",
-        f"{count} images",
-        accuracy_line(progress),
-        *([FIRST_ADVICE] if progress.reached is None else []),
-    ]
+    advice = [FIRST_ADVICE] if progress.reached is None else []
+    return ["", f"{count} images", accuracy_line(progress), *advice]
 
 
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
@@ -179,13 +154,11 @@ def _scene(state: SessionState) -> dict[str, Any]:
     """Return the data of the 3D view: points, images, next pose, and, after a calibration, cameras with their poses."""
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
-    faults_of = {one["name"]: one["fault"] for one in _cards(state)}
     views = []
-    for one, fault in ((one, faults_of[one.image]) for one in state.images):
-        is_placed = found is not None and one.image in progress.registered
-        camera = one.base_from_gripper @ x if is_placed else None
-        name = Path(one.image).name
-        views.append(scene_view(name, fault or one.image, not fault, one.base_from_gripper, camera))
+    for one, card in zip(state.images, _cards(state), strict=True):
+        name, fault, gripper = Path(one.image).name, card["fault"], one.base_from_gripper
+        camera = gripper @ x if found is not None and one.image in progress.registered else None
+        views.append(scene_view(name, fault or one.image, not fault, gripper, camera))
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
     proposed = progress.next_pose if _is_proposed(state) else None
     next_poses = [] if proposed is None else [proposed.base_from_gripper]

@@ -83,7 +83,7 @@ class Progress:
 
     def __str__(self) -> str:
         """Return two lines: the reached and required accuracy, and the next action."""
-        advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_sentence(self)}"
+        advice = FIRST_ADVICE if self.next_pose is None else f"next pose: {next_lines(self, Notation())[0]}"
         if wrong := faults(self):
             advice = sentence(wrong[0])
         elif self.requirement_met:
@@ -147,25 +147,48 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
     if state.requirement_met:
         return [*lines, REQUIREMENT_MET]
     if state.next_pose is not None:
-        lines += [f"next: {next_sentence(state)}", *(f"  {line}" for line in next_lines(state, notation))]
+        about, *below = next_lines(state, notation)
+        lines += [f"next: {about}", *(f"  {line}" for line in below)]
     return lines
 
 
-def next_sentence(state: Progress) -> str:
-    """Return a phrase on the next pose: its distance from the closest image's pose, and the expected accuracy."""
-    pose = state.next_pose
-    assert pose is not None
-    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
-    then = f"expected then: {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
-    return f"{moved:.0f} mm and {rotated:.0f}° from {pose.like}; {then}"
-
-
 def next_lines(state: Progress, notation: Notation) -> list[str]:
-    """Return the lines of `pose_lines` for the next pose, and a line if the arm cannot reach it."""
-    assert state.next_pose is not None
-    lines = pose_lines(state.next_pose.base_from_gripper, notation, state.next_joints)
+    """Return lines of text on the next pose: what it improves, the gripper pose in this notation, and joint angles.
+
+    The first line has the distance from the closest image's pose, and the expected accuracy. For the convention of UR,
+    there is also a line in URScript. A line is added if the arm of `notation` cannot reach the pose.
+    """
+
+    def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
+        """Return numbers with `digits` decimals, separated by commas."""
+        return ", ".join(f"{value:.{digits}f}" for value in numbers)
+
+    assert (new := state.next_pose) is not None
+    moved, rotated = 1e3 * new.moved_m, np.degrees(new.rotation_rad)
+    then = f"expected then: {significant(new.within_95_mm)} mm and {significant(new.rotation_95_deg)}°"
+    convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
+    units: UnitsName = "mm-rad" if convention == "ur" else notation.units
+    pose, joints = new.base_from_gripper[None], state.next_joints
+    row = numbers_from_poses(pose, convention, units)[0]
+    if convention in ("franka", "matrix"):
+        order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
+        line = f"{order}: [{joined(row, 5)}]"
+    else:
+        form = CONVENTIONS[convention]
+        length, angle = form.units(units)
+        digits = 3 * [1 if length == "mm" else 4]
+        digits += (len(row) - 3) * [5 if not form.has_angles else 2 if angle == "deg" else 4]
+        named = [f"{name} {value:.{n}f}" for name, value, n in zip(form.columns, row, digits, strict=True)]
+        unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
+        line = f"{' '.join(named[:3])} {length}, {' '.join(named[3:])}{unit}"
+    lines = [f"{moved:.0f} mm and {rotated:.0f}° from {new.like}; {then}", line]
+    if convention == "ur":
+        movel = f"URScript: movel(p[{joined(numbers_from_poses(pose, 'ur')[0], 5)}], a=0.3, v=0.1)"
+        lines[1:] = [f"pendant: {line}", movel]
     is_used = all(one.kind is not FindingKind.ROBOT_UNUSED for one in state.findings)
-    if notation.arm is not None and state.next_joints is None and is_used:
+    if joints is not None:
+        lines += [f"joints, °: {joined(np.degrees(joints), 2)}", f"joints, rad: {joined(joints, 4)}"]
+    elif notation.arm is not None and is_used:
         lines.append(f"a {notation.arm.name} cannot reach this pose within its joint limits: go near it")
     return lines
 
@@ -186,37 +209,3 @@ def accuracy_line(state: Progress) -> str:
                 met = f"reached, to be confirmed with {CONFIRMING_IMAGES} images"
         line += f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     return line
-
-
-def pose_lines(
-    pose: Float[ndarray, "4 4"], notation: Notation, joints: Float[ndarray, " dof"] | None = None
-) -> list[str]:
-    """Return lines of text with a gripper pose in a pose convention (`notation`), and `joints` in ° and rad.
-
-    For the convention of UR, there is also a line in URScript.
-    """
-
-    def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
-        """Return numbers with `digits` decimals, separated by commas."""
-        return ", ".join(f"{value:.{digits}f}" for value in numbers)
-
-    convention = "quat-xyzw" if notation.convention == "auto" else notation.convention
-    units: UnitsName = "mm-rad" if convention == "ur" else notation.units
-    row = numbers_from_poses(pose[None], convention, units)[0]
-    if convention in ("franka", "matrix"):
-        order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
-        lines = [f"{order}: [{joined(row, 5)}]"]
-    else:
-        form = CONVENTIONS[convention]
-        length, angle = form.units(units)
-        digits = 3 * [1 if length == "mm" else 4]
-        digits += (len(row) - 3) * [5 if not form.has_angles else 2 if angle == "deg" else 4]
-        named = [f"{name} {value:.{n}f}" for name, value, n in zip(form.columns, row, digits, strict=True)]
-        unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
-        lines = [f"{' '.join(named[:3])} {length}, {' '.join(named[3:])}{unit}"]
-    if convention == "ur":
-        metres = joined(numbers_from_poses(pose[None], "ur")[0], 5)
-        lines = [f"pendant: {lines[0]}", f"URScript: movel(p[{metres}], a=0.3, v=0.1)"]
-    if joints is not None:
-        lines += [f"joints, °: {joined(np.degrees(joints), 2)}", f"joints, rad: {joined(joints, 4)}"]
-    return lines

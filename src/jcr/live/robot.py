@@ -43,12 +43,9 @@ UR_TIMEOUT_S = 5.0
 """Time (s) without data after which the connection to a UR fails."""
 FRANKA_POLL_S, XARM_POLL_S = 0.008, 0.02
 """Time (s) between two reads of the state of a Franka and of a UFACTORY arm."""
-UR_TOOL_SINCE_3_0, UR_TOOL_BEFORE = 444, 588
-"""First byte of x, y, z (m) and rx, ry, rz (rotation vector, rad) of the tool centre point: since 3.0, and before."""
-UR_BEFORE_3_0 = (764, 812)
-"""Lengths (bytes) of the packets of UR software before 3.0."""
-UR_SINCE_3_0 = range(1044, 4096)
-"""Possible lengths (bytes) of packets since 3.0, where 1044 is the length; later releases append fields."""
+UR_TOOL = {764: 588, 812: 588} | dict.fromkeys(range(1044, 4096), 444)
+"""First byte of x, y, z (m) and rx, ry, rz (rotation vector, rad) of the tool centre point, by the length of the packet
+(bytes): before software 3.0, and since then, where 1044 is the length in 3.0 and later releases append fields."""
 UR_JOINTS = 252
 """First byte of the six actual joint angles (rad), in every version."""
 
@@ -72,7 +69,7 @@ States = Callable[[], Iterator[RobotState]]
 def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[float, float]) -> RobotState:
     """Wait until the arm rests at a pose that differs from `last` by more than `limit` (m, rad); return its state.
 
-    `last` None: any pose at rest is returned.
+    `states` connects to the arm. `last` is a gripper pose (4,4); None: any pose at rest is returned.
     """
     recent: deque[RobotState] = deque()
     for state in states():
@@ -90,7 +87,7 @@ def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[f
 
 
 def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[float, float]) -> bool:
-    """Test whether two poses differ by more than `limit`, in translation (m) or in rotation (rad)."""
+    """Test whether two gripper poses (4,4) differ by more than `limit` in translation (m) or in rotation (rad)."""
     motion = inverse(a) @ b
     return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
 
@@ -152,7 +149,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
             stream = connection.makefile("rb")
             while head := stream.read(4):
                 length = int.from_bytes(head) if len(head) == 4 else 0
-                if length not in UR_BEFORE_3_0 and length not in UR_SINCE_3_0:
+                if length not in UR_TOOL:
                     raise InputError(
                         f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or "
                         "30013"
@@ -160,8 +157,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
                 if len(packet := head + stream.read(length - 4)) < length:
                     break
                 (time_s,) = struct.unpack_from("!d", packet, 4)
-                offset = UR_TOOL_BEFORE if length in UR_BEFORE_3_0 else UR_TOOL_SINCE_3_0
-                tool = struct.unpack_from("!6d", packet, offset)
+                tool = struct.unpack_from("!6d", packet, UR_TOOL[length])
                 joints = np.array(struct.unpack_from("!6d", packet, UR_JOINTS))
                 # A last joint without limits may have an angle beyond the largest that capture.json allows.
                 plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
@@ -234,32 +230,25 @@ def xarm_states(host: str) -> Iterator[RobotState]:
 
 Action = Literal["take", "retake", "remove", "undo", "finish"]
 WITH_NUMBER: tuple[Action, ...] = ("retake", "remove")
+"""Actions after which the number of an image may follow."""
 HELP = "type take, retake [NUMBER], remove [NUMBER], undo or finish, and Enter; NUMBER counts from 1, unset: the last"
-
-
-def command_of(line: str) -> tuple[Action, int | None] | None:
-    """Return action and image number (None: not given) of a typed command; None if the line is no command.
-
-    The first three letters of an action are enough.
-    """
-    first, *rest = line.split() or [""]
-    found = [action for action in get_args(Action) if len(first) >= 3 and action.startswith(first.lower())]
-    if len(found) != 1 or len(rest) > (found[0] in WITH_NUMBER) or not all(w.isdecimal() for w in rest):
-        return None
-    return found[0], int(rest[0]) if rest else None
 
 
 def without_commands(lines: Iterable[str], press: Callable[[Action, int | None], None]) -> Iterator[str]:
     """Yield the typed lines that are no commands; for each command, call `press` with action and image number.
 
-    The number is None if the command has none.
+    The number is None if the command has none. The first three letters of an action are enough.
     """
     for line in lines:
-        command = command_of(line)
-        if command is None:
-            yield line
+        first, *rest = line.split() or [""]
+        found = [
+            action for action in get_args(Action) if len(first) >= 3 and action.startswith(first.lower())
+        ]
+        most = any(action in WITH_NUMBER for action in found)
+        if len(found) == 1 and len(rest) <= most and all(word.isdecimal() for word in rest):
+            press(found[0], int(rest[0]) if rest else None)
         else:
-            press(*command)
+            yield line
 
 
 def typed_poses(

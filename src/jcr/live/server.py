@@ -79,7 +79,7 @@ class LiveServer(ThreadingHTTPServer):
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError(
-                "--token: has characters that an address cannot have; use letters, digits, - and _"
+                "JCR_TOKEN: has characters that an address cannot have; use letters, digits, - and _"
             )
         where = f"{'--page-port' if host == LOOPBACK else '--listen'} {host}:{port}"
         is_any_host = host == ""
@@ -89,17 +89,16 @@ class LiveServer(ThreadingHTTPServer):
             raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
         if host != LOOPBACK and token is None:
             raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
-        self.session, self.key, self.host = session, token or secrets.token_urlsafe(16), host
-        self.takes_samples = takes_samples
-        self.sampled_s = time.monotonic()
-        """Time (s, monotonic clock) of the last sample; infinite while a sample is being answered."""
-        self._page_version, self._page_s = -1, -np.inf
+        self.session, self.key = session, token or secrets.token_urlsafe(16)
+        self.takes_samples, self.sampled_s = takes_samples, time.monotonic()
+        """Whether samples are accepted, and time (s, monotonic clock) of the last one; infinite during an answer."""
+        self.page_version, self.page_s = -1, -np.inf
         """Version of the state that the page shows, and time (s, monotonic clock) of the page's last request."""
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
             raise InputError(f"{where}: {error}; choose an address of this machine and a free port") from None
-        names = (LOOPBACK, "localhost") if self.host == LOOPBACK else (self.host,)
+        names = (LOOPBACK, "localhost") if host == LOOPBACK else (host,)
         self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
         """Accepted values of the header `Host`: name and port of this server."""
         self.address = f"http://{self.hosts[0]}/{self.key}/"
@@ -122,10 +121,6 @@ class LiveServer(ThreadingHTTPServer):
                 )
             time.sleep(0.1)
 
-    def page_has(self, version: int) -> None:
-        """Record that a page requested the state just now, and that it shows the state of this `version`."""
-        self._page_version, self._page_s = max(self._page_version, version), time.monotonic()
-
     def __enter__(self) -> "LiveServer":
         """Start to serve requests in a thread."""
         threading.Thread(target=self.serve_forever, daemon=True).start()
@@ -135,7 +130,7 @@ class LiveServer(ThreadingHTTPServer):
         """Wait, for LAST_S at most, until an open page has the last state; then stop the server."""
         end = time.monotonic() + LAST_S
         while time.monotonic() < end and (
-            time.monotonic() - self._page_s < OPEN_S and self._page_version < self.session.state.version
+            time.monotonic() - self.page_s < OPEN_S and self.page_version < self.session.state.version
         ):
             time.sleep(0.05)
         self.shutdown()
@@ -164,11 +159,12 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "":
             self._send(whole_page(session).encode(), HTML)
         elif path == "state":
-            # A page that has the newest state gets its version alone.
-            has_it = query.removeprefix("version=") == str(state.version)
-            server.page_has(state.version if has_it else -1)
-            has_report = server.report is not None
-            self._send_json({"version": state.version} if has_it else page_parts(session, state, has_report))
+            server.page_s, content = time.monotonic(), {"version": state.version}
+            if query.removeprefix("version=") == str(state.version):  # the page has the newest state
+                server.page_version = state.version
+            else:
+                content = page_parts(session, state, server.report is not None)
+            self._send_json(content)
         elif path == "now.jpg" and (frame := session.camera.latest()) is not None:
             jpeg, features = camera_image(frame.image)
             self._send(jpeg, "image/jpeg", X_Features=features)

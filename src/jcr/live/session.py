@@ -57,11 +57,6 @@ class SessionOptions:
     """End, with exit status 0, as soon as the requirement is met and the leave-one-out error confirms it; with
     status 3 where it is not met with the last image."""
 
-    @property
-    def most(self) -> int:
-        """Number of images at which the capture ends, even if it is not accurate enough."""
-        return self.images or (MOST_IMAGES if self.until_accurate else ENOUGH_IMAGES)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SessionState:
@@ -93,12 +88,7 @@ class SessionState:
 
 
 class LiveSession:
-    """Live capture: takes images with a camera on request, and calibrates them in a thread meanwhile.
-
-    `tell` is called with each answer and each state of the calibration, as JSON and as lines for a person. `gripper`
-    returns the present state of the arm. It is called for an image on command, and after each image to detect motion;
-    None: poses are typed or posted.
-    """
+    """Live capture: takes images with a camera on request, and calibrates them in a thread meanwhile."""
 
     def __init__(
         self,
@@ -111,12 +101,14 @@ class LiveSession:
     ) -> None:
         """Prepare a session that adds images of `camera` to `calibration`; `run` starts it.
 
-        `tell` is called with each answer (JSON) and its lines for a person. `gripper` returns the arm's state now; None:
-        poses are typed or posted. `notation` is that of proposed poses.
+        `tell` is called with each answer and each state of the calibration, as JSON and as lines for a person.
+        `gripper` returns the present state of the arm, for an image on command and to detect motion after each image;
+        None: poses are typed or posted. `notation` is that of proposed poses.
         """
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
         self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)
         self._tell, self._gripper = tell, gripper
+        self._most = self.options.images or (MOST_IMAGES if self.options.until_accurate else ENOUGH_IMAGES)
         self._frames = iter(camera.frames)
         self._lock = threading.RLock()
         """Lock that is held while an image is taken or a command is executed."""
@@ -139,15 +131,14 @@ class LiveSession:
 
         def request() -> None:
             """Run `source`, then end the capture, with the error of the source if there is one."""
-            error = None
             try:
                 source()  # pyright: ignore[reportOptionalCall]
-            except Exception as raised:
-                error = raised
-            self.end(error)
+            except Exception as error:
+                self.end(error)
+            self.end()
 
         self._follow()
-        self._show(is_over=len(self.folder.names) >= self.options.most)
+        self._show(is_over=len(self.folder.names) >= self._most)
         if source is not None:
             threading.Thread(target=request, daemon=True).start()
         longest_s, abandon = INTERRUPTED_S, True
@@ -170,7 +161,7 @@ class LiveSession:
         self._show(self.state.event, is_over=True)
 
     def watch(self, states: States) -> None:
-        """Take an image whenever the arm comes to rest at a new pose, until the capture has ended."""
+        """Take an image whenever the arm that `states` reads rests at a new pose, until the capture has ended."""
         last, limit = None, MOVED_ON
         while not self.state.is_over:
             state = next_rest(states, last, limit)
@@ -179,7 +170,7 @@ class LiveSession:
             last, limit = state.base_from_gripper, MOVED_ON if answer["accepted"] else TRY_AGAIN
 
     def take(self, state: RobotState, waits: bool = False) -> Answer:
-        """Take an image while the arm rests at `state`, start a calibration with it, and return an answer for JSON.
+        """Take an image while the arm rests at `state`, start to calibrate all images, and return an answer for JSON.
 
         The answer has "accepted", and "image" (name) or "reason". `waits`: wait for the calibration, and add its state
         and the next pose to the answer.
@@ -201,7 +192,7 @@ class LiveSession:
                 self._follow(state.base_from_gripper)
             else:
                 self._follow()
-                is_over = len(self.folder.names) >= self.options.most
+                is_over = len(self.folder.names) >= self._most
                 answer = {"accepted": True, "image": name, "done": self.state.is_over or is_over}
                 self._say(f"kept {name}", answer, is_over=is_over)
             following = self._following
@@ -255,7 +246,7 @@ class LiveSession:
         return self.state.result
 
     def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
-        """Return a frame at rest at a gripper pose (4,4); raise InputError with the reason if there is none to keep."""
+        """Return a frame taken while the gripper rests at this pose (4,4); raise InputError if none can be kept."""
         images = self.folder.images
         for one in images:
             if not is_farther(one.base_from_gripper, base_from_gripper, SAME_PLACE):
@@ -289,7 +280,7 @@ class LiveSession:
             self._following = self._worker.submit(self._calibrate, refused)
 
     def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
-        """Calibrate the images if they changed; then propose a pose distant from `refused`, unless that is None.
+        """Calibrate the images if they changed; propose a pose distant from the gripper pose `refused`, unless None.
 
         With --until-accurate, end the capture if the calibration of all images meets the requirement.
         """

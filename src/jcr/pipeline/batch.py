@@ -29,8 +29,6 @@ from jcr.progress import Progress, silent
 from jcr.report.render import render
 from jcr.result import CAPTURE, RunOptions, load_run
 
-RETRIES = 3
-"""Number of times that Ray starts a task again after its node failed."""
 MIN_EPISODES = 3
 """Smallest number of accepted episodes of a data set whose cameras are compared with each other."""
 MOVED_P = 1e-3
@@ -110,9 +108,10 @@ def batch(
     out.mkdir(parents=True, exist_ok=True)
     report("captures", 0.0)
     rows: list[BatchRow] = []
-    for row in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
-        rows.append(row)
-        rows.sort(key=_rank)
+    order = (*get_args(Verdict), "failed")
+    for new in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
+        rows.append(new)
+        rows.sort(key=lambda row: (order.index(row.status), row.offset_std_mm or np.inf, row.capture))
         _write_summary(out, rows)
         report("captures", len(rows) / len(tasks))
     rows = _with_moved_cameras(rows)
@@ -168,14 +167,15 @@ def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
         if len(members) < MIN_EPISODES:
             continue
         results = [load_run(Path(rows[k].out)).calibration for k in members]
-        squared = [np.median([compare(one, other).chi2 or 0.0 for other in results]) for one in results]
-        for k, result in zip(members, results, strict=True):
-            apart, reason = compare(results[int(np.argmin(squared))], result), rows[k].reason
+        differences = [[compare(one, other) for other in results] for one in results]
+        nearest = min(differences, key=lambda row: float(np.median([one.chi2 or 0.0 for one in row])))
+        for k, apart in zip(members, nearest, strict=True):
             mm = float(1e3 * np.linalg.norm(apart.translation_m))
             deg = float(np.degrees(np.linalg.norm(apart.rotation_vector)))
+            found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg)
             if apart.p_value is not None and apart.p_value < MOVED_P:
                 reason = f"the camera differs by {mm:.1f} mm and {deg:.2f}° from that of most episodes"
-            found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg, reason=reason)
+                found[k] = replace(found[k], reason=reason)
     return found
 
 
@@ -184,51 +184,38 @@ def _failed(task: Task, reason: str) -> BatchRow:
     return BatchRow(capture=str(task[0]), out=str(task[1]), status="failed", reason=reason)
 
 
-def _rank(row: BatchRow) -> tuple[int, float, str]:
-    """Return the sort key of a row: status, standard deviation of the translation, path of the capture."""
-    order = (*get_args(Verdict), "failed").index(row.status)
-    return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
-
-
 def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
     """Yield the row of each task when it ends; the tasks run in processes, which divide the cores among them."""
     # macOS has no sched_getaffinity, because it cannot bind a process to cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(options.processes or max(1, cores // 2), len(tasks))
-    before = dict(os.environ)
-    os.environ.update(dict.fromkeys(THREADS, str(max(1, cores // processes))))
-    try:
-        left = yield from _over_pool(tasks, processes)
-        # A process that is killed ends its whole pool. Each unfinished task is therefore run again in its own pool.
-        for task in left:
-            if (yield from _over_pool([task], 1)):
-                yield _failed(task, "its process died: out of memory, or a crash in a library")
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-def _over_pool(tasks: list[Task], processes: int):
-    """Yield the row of each task when it ends; finally return the tasks that a killed process left unfinished."""
-    left: list[Task] = []
     # Processes are spawned, because libraries with threads do not survive a fork. Ctrl-C, which reaches every process of
     # the terminal, ends each of them without a traceback.
     context, on_interrupt = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
-    pool = ProcessPoolExecutor(processes, context, initializer=signal.signal, initargs=on_interrupt)
+    before, waiting = dict(os.environ), [tasks]
+    os.environ.update(dict.fromkeys(THREADS, str(max(1, cores // processes))))
     try:
-        task_of = {pool.submit(run_one, *task): task for task in tasks}
-        for future in as_completed(task_of):
-            try:
-                yield future.result()
-            except BrokenProcessPool:
-                left.append(task_of[future])
-        pool.shutdown()
-        return left
+        while waiting:
+            own = waiting.pop(0)
+            count = min(processes, len(own))
+            pool = ProcessPoolExecutor(count, context, initializer=signal.signal, initargs=on_interrupt)
+            task_of = {pool.submit(run_one, *task): task for task in own}
+            for future in as_completed(task_of):
+                if not isinstance(future.exception(), BrokenProcessPool):
+                    yield future.result()
+                elif len(own) > 1:
+                    # A killed process ends its whole pool. Each unfinished task is run again in a pool of its own.
+                    waiting.append([task_of[future]])
+                else:
+                    yield _failed(task_of[future], "its process died: out of memory, or a crash in a library")
+            pool.shutdown()
     except BaseException:
         for child in multiprocessing.active_children():
             child.terminate()
-        pool.shutdown(cancel_futures=True)
         raise
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
@@ -237,12 +224,10 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
-    own = not ray.is_initialized()
-    if own:
-        try:
-            ray.init(address=options.ray, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, ValueError) as error:
-            raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
+    try:
+        ray.init(options.ray, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError) as error:
+        raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
     try:
         cpus, gpus = options.cpus_per_task, options.gpus_per_task
         resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -252,7 +237,7 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
                 f"--ray {options.ray}: no node has the {cpus} cores and {gpus:g} GPUs that a capture takes; "
                 "lower --cpus-per-task or --gpus-per-task, or add the node first"
             )
-        remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=RETRIES)(run_one)
+        remote = ray.remote(num_cpus=cpus, num_gpus=gpus)(run_one)  # tried three times more if its node fails
         task_of = {remote.remote(*task): task for task in tasks}
         waiting = list(task_of)
         while waiting:
@@ -262,8 +247,7 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
             except RayError as error:
                 yield _failed(task_of[done], " ".join(str(error).split())[:200])
     finally:
-        if own:
-            ray.shutdown()
+        ray.shutdown()
 
 
 def _write_summary(out: Path, rows: Sequence[BatchRow]) -> None:

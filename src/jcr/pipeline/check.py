@@ -125,14 +125,15 @@ def check_capture(
     options = CalibrateOptions(robot_noise=robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1])))
     camera, sharpness, views, shown = None, np.zeros(0), (), _Comparison()
     if isinstance(capture, PosePairs):
-        robot, clear, shown = errors_of(given), np.arange(len(capture)), _compare_pairs(capture, options)
+        robot, clear = errors_of(given), np.arange(len(capture))
+        shown = _compare(capture, robot, options, seed, progress, thorough)
     else:
         robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
         clear, sharpness, remarks = _look(capture, views)
         notes += remarks
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         if look and verdict_of(views) != "rejected":
-            shown = _compare_with_images(capture, robot, options, seed, progress, thorough)
+            shown = _compare(capture, robot, options, seed, progress, thorough)
     counted = clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
@@ -177,19 +178,28 @@ def _look(
     return clear, sharpness / max(float(np.median(sharpness)), 1e-9), remarks
 
 
-def _compare_with_images(
-    capture: Capture,
+def _compare(
+    capture: Capture | PosePairs,
     robot: RobotErrorPrior,
     options: CalibrateOptions,
     seed: int,
     progress: Progress | None,
     thorough: bool,
 ) -> _Comparison:
-    """Calibrate from gripper poses and camera poses from features, and return whether and how well both agree.
+    """Calibrate from gripper and camera poses, and return whether and how well both agree.
 
-    First QUICK images of reduced size are compared; then all images if `thorough` is set, or if the first comparison
-    fails, is rejected, or does not use all QUICK images.
+    The camera poses of PosePairs are given, others are reconstructed from features: first those of QUICK images of
+    reduced size; then those of all images if `thorough` is set, or if the first comparison fails, is rejected, or does
+    not use all QUICK images.
     """
+    if isinstance(capture, PosePairs):
+        hand_eye, assumptions = calibrate_pose_pairs(capture, options), None
+        used, findings = hand_eye.inliers, hand_eye.findings
+        if hand_eye.converged:
+            scale_std = SCALE_STD if capture.is_metric and is_one(hand_eye) else None
+            assumptions = assumptions_of_poses(hand_eye, capture.base_from_gripper[used], scale_std)
+        rows = np.flatnonzero(used)
+        return _Comparison(hand_eye=hand_eye, findings=findings, registered=rows, assumptions=assumptions)
     is_quick = not thorough and len(capture) > QUICK
     tried, of_tried, size_px = capture, robot, WORKING_SIZE_PX
     if is_quick:
@@ -199,7 +209,7 @@ def _compare_with_images(
         made = reconstruct_colmap(tried, "sift", seed, progress, size_px)
     except RejectedError as error:
         if is_quick:
-            return _compare_with_images(capture, robot, options, seed, progress, thorough=True)
+            return _compare(capture, robot, options, seed, progress, thorough=True)
         return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
     hand_eye, assumptions, registered = case.hand_eye, None, made.image_index[case.hand_eye.inliers]
@@ -207,27 +217,12 @@ def _compare_with_images(
         assumptions = assumptions_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
     if is_quick and (verdict_of(hand_eye.findings) == "rejected" or len(registered) < QUICK):
-        return _compare_with_images(capture, robot, options, seed, progress, thorough=True)
+        return _compare(capture, robot, options, seed, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,
         notes=made.notes,
         registered=None if is_quick else registered,
-        assumptions=assumptions,
-    )
-
-
-def _compare_pairs(pairs: PosePairs, options: CalibrateOptions) -> _Comparison:
-    """Calibrate from gripper poses and given camera poses, and return whether and how well both agree."""
-    hand_eye = calibrate_pose_pairs(pairs, options)
-    used, assumptions = hand_eye.inliers, None
-    if hand_eye.converged:
-        scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
-        assumptions = assumptions_of_poses(hand_eye, pairs.base_from_gripper[used], scale_std)
-    return _Comparison(
-        hand_eye=hand_eye,
-        findings=hand_eye.findings,
-        registered=np.flatnonzero(used),
         assumptions=assumptions,
     )
 
@@ -241,8 +236,9 @@ def read_and_compare(
 ) -> tuple[Capture | PosePairs, ReadOptions]:
     """Read a capture; if its file does not determine the pose convention, select the one that fits the images best.
 
-    Return the capture, with a note on the selected convention, and the options with which it was read. Raises InputError
-    if the best convention does not fit CLEARER times better than the second.
+    Return the capture, with a note on the selected convention, and the options with which it was read. The fit is the
+    median residual between gripper poses and camera poses from a few images of reduced size. Raises InputError if these
+    images cannot be reconstructed, or the best convention does not fit CLEARER times better than the second.
     """
     options = options or ReadOptions()
     with suppress(OpenConventionError):
@@ -253,7 +249,20 @@ def read_and_compare(
             with suppress(InputError):
                 read.append((read_capture(path, one), one))
                 break
-    fits = _fits(read, progress) if read else []
+    fits = list[tuple[float, str, Capture, ReadOptions]]()
+    with suppress(RejectedError):  # the images cannot be reconstructed
+        found = None
+        for capture, one in read:
+            rows = spread_rows(len(capture))
+            found = found or reconstruct_colmap(capture.of_rows(rows), "sift", 0, progress, QUICK_SIZE_PX)
+            gripper = capture.base_from_gripper[rows][found.image_index]
+            fit = solve_hand_eye(gripper, found.recon_from_camera, camera_errors="none")
+            # Residuals are used, because the noise of a rejected fit is an assumption and does not depend on the poses.
+            residuals = [(image.translation_residual_mm, image.rotation_residual_deg) for image in fit.images]
+            mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
+            off = f"{significant(mm)} mm and {significant(deg)}°"
+            fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, one))
+    fits.sort(key=lambda fit: fit[0])
     if not fits or (len(fits) > 1 and fits[1][0] < CLEARER * fits[0][0]):
         raise InputError(
             f"{path}: columns rx, ry, rz may be a rotation vector or angles, and the images do not tell which; add "
@@ -267,31 +276,6 @@ def read_and_compare(
         f"the images to {off} (median){worse}; give these options to jcr run"
     )
     return replace(capture, notes=(*capture.notes, note)), options
-
-
-def _fits(
-    read: list[tuple[Capture, ReadOptions]], progress: Progress | None
-) -> list[tuple[float, str, Capture, ReadOptions]]:
-    """Return (error in m, error in words, capture, options) for one capture read with several options, best first.
-
-    The error is the median residual between gripper poses and camera poses from a few images of reduced size. The list
-    is empty if these images cannot be reconstructed.
-    """
-    rows = spread_rows(len(read[0][0]))
-    try:
-        found = reconstruct_colmap(read[0][0].of_rows(rows), "sift", 0, progress, QUICK_SIZE_PX)
-    except RejectedError:
-        return []
-    fits = []
-    for capture, options in read:
-        gripper = capture.base_from_gripper[rows][found.image_index]
-        fit = solve_hand_eye(gripper, found.recon_from_camera, camera_errors="none")
-        # Residuals are used, because the noise of a rejected fit is an assumption and does not depend on the poses.
-        residuals = [(one.translation_residual_mm, one.rotation_residual_deg) for one in fit.images]
-        mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
-        off = f"{significant(mm)} mm and {significant(deg)}°"
-        fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, options))
-    return sorted(fits, key=lambda fit: fit[0])
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:

@@ -24,6 +24,8 @@ from jcr.files import locked, write_text
 from jcr.options import checked_options
 from jcr.pipeline.selection import NothingFoundError
 from jcr.pipeline.stages import (
+    FIRST,
+    REST,
     begun,
     finished,
     forget_reconstruction,
@@ -32,7 +34,6 @@ from jcr.pipeline.stages import (
     make,
     noted,
     place,
-    stages_of,
 )
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName, check_board
@@ -86,11 +87,10 @@ def run(
             threading.Thread(target=_load_map_code, daemon=True).start()
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
-        stages = stages_of(result)
-        result = noted(make(result, stages[:2], report), missing)
+        result = noted(make(result, FIRST, report), missing)
         if calibrated is not None:
             calibrated(result)
-        return finished(result, stages[2:], report)
+        return finished(result, REST, report)
 
 
 def calibrate(
@@ -156,8 +156,7 @@ def build_map(
         for path in add:
             added = with_added_images(result.added, Path(path), checked_options(read, ReadOptions))
             result = result.with_parts(added=added)
-        stages = stages_of(result)
-        return finished(make(result, stages[:2], report), stages[2:], report)
+        return finished(make(result, FIRST, report), REST, report)
 
 
 def add_camera(
@@ -190,7 +189,7 @@ def add_camera(
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
         with TemporaryDirectory() as scratch:
             camera = added_camera(name, files, file, taken, Path(scratch))
-            result = make(known.with_parts(others=(*known.others, camera)), stages_of(known)[:2], report)
+            result = make(known.with_parts(others=(*known.others, camera)), FIRST, report)
             located = place(result, report)
             if (found := located.cameras[-1]).doubt is not None:
                 raise RejectedError(f"{name}: {found.doubt}")

@@ -103,23 +103,18 @@ class Trial:
             return not isinstance(self.failure, InputError)
         return self.hand_eye.verdict != "accepted" or not all(one.used for one in self.hand_eye.images)
 
-    @property
-    def name(self) -> str:
-        """Name of the back end and its features, with the leave-one-out error of its calibration, for messages."""
+    def in_words(self, is_kept: bool = False) -> str:
+        """Return the back end, its features and its leave-one-out error, and the reason why it failed or is rejected.
+
+        `is_kept`: the reason is left out.
+        """
         name = " with ".join(filter(None, (self.account.backend, self.account.features)))
         if self.hand_eye is None:
-            return name
+            return f"{name} failed ({self.failure})"
         error = self.hand_eye.held_out
-        if error is None:
-            return f"{name} (too few images to leave one out)"
-        return f"{name} (leave-one-out error {leave_one_out_text(error)})"
-
-    @property
-    def why_not(self) -> str:
-        """Name of the back end, and for messages the reason why it failed or is rejected."""
-        if self.hand_eye is None:
-            return f"{self.name} failed ({self.failure})"
-        return f"{self.name} is rejected ({self.hand_eye.doubt})"
+        left_out = "too few images to leave one out"
+        name += f" ({left_out if error is None else f'leave-one-out error {leave_one_out_text(error)}'})"
+        return name if is_kept else f"{name} is rejected ({self.hand_eye.doubt})"
 
     def is_textured(self, images: int) -> bool:
         """Test whether COLMAP found at least TEXTURED SIFT features per image, so that a lack of texture is excluded.
@@ -226,22 +221,18 @@ def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding,
             raise failure
         failure = failure if isinstance(failure, RejectedError) else RejectedError(str(failure))
         # The notes include the licence of network weights that were used.
-        failure = failure.with_more(*notes, *(f"back end {one.why_not}" for one in earlier))
+        failure = failure.with_more(*notes, *(f"back end {one.in_words()}" for one in earlier))
         raise NothingFoundError(failure, tuple(one.account for one in trials), as_causes(of_images))
     if others := [one for one in trials if one is not kept]:
         _, accepted, explained, _ = kept.rank
-        why = f"{kept.name} was used"
+        why = "was used"
         if not accepted and any(one.hand_eye is not None for one in others):
             reason = "it shows the cause" if explained else "its leave-one-out error is the smaller one"
-            why = f"{kept.name} is rejected, too, and was used: {reason}"
-        notes.insert(0, f"back end {'; '.join([*(one.why_not for one in others), why])}")
+            why = f"is rejected, too, and was used: {reason}"
+        texts = [*(one.in_words() for one in others), f"{kept.in_words(is_kept=True)} {why}"]
+        notes.insert(0, f"back end {'; '.join(texts)}")
     found = of_images if hand_eye.is_sound else as_causes(of_images)
-    attempts = tuple(
-        one.account
-        if one is kept or one.hand_eye is None
-        else replace(one.account, why_not=f"rejected: {one.hand_eye.doubt}")
-        for one in trials
-    )
+    attempts = tuple(replace(one.account, why_not=None) if one is kept else one.account for one in trials)
     hand_eye = replace(hand_eye, attempts=attempts, timings_s=timings_of(attempts))
     reconstruction = replace(reconstruction, notes=(*notes, *reconstruction.notes))
     return reconstruction, hand_eye.with_findings(*found) if found else hand_eye
@@ -264,13 +255,13 @@ def _try(
 ) -> Trial:
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
-    `source` is the options of the back end, or a function that returns a reconstruction. A known length, whose ends are
-    points of surfaces, needs dense depth, which is estimated before the calibration. An InputError of the calibration
-    is raised, because it would occur with every back end.
+    `source` is the options of the back end, or a function that returns a reconstruction, which `keep` receives before
+    the calibration. Dense depth is estimated first if a known length needs it. An InputError of the calibration is
+    raised, because it would occur with every back end.
     """
     start, report = time.perf_counter(), progress or silent
-    candidate = source if isinstance(source, ReconstructOptions) else None
-    made = failure = hand_eye = None
+    own = source if isinstance(source, ReconstructOptions) else None
+    made = failure = hand_eye = why_not = None
     try:
         made = reconstruct(capture, source, progress) if isinstance(source, ReconstructOptions) else source()
     except (InputError, RejectedError) as error:
@@ -280,23 +271,22 @@ def _try(
         keep(made)
     if made is not None and options.calibrate.known_length is not None:
         made = densify(capture, made, options.depth, progress)
-    calibrating = ended = time.perf_counter()
+    calibrating = time.perf_counter()
     if made is not None:
         report("calibrate", 0.0)
         try:
             hand_eye = calibrate_reconstruction(capture, made, options.calibrate)
+            why_not = f"rejected: {hand_eye.doubt}"
         except RejectedError as error:
             failure = error.with_traceback(None)
-        ended = time.perf_counter()
         give_back()
         report("calibrate", 1.0)
-    backend = candidate or made
     account = Attempt(
-        backend="" if backend is None else backend.backend,
+        backend=own.backend if own is not None else made.backend if made is not None else "",
         images_registered=None if made is None else len(made.image_index),
         reconstruct_s=round(calibrating - start, 3),
-        calibrate_s=round(ended - calibrating, 3),
-        why_not=None if failure is None else str(failure),
-        features=None if candidate is None or candidate.features == "auto" else candidate.features,
+        calibrate_s=round(time.perf_counter() - calibrating, 3),
+        why_not=why_not if failure is None else str(failure),
+        features=None if own is None or own.features == "auto" else own.features,
     )
     return Trial(account=account, reconstruction=made, hand_eye=hand_eye, failure=failure)

@@ -79,34 +79,18 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     return RunResult(out, capture=capture, state=state)
 
 
-def with_state(result: RunResult, **fields: Any) -> RunResult:
-    """Return the result with the given fields of its RunState replaced."""
-    return result.with_parts(state=result.state.model_copy(update=fields))
-
-
-def stages_of(result: RunResult) -> list[str]:
-    """Return the names of the stages that a run needs for its cameras and options, in the order of execution."""
-    left_out = set() if result.others else {"cameras"}
-    if result.state.options.map is None:
-        left_out |= {"densify", "map"}
-    return [name for name in STAGES if name not in left_out]
-
-
-def is_unchanged(result: RunResult) -> bool:
-    """Test whether the folder holds the finished run of the same inputs and options, with all its files."""
-    with suppress(InputError, OSError):
-        before = RunResult(result.out).state
-        return before.made == made_of(result) and before.files == files_of(result.out) != {}
-    return False
-
-
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run the named stages in this order; return the result with their outputs and times (s)."""
-    for name in stages:
+    """Run those of the named stages that the run's cameras and options need; return the result with their outputs.
+
+    The times (s) of the stages after the calibration are added to `timings_s` of the calibration.
+    """
+    unneeded = set() if result.others else {"cameras"}
+    unneeded |= {"densify", "map"} if result.state.options.map is None else set()
+    for name in (name for name in stages if name not in unneeded):
         start = time.perf_counter()
         result = STAGES[name][1](result, progress)
         give_back()
-        if name not in ("reconstruct", "calibrate"):  # `timings_of` gives these, summed over all back ends
+        if name not in FIRST:  # `timings_of` gives the times of these, summed over all back ends
             timings = result.calibration.timings_s | {name: round(time.perf_counter() - start, 3)}
             result = result.with_parts(calibration=replace(result.calibration, timings_s=timings))
     return result
@@ -124,64 +108,70 @@ def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> Ru
 
 def complete(result: RunResult) -> RunResult:
     """Write fingerprints of inputs and files to run.json, which marks the run as finished; return the result."""
-    result = with_state(result, made=made_of(result), files=files_of(result.out))
+    result = result.with_parts(state=finished_state(result))
     write_state(result)
     return result
 
 
-def made_of(result: RunResult) -> dict[str, str]:
-    """Return two fingerprints: key "reconstruct" for the reconstruction's inputs, "run" for all inputs and options."""
-    capture, folder = result.capture, result.capture.folder
+def is_unchanged(result: RunResult) -> bool:
+    """Test whether the folder holds the finished run of the same inputs and options, with all its files."""
+    with suppress(InputError, OSError):
+        before, now = RunResult(result.out).state, finished_state(result)
+        return before.made == now.made and before.files == now.files != {}
+    return False
+
+
+def finished_state(result: RunResult) -> RunState:
+    """Return the state of a run with the fingerprint of all its inputs and options, and those of the folder's files.
+
+    Fingerprints of calibration.json and of images added later are hashes of their content; that of another file is an
+    empty text.
+    """
+    capture, folder, out = result.capture, result.capture.folder, result.out
     depths = [folder / name for name in capture.depths or () if name is not None]
     others = [
         vars(one) | {"folder": [(one.folder or folder) / name for name in one.images]}
         for one in result.others
     ]
     facts = vars(capture) | {"folder": depths, "source": str(capture.source), "others": others}
-    return result.state.made | {"run": fingerprint(facts, result.state.options, __version__)}
-
-
-def files_of(out: Path) -> dict[str, str]:
-    """Return {name: identity} of the existing files of a run folder: outputs of stages, and images added later.
-
-    The identity of calibration.json and of added images is a hash of their content, that of other files an empty text.
-    """
-    names = [*(name for files, _ in STAGES.values() for name in files), ADDED]
-    return {
-        name: fingerprint(out / name) if name in (CALIBRATION, ADDED) else ""
-        for name in names
-        if (out / name).exists()
-    }
+    made = result.state.made | {"run": fingerprint(facts, result.state.options, __version__)}
+    names = [name for files, _ in STAGES.values() for name in files if (out / name).exists()]
+    hashed = [name for name in (CALIBRATION, ADDED) if (out / name).exists()]
+    files = dict.fromkeys(names, "") | {name: fingerprint(out / name) for name in hashed}
+    return result.state.model_copy(update={"made": made, "files": files})
 
 
 def fingerprint(*values: Any) -> str:
-    """Return a SHA-256 hash of `values`: of the fields of records, and the content of arrays and files (Path)."""
-    return hashlib.sha256(json.dumps(values, default=_identity).encode()).hexdigest()
+    """Return a SHA-256 hash of `values`: of the fields of records, and the content of arrays and files (Path).
 
-
-def _identity(value: Any) -> Any:
-    """Return the value that `fingerprint` hashes for a value that JSON lacks.
-
-    For an array or file: a hash; for a large file: size and date; for a folder: its files; for a record: its fields.
+    A folder is hashed as its files, and a file above LARGE as size and date.
     """
-    if isinstance(value, ndarray):
-        return hashlib.sha256(value.tobytes()).hexdigest()
-    if not isinstance(value, Path):
-        return vars(value)
-    if value.is_dir():
-        return [(str(file.relative_to(value)), file) for file in sorted(value.rglob("*")) if file.is_file()]
-    if not value.exists():
-        return str(value)
-    if (stat := value.stat()).st_size > LARGE:
-        return stat.st_size, stat.st_mtime_ns
-    return hashlib.sha256(read_bytes(value)).hexdigest()
+
+    def identity(value: Any) -> Any:
+        """Return the value to hash for a value that JSON lacks."""
+        if isinstance(value, ndarray):
+            return hashlib.sha256(value.tobytes()).hexdigest()
+        if not isinstance(value, Path):
+            return vars(value)
+        if value.is_dir():
+            files = (file for file in sorted(value.rglob("*")) if file.is_file())
+            return [(str(file.relative_to(value)), file) for file in files]
+        if not value.exists():
+            return str(value)
+        if (stat := value.stat()).st_size > LARGE:
+            return stat.st_size, stat.st_mtime_ns
+        return hashlib.sha256(read_bytes(value)).hexdigest()
+
+    return hashlib.sha256(json.dumps(values, default=identity).encode()).hexdigest()
 
 
 def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with a selected reconstruction and its calibration, and write the reconstruction.
 
     A reconstruction of the same inputs in the run folder, or in the one that `jcr capture` wrote, is used again. For a
-    fixed camera, only the pixels of the object that the gripper carries are used.
+    fixed camera, only the pixels of the object that the gripper carries are used. If no back end gives a calibration,
+    calibration.json and the report state the reason, and NothingFoundError is raised; it proposes the option `--board`
+    if the images show a board.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture
@@ -208,15 +198,23 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     except NothingFoundError as error:
         if not is_same(out):
             forget_reconstruction(out)
-        raise _failed(result, error) from None
+        tried = error.attempts
+        content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
+        boards = proposed(capture, options.reconstruct.board)
+        content = content.with_findings(*boards).with_notes() if boards else content
+        keep_calibration(out, content)
+        complete(_report(result.with_parts(calibration=content)))
+        if not boards:
+            raise
+        raise NothingFoundError(error.with_more(*map(sentence, boards)), tried) from None
     attempts = found.attempts if before is None else before.state.attempts or found.attempts
-    result = with_state(result, attempts=attempts).with_parts(reconstruction=made, calibration=found)
+    state = result.state.model_copy(update={"attempts": attempts})
+    result = result.with_parts(state=state, reconstruction=made, calibration=found)
     if is_same(out):
         write_state(result)
     else:
         keep_reconstruction(result, made)
-    _keep_depth(result)
-    return result
+    return _with_depth_kept(result)
 
 
 def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
@@ -232,20 +230,6 @@ def forget_reconstruction(out: Path) -> None:
     """Delete run.json, then depth and reconstruction, so that run.json never describes files of other inputs."""
     for name in (STATE, DEPTH, RECONSTRUCTION):
         (out / name).unlink(missing_ok=True)
-
-
-def _failed(result: RunResult, error: NothingFoundError) -> NothingFoundError:
-    """Write calibration.json and report with the reason of a failed selection; return the error to raise.
-
-    The error proposes the option `--board` if the images show a board.
-    """
-    capture, tried = result.capture, error.attempts
-    boards = proposed(capture, result.state.options.reconstruct.board)
-    content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
-    content = content.with_findings(*boards).with_notes() if boards else content
-    keep_calibration(result.out, content)
-    complete(_report(result.with_parts(calibration=content)))
-    return NothingFoundError(error.with_more(*map(sentence, boards)), tried) if boards else error
 
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
@@ -310,19 +294,16 @@ def _depth_made_from(result: RunResult) -> str:
 
 def _densify(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with dense depth in its reconstruction, estimated unless it is there, and write depth.npz."""
-    options = result.state.options.depth
-    result = result.with_parts(
-        reconstruction=densify(result.capture, result.reconstruction, options, progress)
-    )
-    _keep_depth(result)
-    return result
+    made = densify(result.capture, result.reconstruction, result.state.options.depth, progress)
+    return _with_depth_kept(result.with_parts(reconstruction=made))
 
 
-def _keep_depth(result: RunResult) -> None:
-    """Write the estimated pointmaps of the reconstruction to depth.npz, unless the file holds them already."""
+def _with_depth_kept(result: RunResult) -> RunResult:
+    """Write the estimated pointmaps of the reconstruction to depth.npz if the file lacks them; return the result."""
     pointmaps, file, made = result.reconstruction.pointmaps, result.out / DEPTH, _depth_made_from(result)
     if pointmaps is not None and not pointmaps.is_predicted and not is_made_from(file, made):
         write_depth(file, result.reconstruction, made)
+    return result
 
 
 def _map(result: RunResult, progress: Progress) -> RunResult:
@@ -341,7 +322,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     from jcr.segments.tabletop import fit_support
 
     options, capture, hand_eye, added = result.state.options, result.capture, result.found, result.added
-    assert options.map is not None  # `stages_of` leaves this stage out otherwise
+    assert options.map is not None  # `make` leaves this stage out otherwise
     made = result.reconstruction
     if len(added):
         x, base_from_recon = hand_eye.gripper_from_camera, hand_eye.base_from_recon
@@ -401,3 +382,5 @@ STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResu
     "report": ((REPORT,), _report),
 }
 """Stages in order: name, files in the run folder, and function that writes the files and adds records to the result."""
+FIRST, REST = tuple(STAGES)[:2], tuple(STAGES)[2:]
+"""Names of the stages until the calibration, and of those after the calibration."""

@@ -140,7 +140,17 @@ def verify_run(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
-    return _by_recalibration(run, new, options, progress)
+    # Images of another scene are calibrated, and both calibrations are compared.
+    if calibration.intrinsics is not None:
+        new = replace(new, intrinsics=calibration.intrinsics)
+    then = run.state.options
+    hand_eye = calibrate_reconstruction(new, reconstruct(new, then.reconstruct, progress), then.calibrate)
+    if not hand_eye.converged:
+        raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
+    offset = step_between(calibration.gripper_from_camera, hand_eye.gripper_from_camera)
+    drifted = _of_two(offset, calibration.covariance[:6, :6] + hand_eye.covariance[:6, :6], options)
+    how = "against a calibration of its own in another scene"
+    return _judged(drifted, options, list(hand_eye.names_used), (), how)
 
 
 def _new_images(
@@ -179,8 +189,8 @@ def _in_old_scene(
 ) -> Verification:
     """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 
-    `located` maps rows of `new` to these poses. Gripper and camera poses of the calibration are fitted again, without
-    bundle adjustment, because calibration.json does not contain the joint covariance that the test needs.
+    `located` maps rows of `new` to these poses; `notes` are warnings about new images without one. Gripper and camera
+    poses of the calibration are fitted again, because calibration.json lacks the joint covariance that the test needs.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
     calibrate_options, rows = run.state.options.calibrate, list(located)
@@ -256,23 +266,6 @@ def _fixed_cameras(
         found = _of_two(offset, j @ solution.covariance @ j.T, options)
         notes = [text for one in cell.cameras for text in one.warnings]
         yield replace(_judged(found, options, now.images, notes, "in the mapped scene"), fixed=own.name)
-
-
-def _by_recalibration(
-    run: RunResult, new: Capture, options: VerifyOptions, progress: Progress | None
-) -> Verification:
-    """Calibrate from images of another scene; return the χ² test of the difference from the old gripper_from_camera."""
-    calibration, then = run.calibration, run.state.options
-    if calibration.intrinsics is not None:
-        new = replace(new, intrinsics=calibration.intrinsics)
-    reconstruction = reconstruct(new, then.reconstruct, progress)
-    hand_eye = calibrate_reconstruction(new, reconstruction, then.calibrate)
-    if not hand_eye.converged:
-        raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
-    offset = step_between(calibration.gripper_from_camera, hand_eye.gripper_from_camera)
-    found = _of_two(offset, calibration.covariance[:6, :6] + hand_eye.covariance[:6, :6], options)
-    images = list(hand_eye.names_used)
-    return _judged(found, options, images, (), "against a calibration of its own in another scene")
 
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:

@@ -6,17 +6,18 @@ Parts that are only shown or hidden need no control here, because viser lists al
 import io
 import threading
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import viser
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 from viser.extras import ViserUrdf
+from viser.transforms import SO3
 
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
@@ -59,8 +60,11 @@ HOST = "127.0.0.1"
 """Address of the server: loopback, because viser has no password and no encryption."""
 Value = Float[ndarray, "3"]
 """Point (m) or direction in the base frame."""
-SliceOf = Literal["distance", "occupancy"]
-"""Property of the map that a slice shows."""
+SLICE_LEGENDS = {
+    "distance": f"yellow: at a surface; violet: {100 * FAR_M:.0f} cm and more; red: solid",
+    "occupancy": "white: free; blue: occupied; grey: unknown",
+}
+"""Legend of the colours of a slice, by its property."""
 
 
 class LocalServer(viser.ViserServer):
@@ -161,11 +165,13 @@ class Viewer:
             self._palette, self._solid = label_colors(len(self.scene.label_names)), self._surface[0]
             report("view", 0.6)
             self._add_map(self.scene)
-            self._add_sphere()
         self.show_points()
-        self._add_click()
         self.choose_image()
-        self._place_eye()
+        # The initial view is obliquely from above, and far enough to show the points and the cameras.
+        target, cameras = _middle(self._solid), self.base_from_camera[:, :3, 3]
+        reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
+        server.initial_camera.position = target + 1.6 * reach * np.array([0.62, -0.62, 0.6])
+        server.initial_camera.look_at = target
         report("view", 1.0)
 
     def _add_capture(self) -> None:
@@ -194,13 +200,13 @@ class Viewer:
                 thickness=2.0,
                 thickness_units="screen",
                 image=undistort(read_image(self.capture.folder / self.capture.images[self.image_index[k]])),
-                wxyz=_wxyz(pose),
+                wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
                 position=pose[:3, 3],
             )
             frustum.on_click(lambda event, k=k: self.look_from(k, event.client))
             self.frusta.append(frustum)
         for k, pose in enumerate(self.capture.base_from_gripper):
-            place = {"wxyz": _wxyz(pose), "position": pose[:3, 3]}
+            place = {"wxyz": SO3.from_matrix(pose[:3, :3]).wxyz, "position": pose[:3, 3]}
             server.scene.add_frame(f"/grippers/{k}", axes_length=0.03, axes_radius=0.001, **place)
         with gui.add_folder("Capture", expand_by_default=False):
             self.image = gui.add_slider("image", 0, len(self.calibration.images) - 1, 1, 0)
@@ -208,7 +214,7 @@ class Viewer:
         self.image.on_update(lambda _: self.choose_image())
 
     def _add_points(self) -> None:
-        """Add the controls that select the drawn points and their colours."""
+        """Add the controls that select the drawn points and their colours, and the values at a clicked point."""
         names = [MAP] * (self.scene is not None) + [CLOUD] * (self.cloud is not None) + ["none"]
         gui, several = self.server.gui, self.scene is not None and len(self.scene.label_names) > 1
         with gui.add_folder("Points", expand_by_default=False):
@@ -218,54 +224,56 @@ class Viewer:
             self.show_tracks = gui.add_checkbox("features", len(names) == 1, hint="tracked, red")
         for control in (self.shown, self.by_label, self.show_tracks):
             control.on_update(lambda _: self.show_points())
-
-    def _add_map(self, scene: SceneMap) -> None:
-        """Add the border of unknown space, hidden at first, and a horizontal slice of the map with its controls."""
-        gui, (low, high) = self.server.gui, scene.box
-        with gui.add_folder("Map", expand_by_default=False):
-            self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
-            self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
-            bottom, top = float(low[2].round(3)), float(high[2].round(3))
-            self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(self._support() + 0.02, 3))
-            self._slice_legend = gui.add_markdown("")
-        vertices, faces = unknown_border(scene)
-        if len(faces):
-            self.server.scene.add_mesh_simple(
-                "/unknown", vertices, faces, color=GREY, opacity=0.25, side="double", visible=False
-            )
-        size = (high - low)[:2]
-        self._slice = self.server.scene.add_image(
-            "/slice", np.zeros((2, 2, 4), np.uint8), *size.tolist(), wxyz=(0.0, 1.0, 0.0, 0.0), visible=False
-        )
-        for control in (self.slice_of, self.slice_at, self.unknown):
-            control.on_update(lambda _: self.show_slice())
-
-    def _add_sphere(self) -> None:
-        """Add the sphere that a user moves to test for collisions, 0.15 m above the support, and its controls."""
-        gui = self.server.gui
-        with gui.add_folder("Sphere to drag", expand_by_default=False):
-            self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
-            self.answer = gui.add_markdown("")
-        start = np.array([*_middle(self._solid)[:2], self._support() + 0.15])
-        self.gizmo = self.server.scene.add_transform_controls(
-            "/sphere", scale=0.12, disable_rotations=True, position=start
-        )
-        self.gizmo.on_update(lambda _: self.move_sphere())
-        self.ball = self.server.scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
-        for control in (self.radius, self.unknown):
-            control.on_update(lambda _: self.move_sphere())
-        self.move_sphere()
-
-    def _add_click(self) -> None:
-        """Add the text and the mark that show the values at a clicked point, and handle clicks."""
-        with self.server.gui.add_folder("Click a point", expand_by_default=False):
-            self.clicked = self.server.gui.add_markdown("Click a point to see its values.")
+        with gui.add_folder("Click a point", expand_by_default=False):
+            self.clicked = gui.add_markdown("Click a point to see its values.")
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
 
         @self.server.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             """Show the values at the clicked point."""
             self.click(np.array(event.ray_origin), np.array(event.ray_direction))
+
+    def _add_map(self, map: SceneMap) -> None:
+        """Add a slice of the map, the border of unknown space (hidden), and a sphere to move, with their controls.
+
+        The slice is horizontal. The sphere begins 0.15 m above the table: the most frequent height of surface points.
+        """
+        gui, scene, (low, high) = self.server.gui, self.server.scene, map.box
+        counts, edges = np.histogram(self._solid[:, 2], bins=100)
+        table_m = float(np.clip(edges[counts.argmax()], low[2], high[2] - 0.02))
+        with gui.add_folder("Map", expand_by_default=False):
+            self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
+            self.slice_of = gui.add_dropdown("slice", ("none", *SLICE_LEGENDS), initial_value="none")
+            bottom, top = float(low[2].round(3)), float(high[2].round(3))
+            self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(table_m + 0.02, 3))
+            self._slice_legend = gui.add_markdown("")
+        pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
+        axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
+        x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        unknown = map.query(x.reshape(-1, 3)).unknown.reshape(x.shape[:3])
+        if unknown.any() and not unknown.all():
+            vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
+            in_base, style = (
+                low + pitch * (vertices + 0.5),
+                {"color": GREY, "opacity": 0.25, "side": "double"},
+            )
+            scene.add_mesh_simple("/unknown", in_base, faces, visible=False, **style)
+        size, turned = (high - low)[:2].tolist(), (0.0, 1.0, 0.0, 0.0)
+        empty = np.zeros((2, 2, 4), np.uint8)
+        self._slice = scene.add_image("/slice", empty, *size, wxyz=turned, visible=False)
+        with gui.add_folder("Sphere to drag", expand_by_default=False):
+            self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
+            self.answer = gui.add_markdown("")
+        start = np.array([*_middle(self._solid)[:2], table_m + 0.15])
+        self.gizmo = scene.add_transform_controls(
+            "/sphere", scale=0.12, disable_rotations=True, position=start
+        )
+        self.ball = scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
+        for control in (self.slice_of, self.slice_at, self.unknown):
+            control.on_update(lambda _: self.show_slice())
+        for control in (self.gizmo, self.radius, self.unknown):
+            control.on_update(lambda _: self.move_sphere())
+        self.move_sphere()
 
     def choose_image(self) -> None:
         """Show the residuals of the selected image, mark its camera, and move the robot to its joint values."""
@@ -294,7 +302,7 @@ class Viewer:
             return
         pose = self.base_from_camera[camera]
         with client.atomic():
-            client.camera.wxyz, client.camera.position = _wxyz(pose), pose[:3, 3]
+            client.camera.wxyz, client.camera.position = SO3.from_matrix(pose[:3, :3]).wxyz, pose[:3, 3]
             client.camera.fov = self._fov
 
     def show_points(self) -> None:
@@ -310,29 +318,47 @@ class Viewer:
                     labels = list(zip(self.scene.label_names, self._palette.tolist(), strict=True))
                     legend = render("labels.html", {"labels": labels}, "jcr.viewer")
             self.points, self._legend.content = x, legend
-            self._draw("/points", x, color, POINT_M)
             tracks = self.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
-            self._draw("/tracks", tracks, np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1)), 0.004)
-
-    def _draw(self, name: str, x: Float[ndarray, "n 3"], color: UInt8[ndarray, "n 3"], size: float) -> None:
-        """Replace the point cloud `name` by points (m, base frame) drawn with `size` (m); remove it for no points."""
-        if len(x) == 0:
-            self.server.scene.remove_by_name(name)
-            return
-        self.server.scene.add_point_cloud(
-            name, x, color, point_size=size, point_shape="circle", point_shading="flat", precision="float32"
-        )
+            red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1))
+            draw = partial(
+                self.server.scene.add_point_cloud,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            )
+            for name, points, rgb, size in (("/points", x, color, POINT_M), ("/tracks", tracks, red, 0.004)):
+                if len(points):
+                    draw(name, points, rgb, point_size=size)
+                else:
+                    self.server.scene.remove_by_name(name)
 
     def show_slice(self) -> None:
-        """Draw the horizontal slice of the map with the selected property and height, or hide it."""
+        """Draw the horizontal slice of the map with the selected property and height, or hide it.
+
+        Columns of the image follow the x axis of the base; rows follow y from the largest value to the smallest.
+        """
         assert self.scene is not None  # the control exists only with a map
         with self._lock:
             of, height = self.slice_of.value, self.slice_at.value
-            self._slice.visible = of != "none"
-            self._slice_legend.content = SLICE_LEGENDS.get(of, "")
-            if of != "none":
-                self._slice.image = slice_image(self.scene, height, self.unknown.value, of)
-                self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
+            self._slice.visible, self._slice_legend.content = of != "none", SLICE_LEGENDS.get(of, "")
+            if of == "none":
+                return
+            low, high = self.scene.box
+            pitch = float((high - low)[:2].max() / SLICE_PIXELS)
+            a, b = (np.arange(low[k] + pitch / 2, high[k], pitch) for k in (0, 1))
+            x = np.stack([*np.meshgrid(a, b[::-1]), np.full((len(b), len(a)), height)], -1).reshape(-1, 3)
+            at, rgba = self.scene.query(x, self.unknown.value), np.zeros((len(x), 4), np.uint8)
+            if of == "occupancy":
+                rgba[:, :3], rgba[:, 3] = OCCUPIED, 255 * (0.1 + 0.9 * at.occupancy.clip(0, 1))
+                rgba[at.unknown] = (*GREY, 160)
+            else:
+                known = np.isfinite(at.distance)
+                share = (255 * (1 - (at.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)
+                rgba[known, :3] = cv2.applyColorMap(share[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
+                rgba[known, 3] = 217
+                rgba[known & (at.distance <= 0)] = (200, 30, 30, 230)
+            self._slice.image = rgba.reshape(len(b), len(a), 4)
+            self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
 
     def move_sphere(self) -> None:
         """Test the sphere for a collision with the map; colour it red if there is one, and show distance and verdict."""
@@ -352,109 +378,37 @@ class Viewer:
             self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
-        """Show the values at the first drawn point along the ray of a click, and return them as Markdown.
+        """Show the values of the map and the nearest measured point where a click hits a drawn point; return the text.
 
         `origin_in_base` (m) is the origin of the ray, `direction` a unit vector in the base frame.
         """
         with self._lock:
-            x = self.points
-            along = (x - origin_in_base) @ direction
-            aside = np.linalg.norm(x - origin_in_base - along[:, None] * direction, axis=1)
-            reach = np.maximum(CLICK_RAD * along, POINT_M / 2)
-            near = np.flatnonzero((along > 0.02) & (aside < reach))
-            self._mark.visible = len(near) > 0
+            along = (self.points - origin_in_base) @ direction
+            aside = np.linalg.norm(self.points - origin_in_base - along[:, None] * direction, axis=1)
+            near = np.flatnonzero((along > 0.02) & (aside < np.maximum(CLICK_RAD * along, POINT_M / 2)))
+            self._mark.visible, self.clicked.content = len(near) > 0, "No point there."
             if len(near) == 0:
-                self.clicked.content = "No point there."
-            else:
-                point = x[near[along[near].argmin()]]
-                self._mark.position, self.clicked.content = point, self._values(point)
+                return self.clicked.content
+            self._mark.position = point = self.points[near[along[near].argmin()]]
+            rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
+            if self.scene is not None:
+                at = self.scene.query(point[None])
+                rgb = np.nan_to_num(255 * at.color[0]).round().astype(int)
+                rows.append(("occupancy", f"{at.occupancy[0]:.2f}" + ", unknown" * bool(at.unknown[0])))
+                rows.append(("distance", f"{1e3 * at.distance[0]:.1f} mm"))
+                rows.append(("colour", f"rgb({', '.join(map(str, rgb))})"))
+                rows.append(("label", self.scene.label_names[int(at.label[0])]))
+            if (cloud := self.cloud) is not None and len(cloud.points_in_base):
+                nearest = int(np.linalg.norm(cloud.points_in_base - point, axis=1).argmin())
+                image = self.calibration.images[int(self.image_index[cloud.image[nearest]])].image
+                rows.append(("measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}"))
+                if np.isfinite(cloud.margin[nearest]):
+                    rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
+            table = "".join(f"\n| {name} | {value} |" for name, value in rows)
+            self.clicked.content = "| | |\n|---|---|" + table
             return self.clicked.content
-
-    def _values(self, point: Value) -> str:
-        """Return a Markdown table with the map's values at a point (m, base frame) and the nearest measured point."""
-        rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
-        if self.scene is not None:
-            at = self.scene.query(point[None])
-            rows.append(("occupancy", f"{at.occupancy[0]:.2f}" + ", unknown" * bool(at.unknown[0])))
-            rows.append(("distance", f"{1e3 * at.distance[0]:.1f} mm"))
-            rgb = np.nan_to_num(255 * at.color[0]).round().astype(int)
-            rows.append(("colour", f"rgb({', '.join(map(str, rgb))})"))
-            rows.append(("label", self.scene.label_names[int(at.label[0])]))
-        if (cloud := self.cloud) is not None and len(cloud.points_in_base):
-            nearest = int(np.linalg.norm(cloud.points_in_base - point, axis=1).argmin())
-            image = self.calibration.images[int(self.image_index[cloud.image[nearest]])].image
-            rows.append(("measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}"))
-            if np.isfinite(cloud.margin[nearest]):
-                rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
-        return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
-
-    def _support(self) -> float:
-        """Return the height (m) of the table: the most frequent z of surface points, limited to the workspace."""
-        assert self.scene is not None
-        counts, edges = np.histogram(self._solid[:, 2], bins=100)
-        low, high = self.scene.box[:, 2]
-        return float(np.clip(edges[counts.argmax()], low, high - 0.02))
-
-    def _place_eye(self) -> None:
-        """Set the initial view: obliquely from above, far enough to show the points and the cameras."""
-        target = _middle(self._solid)
-        cameras = self.base_from_camera[:, :3, 3]
-        reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
-        eye = target + 1.6 * reach * np.array([0.62, -0.62, 0.6])
-        self.server.initial_camera.position, self.server.initial_camera.look_at = eye, target
 
 
 def _middle(points: Float[ndarray, "n 3"]) -> Value:
     """Return the median of the n points along each axis, shape (3,); zeros if there are no points."""
     return np.median(points, axis=0) if len(points) else np.zeros(3)
-
-
-def unknown_border(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:
-    """Return vertices (v,3) m, base frame, and triangles (f,3) of the surface between seen and unknown space.
-
-    Both are empty if all space or none was seen.
-    """
-    low, high = scene.box
-    pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
-    axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    unknown = scene.query(x.reshape(-1, 3)).unknown.reshape(x.shape[:3])
-    if unknown.all() or not unknown.any():
-        return np.zeros((0, 3)), np.zeros((0, 3), int)
-    vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
-    return low + pitch * (vertices + 0.5), faces
-
-
-def slice_image(scene: SceneMap, height: float, unknown: Unknown, of: SliceOf) -> UInt8[ndarray, "h w 4"]:
-    """Return an RGBA image of `of`, "occupancy" or "distance", at z = `height` (m), in the colours of SLICE_LEGENDS.
-
-    `unknown` selects how unseen space counts. Columns follow the x axis of the base; rows follow y from the largest
-    value to the smallest.
-    """
-    low, high = scene.box
-    pitch = float((high - low)[:2].max() / SLICE_PIXELS)
-    a, b = (np.arange(low[k] + pitch / 2, high[k], pitch) for k in (0, 1))
-    x = np.stack([*np.meshgrid(a, b[::-1]), np.full((len(b), len(a)), height)], -1)
-    at, rgba = scene.query(x.reshape(-1, 3), unknown), np.zeros((x[..., 0].size, 4), np.uint8)
-    if of == "occupancy":
-        rgba[:, :3], rgba[:, 3] = OCCUPIED, 255 * (0.1 + 0.9 * at.occupancy.clip(0, 1))
-        rgba[at.unknown] = (*GREY, 160)
-    else:
-        known = np.isfinite(at.distance)
-        share = (255 * (1 - (at.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)
-        rgba[known, :3] = cv2.applyColorMap(share[:, None], cv2.COLORMAP_PLASMA)[:, 0, ::-1]
-        rgba[known, 3] = 217
-        rgba[known & (at.distance <= 0)] = (200, 30, 30, 230)
-    return rgba.reshape(len(b), len(a), 4)
-
-
-SLICE_LEGENDS: dict[str, str] = {
-    "distance": f"yellow: at a surface; violet: {100 * FAR_M:.0f} cm and more; red: solid",
-    "occupancy": "white: free; blue: occupied; grey: unknown",
-}
-"""Legend of the colours of a slice, by its property."""
-
-
-def _wxyz(a_from_b: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:
-    """Return the rotation of a transform as a quaternion in the order w, x, y, z."""
-    return Rotation.from_matrix(a_from_b[:3, :3]).as_quat()[[3, 0, 1, 2]]
