@@ -101,6 +101,40 @@ def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its
     assert np.allclose(project(found, np.array(rays)), pixels, atol=0.05)
 
 
+FIXED = """
+    import json
+    from types import SimpleNamespace as Fake
+    import pyrealsense2 as rs
+    from jcr.errors import InputError
+    from jcr.live.cameras import CameraOptions, open_camera
+    fixed, refused = [], []
+    sensor = Fake(supports=lambda option: True, get_option_range=lambda option: Fake(min=1, max=1000))
+    sensor.set_option = lambda option, value: fixed.append([str(option), value])
+    lens = Fake(fx=600.0, fy=600.0, ppx=320.0, ppy=240.0, coeffs=[0.0] * 5)
+    stream = Fake(as_video_stream_profile=lambda: Fake(get_intrinsics=lambda: lens))
+    device = Fake(first_color_sensor=lambda: sensor, first_depth_sensor=lambda: Fake(get_depth_scale=lambda: 0.001))
+    profile = Fake(get_device=lambda: device, get_stream=lambda kind: stream)
+    def ended(limit_ms):
+        raise RuntimeError
+    rs.pipeline = lambda: Fake(start=lambda config: profile, stop=lambda: None, wait_for_frames=ended)
+    for options in (CameraOptions(exposure=200.0), CameraOptions(exposure=2000.0), CameraOptions(focus=3.0)):
+        try:
+            with open_camera("realsense", options):
+                pass
+        except InputError as error:
+            refused.append(str(error))
+    print(json.dumps([fixed, refused]))
+"""
+
+
+@pytest.mark.slow
+def test_a_realsense_fixes_its_exposure_and_refuses_a_focus():
+    needs("pyrealsense2")
+    fixed, refused = named_by(FIXED)
+    assert fixed == [["Enable Auto Exposure", 0], ["Exposure", 200.0]]
+    assert "--exposure 2000: this camera takes 1 to 1000" in refused[0] and "fixed focus" in refused[1]
+
+
 class Device:
     """A cv2.VideoCapture that follows some settings and not others."""
 

@@ -226,7 +226,7 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
         if serial:
             config.enable_device(serial)
         size = options.camera_size or (1280, 720)  # every D400 has this size
-        config.enable_stream(rs.stream.color, *size, rs.format.rgb8)
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, 0)  # 0: any frame rate
         config.enable_stream(rs.stream.depth)
     try:
         profile = pipeline.start(config)
@@ -243,24 +243,25 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
             with suppress(RuntimeError):
                 pipeline.stop()
 
-        device, exposure, focus = profile.get_device(), rs.option.exposure, rs.option.focus_position
         if is_file:
-            device.as_playback().set_real_time(False)
-        for option, value, flag in (
-            (exposure, options.exposure, "--exposure"),
-            (focus, options.focus, "--focus"),
-        ):
-            if value is None or is_file:
-                continue
-            sensor = device.first_color_sensor()
+            profile.get_device().as_playback().set_real_time(False)
+        elif options.focus is not None:
+            raise InputError(
+                f"--focus {options.focus:g}: a RealSense has a fixed focus; leave the option out"
+            )
+        elif (exposure := options.exposure) is not None:
+            sensor, option = profile.get_device().first_color_sensor(), rs.option.exposure
             if not sensor.supports(option):
-                raise InputError(f"{flag} {value:g}: this camera has no such setting; leave the option out")
-            if option == exposure:
-                sensor.set_option(rs.option.enable_auto_exposure, 0)
+                raise InputError(
+                    f"--exposure {exposure:g}: this camera has no such setting; leave the option out"
+                )
             limits = sensor.get_option_range(option)
-            if not limits.min <= value <= limits.max:
-                raise InputError(f"{flag} {value:g}: this camera takes {limits.min:g} to {limits.max:g}")
-            sensor.set_option(option, value)
+            if not limits.min <= exposure <= limits.max:
+                raise InputError(
+                    f"--exposure {exposure:g}: this camera takes {limits.min:g} to {limits.max:g}"
+                )
+            sensor.set_option(rs.option.enable_auto_exposure, 0)
+            sensor.set_option(option, exposure)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
         intrinsics = _realsense_intrinsics(rs, stored)
         read = _realsense_reader(rs, pipeline, profile, is_file)
