@@ -59,6 +59,11 @@ _START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
 """Initial focal lengths for unknown intrinsics, as multiples of the long side. COLMAP's 1.2 alone fails on two of three
 real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
+_MADE_AGAIN = (
+    "the first map contradicted the gripper poses, as where objects move while the images are taken: the map was made "
+    "again without the matches that contradict them"
+)
+"""Note on a map that was replaced by one near the cameras that the gripper poses predict."""
 _MANY, _GROWN = 40, 1.3
 """Number of images above which COLMAP adjusts the whole map only after growth by a factor _GROWN (its default: 1.1)."""
 _ROUGHLY = 1e-3
@@ -235,7 +240,9 @@ def map_images(
         if model is not None and model.num_reg_images() < matching:
             model = with_missing_images(database, model, base_from_gripper, matcher)
         if model is not None and matched.x is not None:
-            model = nearer_to_robot(database, model, base_from_gripper, matched.x, matcher)
+            nearer = nearer_to_robot(database, model, base_from_gripper, matched.x, matcher)
+            if nearer is not model:
+                model, matched = nearer, replace(matched, notes=(*matched.notes, _MADE_AGAIN))
     return matched, model
 
 
