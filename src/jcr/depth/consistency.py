@@ -110,46 +110,6 @@ def _row(v, n, a, b, k, width, height):
     return x, y, z, (np.float32(width - 1), np.float32(height - 1), k[2], np.float32(1) / k[0])
 
 
-def _numbers(builder: Any, row: Any) -> list[Any]:
-    """Return a vector for each number of the tuple `row`; the vector has this number in all lanes."""
-    return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
-
-
-def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
-    """Project 16 pixels of a row, from column u on, into another image; return x, y, z and whether they lie in it.
-
-    `here` is the inverse depth of the pixels, and z is their depth in the other image over their own depth. `rows`
-    comes from `_row`. Outside of the image, x and y are 0.
-    """
-    (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = rows
-    columns: Any = Lanes.repeated(here.builder, here.builder.trunc(u, INT), LANES).as_floats()
-    ray = (columns + Lanes.constant(here.builder, range(LANES)) - cx) * per_fx
-    z = z0 * ray + z1 + bz * here
-    ahead = z > 0.0
-    z = ahead.choose(z, 1.0)
-    x, y = (x0 * ray + x1 + bx * here) / z, (y0 * ray + y1 + by * here) / z
-    inside = ahead & (here > 0.0) & (x >= 0.0) & (y >= 0.0) & (x < right) & (y < bottom)
-    return inside.choose(x, 0.0), inside.choose(y, 0.0), z, inside
-
-
-def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Interpolate inverse depth at x, y in a map of `inverse_depth_evidence`; return it, and whether the image sees it.
-
-    Seeing is the sign of the nearest pixel. Where one of the four pixels around is unknown, the inverse depth is that
-    of the nearest pixel. `width` is the padded width of the map.
-    """
-    left, top = x.as_ints(), y.as_ints()
-    first = top * width + left
-    (p, q), (r, s) = (at.gathered(image, LANES).as_pairs() for at in (first, first + width))
-    fx, fy = x - left.as_floats(), y - top.as_floats()
-    nearest = (fy >= 0.5).choose((fx >= 0.5).choose(s, r), (fx >= 0.5).choose(q, p))
-    sees = nearest > 0.0
-    p, q, r, s = abs(p), abs(q), abs(r), abs(s)
-    whole = (p > 0.0) & (q > 0.0) & (r > 0.0) & (s > 0.0)
-    upper, lower = p + fx * (q - p), r + fx * (s - r)
-    return whole.choose(upper + fy * (lower - upper), abs(nearest)), sees
-
-
 @intrinsic
 @no_type_check
 def _compare_depths(typing, sums, compared, place, rays, rest):
@@ -163,21 +123,46 @@ def _compare_depths(typing, sums, compared, place, rays, rest):
         _, height, width = cgutils.unpack_tuple(builder, maps.shape)
         i, j, v, u = cgutils.unpack_tuple(builder, given[2])
         size, own = builder.mul(height, width), builder.add(builder.mul(v, width), u)
+
+        def numbers(row: Any) -> list[Any]:
+            return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
+
+        # Pixels x, y in the other image, inside of it, and their depth z there over the depth in image i.
         here: Any = abs(Lanes.read(builder, maps.data, builder.add(builder.mul(i, size), own), LANES))
-        rows = [_numbers(builder, row) for row in cgutils.unpack_tuple(builder, given[3])]
-        x, y, z, inside = _other_pixels(here, u, rows)
-        row = Lanes.repeated(builder, builder.trunc(width, INT), LANES)
-        depth, sees = _between_pixels(builder.gep(maps.data, [builder.mul(j, size)]), row, x, y)
-        centre, tolerance = _numbers(builder, given[4])
+        rows = [numbers(row) for row in cgutils.unpack_tuple(builder, given[3])]
+        (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = rows
+        columns: Any = Lanes.repeated(builder, builder.trunc(u, INT), LANES).as_floats()
+        ray = (columns + Lanes.constant(builder, range(LANES)) - cx) * per_fx
+        z = z0 * ray + z1 + bz * here
+        ahead = z > 0.0
+        z = ahead.choose(z, 1.0)
+        x, y = (x0 * ray + x1 + bx * here) / z, (y0 * ray + y1 + by * here) / z
+        inside = ahead & (here > 0.0) & (x >= 0.0) & (y >= 0.0) & (x < right) & (y < bottom)
+        x, y = inside.choose(x, 0.0), inside.choose(y, 0.0)
+        # Inverse depth there, interpolated; that of the nearest pixel if one of the four pixels around is unknown.
+        left, top = x.as_ints(), y.as_ints()
+        across = Lanes.repeated(builder, builder.trunc(width, INT), LANES)
+        image, first = builder.gep(maps.data, [builder.mul(j, size)]), top * across + left
+        (p, q), (r, s) = (at.gathered(image, LANES).as_pairs() for at in (first, first + across))
+        fx, fy = x - left.as_floats(), y - top.as_floats()
+        nearest = (fy >= 0.5).choose((fx >= 0.5).choose(s, r), (fx >= 0.5).choose(q, p))
+        sees = nearest > 0.0
+        p, q, r, s = abs(p), abs(q), abs(r), abs(s)
+        whole = (p > 0.0) & (q > 0.0) & (r > 0.0) & (s > 0.0)
+        upper, lower = p + fx * (q - p), r + fx * (s - r)
+        depth = whole.choose(upper + fy * (lower - upper), abs(nearest))
+        centre, tolerance = numbers(given[4])
         there = z * depth
         agrees = inside & (depth > 0.0) & (abs(there - here) < tolerance * here)
         # Inverse depth in image i of the point that has the other image's depth on the other image's ray.
         moved = there / (centre * there - centre * here + 1.0)
         through = inside & sees & (there < here * (1.0 - SEEN_THROUGH))
-        dx, dy = ((rows[n][2] - at * rows[2][2]) / z for n, at in enumerate((x, y)))
+        dx, dy = (bx - x * bz) / z, (by - y * bz) / z
         found = (agrees, moved), (agrees, 1.0), (through, 1.0), (agrees, dx * dx + dy * dy)
         for n, (where, value) in enumerate(found):
-            where.choose(value, 0.0).add_to(out.data, builder.add(builder.mul(size, LONG(n)), own))
+            at = builder.add(builder.mul(size, LONG(n)), own)
+            total = where.choose(value, 0.0) + Lanes.read(builder, out.data, at, LANES)
+            total.write(out.data, at)
         return context.get_dummy_value()
 
     return signature(types.none, sums, compared, place, rays, rest), generate

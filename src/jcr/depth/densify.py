@@ -42,13 +42,24 @@ def densify(
     place = np.argsort(order)
     cameras = reconstruction.recon_from_camera[order]
     tracks = replace(reconstruction.tracks, image=place[reconstruction.tracks.image])
+    searched = tracks
+    if tracks.from_board:  # objects rise above the board: a copy of its points, moved towards the cameras
+        on_board = tracks.points_in_recon
+        raised = on_board + RISE * (cameras[:, :3, 3].mean(0) - on_board)
+        searched = replace(
+            tracks,
+            image=np.tile(tracks.image, 2),
+            x_px=np.tile(tracks.x_px, (2, 1)),
+            point=np.concatenate([tracks.point, tracks.point + len(on_board)]),
+            points_in_recon=np.concatenate([on_board, raised]),
+        )
     pinhole = pinhole_inside(reconstruction.intrinsics, options.pointmap_size_px)
     pointmaps = dense_pointmaps(
         undistorted(capture.folder, names[order].tolist(), reconstruction.intrinsics, pinhole),
         cameras,
         pinhole,
         choose_neighbours(tracks, cameras, options.neighbours),
-        sweep_planes(_raised(tracks, cameras) if tracks.from_board else tracks, cameras),
+        sweep_planes(searched, cameras),
         progress or silent,
         priors=options.priors,
     )
@@ -61,20 +72,6 @@ def undistorted(
     """Return the images, read from `folder` and undistorted to the pixel grid of `pinhole`."""
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])
-
-
-def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
-    """Return the tracks with a copy of every point, moved from the board to the mean camera centre by share RISE."""
-    on_board = tracks.points_in_recon
-    middle = recon_from_camera[:, :3, 3].mean(0)
-    raised = on_board + RISE * (middle - on_board)
-    return replace(
-        tracks,
-        image=np.tile(tracks.image, 2),
-        x_px=np.tile(tracks.x_px, (2, 1)),
-        point=np.concatenate([tracks.point, tracks.point + len(on_board)]),
-        points_in_recon=np.concatenate([on_board, raised]),
-    )
 
 
 def choose_neighbours(
@@ -146,10 +143,8 @@ def dense_pointmaps(
     from jcr.depth.matched import match_depth
 
     threads = min(os.cpu_count() or 1, MOST_THREADS)
-    images, old = (
-        (colors, recon_from_camera, pinhole, neighbours),
-        0 if before is None else len(before.colors),
-    )
+    images = colors, recon_from_camera, pinhole, neighbours
+    old = 0 if before is None else len(before.colors)
     inverse_depth, score = match_depth(
         *images, planes, range(old, len(colors)), threads, lambda done: report("dense depth", 0.7 * done)
     )

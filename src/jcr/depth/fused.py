@@ -12,7 +12,8 @@ from numpy import ndarray
 from jcr.camera import rays
 from jcr.depth.consistency import agreement, inverse_depth_evidence
 from jcr.depth.matched import Relative, grid, relative
-from jcr.depth.priors import ON_PLANE, evened, planar_prior, support_plane
+from jcr.depth.priors import ON_PLANE, evened, planar_prior
+from jcr.depth.support import support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
@@ -23,6 +24,8 @@ AGREEMENT = (0.01, 0.005, 0.003, 0.003)
 rounds halve the median error and the share of gross errors."""
 FEWEST_MATCHED = 300
 """Least number of matched pixels of all images together from which planes are fitted."""
+EVERY = 20
+"""Step between the matched pixels of an image that the fit of the support plane uses."""
 MATCHING_STD_PX = 0.6
 """Standard deviation of a matched pixel in a neighbour, px. Fitted to simulated scenes; it is larger than the scatter
 of single pixels because the errors of adjacent windows are correlated."""
@@ -133,7 +136,13 @@ def _priors(
     pinhole: Intrinsics,
 ) -> list[ndarray]:
     """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks."""
-    support = _support(inverse_depth, matched, recon_from_camera, pinhole)
+    direction, x_in_recon = rays(pinhole).reshape(-1, 3), []
+    for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
+        some = np.flatnonzero(there)[::EVERY]
+        x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
+    far = 1 / float(np.median(inverse_depth[matched]))
+    found = support_plane(np.concatenate(x_in_recon), recon_from_camera[:, :3, 3], far, z_is_up=False)
+    support = np.zeros(4) if found is None else np.append(found[0], -found[0] @ found[1])
     even = evened(colors, inverse_depth, matched, views, pinhole)
     smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
     surfaces = np.where(matched, inverse_depth, 0).astype(np.float32), smooth
@@ -163,18 +172,3 @@ def _chosen(
         np.select(which, reasons, NO_DEPTH).astype(np.uint8),
         np.select(which, stds, 0).astype(np.float32),
     )
-
-
-def _support(
-    inverse_depth: Float[ndarray, "m h w"],
-    matched: Bool[ndarray, "m h w"],
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    pinhole: Intrinsics,
-) -> Float[ndarray, "4"]:
-    """Return the plane in the recon frame on which most matched points lie: unit normal n and d, with n·x + d = 0."""
-    direction = rays(pinhole).reshape(-1, 3)
-    x_in_recon = []
-    for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
-        some = np.flatnonzero(there)[::10]
-        x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
-    return support_plane(np.concatenate(x_in_recon), 0.004 / float(np.median(inverse_depth[matched])))

@@ -108,7 +108,3 @@ class Lanes:
         """Store the lanes to memory as consecutive floats, beginning at element `place` of the array `start`."""
         there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
         self.builder.store(self.value, there, align=4)
-
-    def add_to(self, start: Any, place: Any) -> None:
-        """Add the lanes to consecutive floats in memory, beginning at element `place` of the array `start`."""
-        (self + Lanes.read(self.builder, start, place, self.count)).write(start, place)

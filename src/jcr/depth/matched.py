@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.camera import rays, resized
 from jcr.depth.patch_match import UNKNOWN, best_neighbours, peaks, random_planes, spread_planes
-from jcr.depth.window import PAD, blocks_of, continued, floats_of_windows, quads, windows
+from jcr.depth.window import LANES, MARGIN, PAD, TAPS, blocks_of, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
@@ -76,8 +76,11 @@ class _Level:
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
+        around = ((MARGIN, MARGIN), (MARGIN, MARGIN + -self.pinhole.width % LANES))
+        channels = *np.moveaxis(self.colors[i], -1, 0), self.greys[i]
+        image = np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
         k = tuple(grid(self.pinhole))  # a tuple, which the loops keep in registers
-        return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
+        return self.packed[others], motions, windows(image, space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
         """Return a map of half the resolution at this resolution; each pixel is repeated where it lies."""
@@ -108,7 +111,7 @@ def match_depth(
     h, w = half.greys[0].shape
     spaces = SimpleQueue[ndarray]()
     for _ in range(threads):
-        spaces.put(np.empty(floats_of_windows(*full.greys[0].shape), np.float32))
+        spaces.put(np.empty(pinhole.height * blocks_of(pinhole.width) * TAPS * 2, np.float32))
 
     def match(i: int, space: Float[ndarray, " _"]) -> Float[ndarray, "2 h w"]:
         others, seed = neighbours[i][:COMPARED], 100 * i

@@ -41,32 +41,8 @@ PATCH = 0.02
 WHOLE = 0.8
 """Least share of such a region's pixels at which the support plane must be confirmed; an object standing on the plane
 shows parallax."""
-_POINTS, _TRIALS = 4000, 400
-"""Numbers of points and of trials of the RANSAC search for the support plane."""
 _PAIRS = 600
 """Largest number of pixels of an image whose brightness is compared with each other image."""
-
-
-def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
-    """Return the plane on which most points lie, as unit normal n and d with n·x + d = 0.
-
-    The method is RANSAC, then total least squares. `tolerance` is the largest distance of a point on the plane, recon
-    units.
-    """
-    draw = np.random.default_rng(seed)
-    some = x_in_recon[draw.choice(len(x_in_recon), min(_POINTS, len(x_in_recon)), replace=False)]
-    corner = some[draw.integers(len(some), size=(_TRIALS, 3))]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    normal, corner = normal[length > 0] / length[length > 0, None], corner[length > 0, 0]
-    on_plane = [int((np.abs((some - c) @ n) < tolerance).sum()) for n, c in zip(normal, corner, strict=True)]
-    n, d = normal[np.argmax(on_plane)], -float(normal[np.argmax(on_plane)] @ corner[np.argmax(on_plane)])
-    for _ in range(5):
-        inside = x_in_recon[np.abs(x_in_recon @ n + d) < tolerance]
-        middle = inside.mean(0)
-        n = np.linalg.eigh(np.cov((inside - middle).T))[1][:, 0]
-        d = -float(n @ middle)
-    return np.append(n, d)
 
 
 def evened(

@@ -8,7 +8,7 @@ import itertools
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16, UInt64
+from jaxtyping import UInt16, UInt64
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import signature
@@ -49,11 +49,11 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 def windows(image, space):
     """Return weight and weighted grey of each tap (sampled pixel) of each pixel's window.
 
-    The shape is (rows, blocks of 16 pixels, taps, 2, 16). `image` (4,h,w) comes from `continued`. The weights of a
-    window have the sum 1; a tap's weight grows with the similarity of its colour to the central one (Schönberger et
-    al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for exp(-x)). The weighted grey is weight · (grey - mean) / standard
-    deviation, both over the window, the latter with noise. The result is written to the beginning of the buffer `space`
-    of `floats_of_windows` floats, which is reused for every image.
+    The shape is (rows, blocks of 16 pixels, taps, 2, 16). `image` (4,h,w) are the three colours and grey of an image,
+    padded by MARGIN on all sides and to whole blocks. The weights of a window have the sum 1; a tap's weight grows with
+    the similarity of its colour to the central one (Schönberger et al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for
+    exp(-x)). The weighted grey is weight · (grey - mean) / standard deviation, both over the window, the latter with
+    noise. The result is written to the beginning of the float buffer `space`, which is reused for every image.
     """
     h, blocks = image.shape[1] - 2 * MARGIN, (image.shape[2] - 2 * MARGIN) // LANES
     rows = space[: h * blocks * TAPS * 2 * LANES].reshape((h, blocks, TAPS, 2, LANES))
@@ -66,21 +66,6 @@ def windows(image, space):
 def blocks_of(columns: int) -> int:
     """Return the number of columns rounded up to a multiple of LANES."""
     return -(-columns // LANES) * LANES
-
-
-def floats_of_windows(h: int, w: int) -> int:
-    """Return the number of floats that `windows` writes for an image of h rows and w columns."""
-    return h * blocks_of(w) * TAPS * 2
-
-
-def continued(color: UInt8[ndarray, "h w 3"], grey: UInt16[ndarray, "h w"]) -> Float[ndarray, "4 _ _"]:
-    """Return the three colours and grey of an image, padded by half a window on all sides and to a multiple of LANES.
-
-    This is the input of `windows`.
-    """
-    around = ((MARGIN, MARGIN), (MARGIN, MARGIN + -grey.shape[1] % LANES))
-    channels = [*np.moveaxis(color, -1, 0), grey]
-    return np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
 
 
 @intrinsic
@@ -184,33 +169,26 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
     """Return Σ c·g / std(g) per lane: g are the greys at a window's sampled pixels in `image`, c those of this image.
 
-    The greys g are interpolated at the places `window`; `weights` has weights and weighted greys c from `windows`. The
+    `image` are the packed other images, with `width` columns and the lane's image from index `start` on. The greys g
+    are interpolated bilinearly at the places `window`; `weights` has weights and weighted greys c from `windows`. The
     standard deviation std(g) includes the pixel noise.
     """
-    x, y, xu, yu, xv, yv = window
+    center_x, center_y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]
     along = [(xu * n, yu * n) for n in steps]
     mean = square = product = start.as_floats() * 0.0
     for i, down in enumerate((xv * n, yv * n) for n in steps):
-        px, py = x + down[0], y + down[1]
+        px, py = center_x + down[0], center_y + down[1]
         for j, (dx, dy) in enumerate(along):
-            tap = weights[2 * (i * len(steps) + j) :]
-            grey = _interpolated(image, start, width, px + dx, py + dy)
+            tap, x, y = weights[2 * (i * len(steps) + j) :], px + dx, py + dy
+            left, top = x.as_ints(), y.as_ints()
+            upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
+            fx, fy = x - left.as_floats(), y - top.as_floats()
+            here, right = (upper & 65535).as_floats(), (upper >> 16).as_floats()
+            below, both = (lower & 65535).as_floats(), (lower >> 16).as_floats()
+            above, beneath = here + fx * (right - here), below + fx * (both - below)
+            grey = above + fy * (beneath - above)
             weighted = tap[0] * grey
             mean, square, product = mean + weighted, square + weighted * grey, product + tap[1] * grey
     variance = square - mean * mean
     return product / ((variance > 0.0).choose(variance, 0.0) + NOISE * NOISE).root()
-
-
-def _interpolated(image: Any, start: Lanes, width: Lanes, x: Lanes, y: Lanes) -> Lanes:
-    """Return per lane the bilinear grey at (x, y) of the packed image that begins at index `start`.
-
-    `width` is the number of columns of the packed images.
-    """
-    left, top = x.as_ints(), y.as_ints()
-    upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
-    fx, fy = x - left.as_floats(), y - top.as_floats()
-    here, right = (upper & 65535).as_floats(), (upper >> 16).as_floats()
-    below, both = (lower & 65535).as_floats(), (lower >> 16).as_floats()
-    above, beneath = here + fx * (right - here), below + fx * (both - below)
-    return above + fy * (beneath - above)

@@ -114,7 +114,9 @@ def interpolate_grid(
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
     """Return a linear layer with initial weights from `generator`, distributed as those of torch.nn.Linear."""
-    layer, bound = cast(nn.Linear, nn.utils.skip_init(nn.Linear, inputs, outputs)), inputs**-0.5
+    # torch.nn.utils.skip_init would import SymPy, which takes 0.3 s; the caller's random numbers must not advance.
+    with torch.random.fork_rng([]):
+        layer, bound = nn.Linear(inputs, outputs), inputs**-0.5
     nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
     nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
     return layer

@@ -9,6 +9,7 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
+from jcr.depth.support import robust_std, support_plane
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, transform
 from jcr.records import PRIOR, PointCloud
@@ -42,79 +43,42 @@ FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 with fewer points hold only stray points."""
 PATCH = 0.02
 """Side (m) of a patch of the table that counts as flat even if the table is bent."""
-LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
-"""Smallest cosine between the normal of a level plane and the base frame's z axis, and factor by which the points of
-level planes count."""
 FEWEST_MEASURED = 1000
 """Smallest number of measured points for which the fit of the support plane ignores filled-in points."""
-PLANES, SAMPLE = 400, 20_000
-"""Number of planes through three random points that are tried, and number of points on which each is tested."""
 
 
 def fit_support(cloud: PointCloud) -> Support:
-    """Fit the plane with most points that has all cameras on one side (RANSAC, then robust least squares).
+    """Fit the plane with most points that has all cameras on one side, by `support_plane`.
 
     Points filled in by plane priors are excluded from the fit and its noise, because they lie on planes by
     construction. Raises InputError if no plane holds a tenth of the points.
     """
-    draw = np.random.default_rng(0)
     filled = np.zeros(len(cloud.image), bool) if cloud.reason is None else cloud.reason == PRIOR
     if (~filled).sum() < FEWEST_MEASURED:
         filled[:] = False
-    x, image = cloud.points_in_base[~filled], cloud.image[~filled]
+    x, centers = cloud.points_in_base[~filled], cloud.camera_centers_in_base
     if len(x) < 100:
         raise InputError(f"the cloud has {len(x)} points; a support plane needs some hundreds")
-    some = x[draw.choice(len(x), min(SAMPLE, len(x)), replace=False)]
-    a, b, c = some[draw.integers(len(some), size=(3, PLANES))]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.divide(normal, length, where=length > 1e-9, out=np.zeros_like(normal))
-    offset = (normal * a).sum(1)
-    side = np.sign(cloud.camera_centers_in_base @ normal.T - offset)
-    one_sided = (np.abs(side.sum(0)) == len(side)) & (length[:, 0] > 1e-9)
-    # The noise of a table's points is the noise of depth, which grows with the distance of the cameras.
-    far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[image], axis=1))
-    count = np.zeros(PLANES, int)
-    for k in np.flatnonzero(one_sided):  # one at a time, so that the data stay in the processor's cache
-        count[k] = np.count_nonzero(np.abs(some @ normal[k] - offset[k]) < 0.005 * far)
-    # A wall behind the table may have more points; most arms stand upright, so level planes are preferred.
-    level = np.abs(normal[:, 2]) > LEAST_LEVEL
-    best = int((count * np.where(level, LEVEL_WEIGHT, 1)).argmax())
-    if count[best] < 0.1 * len(some):
+    far = float(np.median(np.linalg.norm(x - centers[cloud.image[~filled]], axis=1)))
+    if (plane := support_plane(x, centers, far, z_is_up=True)) is None:
         raise InputError(
             "no plane carries the scene: none holds a tenth of the points with all cameras on one side"
         )
-
-    # Geman and McClure's weights: a sheet of board or a tray that lies on the table does not lift the plane.
-    up, middle = normal[best] * side[0, best], a[best]
-    distance, noise = (x - middle) @ up, 0.002 * far
-    for _ in range(10):
-        near = np.abs(distance) < 3 * noise
-        weight = 1 / (1 + (distance[near] / noise) ** 2) ** 2
-        middle = weight @ x[near] / weight.sum()
-        _, axes = np.linalg.eigh(np.cov((x[near] - middle).T, aweights=weight))
-        up = axes[:, 0] * np.sign(axes[:, 0] @ up)
-        distance = (x - middle) @ up
-        noise = max(_noise(distance[np.abs(distance) < 3 * noise]), 1e-5 * far)
+    up, middle, noise = plane
     # The x axis of the support frame is the base's x axis (or y axis) projected onto the plane.
     along = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     along = along - (along @ up) * up
     along /= np.linalg.norm(along)
     rotation = np.stack([along, np.cross(up, along), up], axis=1)
+    distance = (x - middle) @ up
     on = np.abs(distance) < 3 * noise
     patch = np.floor((x[on] - middle) @ rotation[:, :2] / PATCH).astype(np.int64)
     patch -= patch.min(0)
     _, place = np.unique(np.ravel_multi_index(tuple(patch.T), patch.max(0) + 1), return_inverse=True)
     bend = ndimage.median(distance[on], place, np.arange(place.max() + 1))
+    roughness = min(robust_std(distance[on] - bend[place]), noise)
     on_plane = np.abs((cloud.points_in_base - middle) @ up) < 3 * noise
-    return Support(
-        transform(rotation, middle), noise, min(_noise(distance[on] - bend[place]), noise), on_plane
-    )
-
-
-def _noise(distance: Float[ndarray, " n"]) -> float:
-    """Return the robust standard deviation of distances: 1.4826 times their median absolute deviation."""
-    return float(1.4826 * np.median(np.abs(distance - np.median(distance))))
+    return Support(transform(rotation, middle), noise, roughness, on_plane)
 
 
 def label_tabletop(
