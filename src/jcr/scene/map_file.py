@@ -29,7 +29,9 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     require_packages("a map")
     from safetensors import SafetensorError, safe_open
 
-    from jcr.scene.scene_map import FORMAT, digest, map_from_tensors
+    from jcr.scene.fields import Field, Fields, Lattice
+    from jcr.scene.scene_map import FORMAT, SceneMap, digest
+    from jcr.scene.seen import SeenGrid
 
     try:
         with safe_open(path, "pt") as file:
@@ -39,7 +41,15 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
             raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
         if metadata.get("digest") != digest(tensors):
             raise ValueError("its numbers changed since it was written")
-        return map_from_tensors(tensors, json.loads(metadata["about"])).to(device)
+        about = json.loads(metadata["about"])
+        seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
+        lattices = [
+            Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
+            for k, (cell, shape) in enumerate(about["lattices"])
+        ]
+        fields = Fields([Field(**of, box=seen.box, lattices=lattices) for of in about["fields"]], lattices)
+        fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
+        return SceneMap(fields, seen, tuple(about["label_names"]), about["history"]).to(device)
     except InputError:
         raise
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:

@@ -32,9 +32,8 @@ def train_paper(
 ) -> dict[str, PaperField]:
     """Return trained networks by property: "occupancy", "color" and, if the cloud has several labels, "label".
 
-    `weighted`: points weigh by their confidence. `box` are the corners of the workspace (m); None: from the cloud.
-    Occupancy is trained with the points as occupied and as many positions drawn uniformly from the workspace as free
-    (binary cross-entropy); color by squared error, label by cross-entropy.
+    `weighted`: points weigh by their confidence. `box` (2,3) m is the workspace; None: from the cloud. Losses: binary
+    cross-entropy of points (occupied) and as many uniform positions (free), squared error of color, cross-entropy.
     """
     box = workspace_box(cloud, None) if box is None else box
     inside, start = rows_inside(cloud, box), time.perf_counter()

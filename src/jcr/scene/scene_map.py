@@ -21,7 +21,7 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Field, Fields, Lattice, in_chunks
+from jcr.scene.fields import Fields, in_chunks
 from jcr.scene.robot import JointValues, RobotSpheres, load_robot
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
@@ -302,36 +302,29 @@ class SceneMap:
         return in_chunks(touches, x, radius)[0]
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
-        """Return the grid of signed distances; unseen space counts as `unknown` says, "occupied" or "free"."""
-        with self._lock:
-            if unknown not in self._distance:
-                self._distance[unknown] = self._transform(unknown)
-            return self._distance[unknown]
+        """Return the grid of signed distances to the occupancy field's surfaces, computed at the first call.
 
-    def _transform(self, unknown: str) -> DistanceGrid:
-        """Compute the grid of signed distances from the occupancy field, with unknown space "occupied" or "free".
-
-        Within two cells behind a seen surface the field is used in both cases, although no ray crossed these cells:
-        otherwise the surface would have no thickness, and the nodes of the grid could miss it.
+        Unseen space counts as `unknown` says, "occupied" or "free". Within two cells behind a seen surface the field is
+        used in both cases, although no ray crossed these cells: otherwise the surface would have no thickness, and the
+        nodes of the grid could miss it.
         """
-        skin = dilate(halve((self.seen.state & HIT) != 0), 2)
-        behind = SeenGrid(self.seen.lower, self.cell, skin.to(torch.uint8))
+        with self._lock:
+            if (known := self._distance.get(unknown)) is not None:
+                return known
+            skin = dilate(halve((self.seen.state & HIT) != 0), 2)
+            behind = SeenGrid(self.seen.lower, self.cell, skin.to(torch.uint8))
 
-        def is_solid(x: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"]]:
-            """Return the mask (n,) of points that count as solid."""
-            inside = self.fields(x, ("occupancy",))["occupancy"][:, 0] >= 0
-            if unknown == "occupied":
-                return (inside | ((self.seen.at(x) & CROSSED) == 0),)
-            return (inside & ((self.seen.at(x) | behind.at(x)) != 0),)
+            def is_solid(x: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"]]:
+                """Return the mask (n,) of points that count as solid."""
+                inside = self.fields(x, ("occupancy",))["occupancy"][:, 0] >= 0
+                if unknown == "occupied":
+                    return (inside | ((self.seen.at(x) & CROSSED) == 0),)
+                return (inside & ((self.seen.at(x) | behind.at(x)) != 0),)
 
-        nz, ny, nx = (n // 2 + 1 for n in self.seen.state.shape)
-        return distance_grid(
-            self.seen.lower,
-            self.cell,
-            (nz, ny, nx),
-            lambda x: in_chunks(is_solid, x)[0],
-            closed=unknown == "occupied",
-        )
+            nz, ny, nx = (n // 2 + 1 for n in self.seen.state.shape)
+            space = self.seen.lower, self.cell, (nz, ny, nx), lambda x: in_chunks(is_solid, x)[0]
+            self._distance[unknown] = distance_grid(*space, closed=unknown == "occupied")
+            return self._distance[unknown]
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
         """Return points (n,3) m as a tensor on the map's device.
@@ -372,21 +365,6 @@ def digest(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
     return total.hexdigest()
-
-
-def map_from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
-    """Return the map from the tensors and metadata (`about`) of a file that `SceneMap.save` wrote.
-
-    Raises KeyError, ValueError or a similar error if the content is not that of a map.
-    """
-    seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
-    lattices = [
-        Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
-        for k, (cell, shape) in enumerate(about["lattices"])
-    ]
-    fields = Fields([Field(**of, box=seen.box, lattices=lattices) for of in about["fields"]], lattices)
-    fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
-    return SceneMap(fields, seen, tuple(about["label_names"]), about["history"])
 
 
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt16
-from numpy import ndarray
 
 from jcr.calibration.record import Calibration
 from jcr.camera import project, rays
@@ -35,29 +33,27 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
     labels = np.zeros(reconstruction.dense.confidence.shape, np.int64)
     for k, row in enumerate(reconstruction.image_index):
         if row < len(capture):  # later rows are images that were added to the run
-            label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
+            image = capture.images[row]
+            if not (path := folder / f"{Path(image).stem}.png").is_file():
+                raise InputError(
+                    f"{path}: not found; give labels for every image of the capture, or for none ({image})"
+                )
+            label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if label is None or label.ndim != 2:
+                raise InputError(f"{path}: no label image; save it as PNG with one channel of 8 or 16 bits")
+            if label.shape[::-1] != capture.image_size:
+                raise InputError(
+                    f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
+                )
+            if label.max() >= MOST:
+                raise InputError(
+                    f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}"
+                )
+            label = label.astype(np.uint16)
             labels[k] = cv2.remap(label, at_px[..., 0], at_px[..., 1], cv2.INTER_NEAREST, borderValue=0)
     count = int(labels.max()) + 1
     names = {k: str(k) for k in range(1, count)} | {0: "none"} | _read_names(folder / "names.json")
     return labels, tuple(names[k] for k in range(count))
-
-
-def _read(path: Path, capture: Capture, image: str) -> UInt16[ndarray, "h w"]:
-    """Read the label image of `image` from `path`; raise InputError if it is missing or does not fit the image."""
-    if not path.is_file():
-        raise InputError(
-            f"{path}: not found; give labels for every image of the capture, or for none ({image})"
-        )
-    label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if label is None or label.ndim != 2:
-        raise InputError(f"{path}: no label image; save it as PNG with one channel of 8 or 16 bits")
-    if label.shape[::-1] != capture.image_size:
-        raise InputError(
-            f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
-        )
-    if label.max() >= MOST:
-        raise InputError(f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}")
-    return label.astype(np.uint16)
 
 
 def _read_names(path: Path) -> dict[int, str]:
