@@ -98,10 +98,10 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
 @inlined
 @no_type_check
 def _row(v, n, a, b, k, width, height):
-    """Return the factors that project row v of an image into the n-th other image; `a`, `b`, `k` are as in `agreement`.
+    """Return the coefficients that project the pixels of row v into the n-th other image; a, b, k as in `agreement`.
 
-    The first three elements give the homogeneous coordinates x, y, z: (first factor)·(x of the ray) + (second) +
-    (third)·(inverse depth). The last element is the largest x and y in the image, cx and 1/fx.
+    The first three elements (f, g, h) are for x, y and z of the homogeneous pixel f·(x of the ray) + g + h·(inverse
+    depth). The last element are the largest x and y in an image of `width` and `height`, cx and 1/fx.
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]

@@ -69,7 +69,7 @@ def densify(
 def undistorted(
     folder: Path, names: Sequence[str], intrinsics: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "m h w 3"]:
-    """Return the images, read from `folder` and undistorted to the pixel grid of `pinhole`."""
+    """Read images of a camera with `intrinsics` from `folder`; return them undistorted, on the grid of `pinhole`."""
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])
 
@@ -179,9 +179,9 @@ def pointmaps_of(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> Pointmaps:
-    """Return pointmaps from the depths (z, recon units) of images with known camera poses.
+    """Return pointmaps from the depths (z, recon units) of undistorted images with known camera poses.
 
-    `relative_std` is the standard deviation of a depth over this depth.
+    `relative_std` is the standard deviation of a depth divided by the depth; `reason` is the origin of a depth.
     """
     points, direction = np.empty((*depth.shape, 3)), rays(pinhole)
     for k, pose in enumerate(recon_from_camera):

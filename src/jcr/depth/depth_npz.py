@@ -33,9 +33,9 @@ class DepthHeader(BaseModel):
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write the pointmaps of a reconstruction to a file; `made_from` is a fingerprint of what they were made from.
+    """Write depth, confidence and standard deviation of a reconstruction's pointmaps to a file, whole or not at all.
 
-    An interrupted call leaves no partial file.
+    `made_from` is the fingerprint of reconstruction and options that `is_made_from` compares.
     """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None

@@ -113,10 +113,10 @@ def _checked(
     sees: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
-    """Return for all images the four maps (m,h,w) of `agreement`, by relative differences of depth below `tolerance`.
+    """Return the four maps of `agreement` for all images, (m,h,w) each; `tolerance` is relative to the inverse depth.
 
-    `depth` is inverse depth; it is returned unchanged where it is not `known`. Pixels of `sees` may contradict other
-    images.
+    The first map is the averaged inverse depth, and the given inverse depth `depth` where it is not `known`. `views`
+    are the projections between the images. Only pixels of `sees` can contradict the depth of other images.
     """
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
     found = pool.map(

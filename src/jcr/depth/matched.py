@@ -38,7 +38,7 @@ b = K t, and the z coordinate of each neighbour's camera centre in the image's c
 def relative(
     i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"], pinhole: Intrinsics
 ) -> Relative:
-    """Return the projection of pixels of image i into the images `others`, as the tuple `Relative`.
+    """Return the motion from image i to the n images `others` in the form that the compiled loops read (`Relative`).
 
     All images are on the pixel grid of `pinhole`.
     """
@@ -69,10 +69,10 @@ class _Level:
         recon_from_camera: Float[ndarray, "m 4 4"],
         space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """Return the greys of the images `others`, the projections into them, windows of image i, and fx, fy, cx, cy.
+        """Return the arguments `packed`, `motions`, `windows` and `k` of patch_match.py to match image i with `others`.
 
-        They are the arguments `packed`, `motions`, `windows` and `k` of patch_match.py. The windows are written to the
-        buffer `space`.
+        They are the greys of the other images, the projections into them, the windows of image i, which are written to
+        the buffer `space`, and fx, fy, cx, cy.
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
@@ -100,11 +100,12 @@ def match_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[Float[ndarray, "k h w"], Float[ndarray, "k h w"]]:
-    """Match the images `rows` with their neighbours; return inverse depth (per recon unit) and correlation (-1 to 1).
+    """Estimate the depth of the k images `rows` by PatchMatch stereo with their neighbours, `threads` images at once.
 
-    `neighbours` and `planes` are those of all images, from `densify.choose_neighbours` and `densify.sweep_planes`. The
-    search lies between the two planes; half of the initial planes lie between them, too. The result does not depend on
-    the number of threads.
+    Returns for each pixel the inverse depth (1/z, per recon unit) and the correlation with its best neighbours (-1 to
+    1). `colors` and poses are of all m undistorted images, on the pixel grid of `pinhole`; `neighbours` and `planes`
+    come from `choose_neighbours` and `sweep_planes`. The search covers the inverse depths between an image's two planes.
+    `report` is called with the share that is done. The result does not depend on `threads`.
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)

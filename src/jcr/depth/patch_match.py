@@ -128,10 +128,10 @@ def _try_passed(found, row, u, side, tried):
 @inlined
 @no_type_check
 def _try_changed(found, v, u, k, search, halvings, state, tried):
-    """Write to `tried` random changes of the planes of 16 pixels of row v, from column u on.
+    """Write to `tried` the planes of 16 pixels of row v, from column u on, with random changes of depth and normal.
 
-    `search` begins with the lowest and highest inverse depth and the largest relative change, which is halved
-    `halvings` times. `state` is that of the random numbers.
+    The first three elements of `search` are the lowest and highest inverse depth and the largest relative change, which
+    is halved `halvings` times. `state` is that of the random numbers.
     """
     lowest, highest, size = search[:3]
     scale = size * 0.5**halvings

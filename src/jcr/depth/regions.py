@@ -136,10 +136,10 @@ def _drawn_planes(
     tolerance: float,
     seed: int,
 ) -> tuple[Float[ndarray, "n 3"], Bool[ndarray, " n"]]:
-    """Return for each of n regions the plane with most inliers, from random planes and `support`; true if `support`.
+    """Return for each of n regions the plane p, p·ray = inverse depth, of most inliers, and whether it is `support`.
 
-    The k pixels are sorted by region; `of_region` are the index of the first pixel and the number of pixels of each
-    region. `depth` is inverse depth, and `tolerance` relative to it.
+    The planes tried are random ones through three pixels, and `support`. The k pixels are sorted by region; `of_region`
+    are index of the first pixel and number of pixels of each region. `depth` is inverse depth, `tolerance` relative.
     """
     start, size = of_region
     share = np.random.default_rng(seed).random((len(start), TRIALS, 3))

@@ -144,11 +144,12 @@ def correlate(typing, out, slot, packed, starts, motions, windows, place, tried)
 
 
 def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) -> tuple[list[Lanes], Lanes]:
-    """Return six vectors that place the windows of 16 pixels in the padded other images, and whether they lie there.
+    """Project the windows of 16 pixels into the padded other images; return places, and whether they lie inside.
 
-    The vectors are the centre x, y and the steps between sampled pixels: x, y along a row, x, y down a column. `motion`
-    is the projection, `plane` the change of inverse depth in a row, in a column, and the inverse depth. The homography
-    of a window is approximated as affine about its centre, which saves divisions.
+    The places are six vectors (px): centre x, y, and the steps x, y from one sampled pixel of the window to the next in
+    a row, and in a column. `motion` are the 12 numbers of the projection (`near` of patch_match.py), `plane` is the
+    change of inverse depth along a row, along a column, and the inverse depth, `size` width and height of the images.
+    The homography of a window is approximated as affine about its centre, which saves divisions.
     """
     (x0, y0, z0, x1, y1, z1, x, y, z, tx, ty, tz), (du, dv, here) = motion, plane
     z = z + tz * here

@@ -37,7 +37,7 @@ class DistanceGrid:
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the distance (n,) m, interpolated at points (n,3) m of the box."""
+        """Return the signed distance (n,) m at points (n,3) m of the box, interpolated trilinearly."""
         return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 

@@ -140,9 +140,9 @@ class Field(nn.Module):
     ) -> None:
         """Initialise the layers from `generator`; `heads` maps the name of each property to its number of outputs.
 
-        `hidden` is the number of hidden units, `box` the workspace (m). The input is encoded by sinusoids of so many
-        `frequencies`, or, if this is 0, by features of `lattices` (grids of nodes); each entry of `grids` is the index
-        of a lattice and its number of features per node.
+        `hidden` is the number of hidden units, `box` (2,3) m the workspace. A position is encoded by sinusoids of
+        `frequencies` octaves, or, if this is 0, by features of `lattices` (grids of nodes); each entry of `grids` is
+        the index of a lattice and its number of features per node.
         """
         super().__init__()
         self.about = {"heads": heads, "hidden": hidden, "frequencies": frequencies, "grids": grids}

@@ -52,7 +52,7 @@ class Rays:
     """Properties of the points to be learnt: color (n,3) in [0, 1], label (n,), other values (n,d)."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
-        """Return the selected rays."""
+        """Return the rays of the given rows, a tensor of indices or a slice."""
         columns = {name: value[rows] for name, value in vars(self).items() if name != "targets"}
         return Rays(targets={name: target[rows] for name, target in self.targets.items()}, **columns)
 
