@@ -136,10 +136,10 @@ def _priors(
     pinhole: Intrinsics,
 ) -> list[ndarray]:
     """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks."""
-    direction, x_in_recon = rays(pinhole).reshape(-1, 3), []
+    ray, x_in_recon = rays(pinhole), []
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
         some = np.flatnonzero(there)[::EVERY]
-        x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
+        x_in_recon.append(apply(pose, ray.reshape(-1, 3)[some] / per_depth.ravel()[some, None].astype(float)))
     far = 1 / float(np.median(inverse_depth[matched]))
     found = support_plane(np.concatenate(x_in_recon), recon_from_camera[:, :3, 3], far, z_is_up=False)
     support = np.zeros(4) if found is None else np.append(found[0], -found[0] @ found[1])
@@ -149,7 +149,7 @@ def _priors(
 
     def prior(i: int) -> tuple[ndarray, ...]:
         image = surfaces, inverse_depth[i], matched[i], views[i]
-        return planar_prior(i, *image, support, recon_from_camera[i], pinhole)
+        return planar_prior(i, *image, support, recon_from_camera[i], (grid(pinhole), ray))
 
     return [np.stack(maps) for maps in zip(*pool.map(prior, range(len(colors))), strict=True)]
 

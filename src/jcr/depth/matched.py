@@ -109,7 +109,7 @@ def match_depth(
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)
-    h, w = half.greys[0].shape
+    (h, w), ray = half.greys[0].shape, rays(half.pinhole)
     spaces = SimpleQueue[ndarray]()
     for _ in range(threads):
         spaces.put(np.empty(pinhole.height * blocks_of(pinhole.width) * TAPS * 2, np.float32))
@@ -117,7 +117,7 @@ def match_depth(
     def match(i: int, space: Float[ndarray, " _"]) -> Float[ndarray, "2 h w"]:
         others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i])
-        reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
+        reach = np.einsum("di,hwi->dhw", family, ray)
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
         views = half.views(i, others, recon_from_camera, space)

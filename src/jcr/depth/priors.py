@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import rays
 from jcr.depth.consistency import colours_agree
 from jcr.depth.matched import Relative, grid
 from jcr.depth.regions import FEWEST, colour_regions, region_planes
@@ -107,7 +106,7 @@ def planar_prior(
     view: Relative,
     support: Float[ndarray, "4"],
     recon_from_camera: Float[ndarray, "4 4"],
-    pinhole: Intrinsics,
+    camera: tuple[Float[ndarray, "4"], Float[ndarray, "h w 3"]],
 ) -> tuple[ndarray, ...]:
     """Fit a plane to the matched depth of each colour region of image i; return six maps (h,w) of these planes.
 
@@ -116,24 +115,25 @@ def planar_prior(
     that must agree with it (1 on the support plane); matched pixels that a well-supported plane shows to be wrong;
     relative standard deviation of the inverse depth. `surfaces` are the matched inverse depths of all images (0: none)
     and their colours, corrected and slightly smoothed. `support` is the scene's main plane (normal, d) in the recon
-    frame.
+    frame; `camera` are fx, fy, cx, cy and the rays (z = 1) of the pixels.
     """
-    k, (depths, colors) = grid(pinhole), surfaces
+    (depths, colors), (k, ray) = surfaces, camera
     label, count = colour_regions(colors[i])
     # The support plane as p with p·x = 1 in the camera frame; 0 if it contains the camera centre.
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -recon_from_camera[:3, :3].T @ support[:3] / offset if offset else np.zeros(3)
     planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
-        label, count, inverse_depth, matched, rays(pinhole), plane, ON_PLANE, i
+        label, count, inverse_depth, matched, ray, plane, ON_PLANE, i
     )
-    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1) - middle[label]
     # Mahalanobis distance from the pixels that support the region's plane.
-    away = np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", pixel, shape[label], pixel), 0))
+    u, v = np.arange(label.shape[1]) - middle[label, 0], np.arange(label.shape[0])[:, None] - middle[label, 1]
+    (uu, uv), (_, vv) = shape.transpose(1, 2, 0)
+    away = np.sqrt(np.maximum(uu[label] * u * u + 2 * uv[label] * u * v + vv[label] * v * v, 0))
     # Shadows and prints on the support plane are small regions without a plane of their own.
     size = np.bincount(label.ravel(), minlength=count)
     lonely = _beside(label, on_support) & (inliers == 0) & (fixed < FEWEST) & (size < PATCH * label.size)
     planes[lonely] = plane
-    predicted = np.einsum("hwi,hwi->hw", planes[label], rays(pinhole)).astype(np.float32)
+    predicted = np.einsum("hwi,hwi->hw", planes[label], ray).astype(np.float32)
     carried = (inliers > 0) & (inliers >= CARRIED * fixed)
     near = (on_support | lonely)[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near

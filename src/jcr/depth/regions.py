@@ -31,7 +31,10 @@ def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"],
     otherwise noise and JPEG blocks would join regions.
     """
     smooth = cv2.bilateralFilter(color, 7, 0.07, 3)
-    weight = np.concatenate([np.abs(np.diff(smooth, axis=axis)).max(-1).ravel() for axis in (1, 0)])
+    pairs = (smooth[:, 1:], smooth[:, :-1]), (smooth[1:], smooth[:-1])
+    # Over three channels, NumPy's maximum of two arrays takes a tenth of the time of its maximum along an axis.
+    changes = (np.moveaxis(cv2.absdiff(one, other), -1, 0) for one, other in pairs)
+    weight = np.concatenate([np.maximum(np.maximum(*change[:2]), change[2]).ravel() for change in changes])
     h, w = color.shape[:2]
     index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
