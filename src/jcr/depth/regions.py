@@ -113,12 +113,12 @@ def region_planes(
         return found
 
     best, on = _drawn_planes(ray, depth, (start, size), support, tolerance, seed)
-    on_best = ray * (np.abs((ray * best[of]).sum(1) - depth) < tolerance * depth)[:, None]
+    on_best = ray * (np.abs(np.einsum("ki,ki->k", ray, best[of]) - depth) < tolerance * depth)[:, None]
     normal = np.add.reduceat(on_best[:, :, None] * ray[:, None], start)
     fitted = ~on & (np.abs(np.linalg.det(normal)) >= 1e-12)
     right = np.add.reduceat(on_best * depth[:, None], start)
     best[fitted] = np.linalg.solve(normal[fitted], right[fitted][..., None])[..., 0]
-    off = (ray * best[of]).sum(1) / depth - 1
+    off = np.einsum("ki,ki->k", ray, best[of]) / depth - 1
     carries = np.abs(off) < tolerance
     number, mean, covariance = _moments(of[carries], pixel[chosen[carries]], n)
     whole = _moments(label.ravel(), pixel, count)[2][regions]

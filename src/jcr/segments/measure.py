@@ -83,7 +83,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
         if label in (0, plane_label) or rows.sum() < FEWEST:
             continue
         x, image = x_in_support[rows], cloud.image[rows]
-        top, spread, rotation_rad, center, sides, outline = _shape(x, support.roughness)
+        top, spread, rotation_rad, center, sides, within = _shape(x, support.roughness)
         if top <= 0:
             continue
         parts = []
@@ -97,6 +97,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
         own = np.array([CELL / 2, CELL / 2, np.hypot(bent, spread / np.sqrt(max(len(parts), 1)))])
         std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
         turn = rotation_exp(np.array([0.0, 0.0, rotation_rad]))
+        outline = _outline(within)
         outline = np.column_stack([outline, np.zeros(len(outline))])
         sizes.append(
             ObjectSize(
@@ -118,11 +119,11 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, given_rad: float | None = None
 ) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
-    """Return height of the top, spread of the top, rotation, centre, side lengths and outline of one object.
+    """Return height of the top, spread of the top, rotation, centre, sides of one object, and k points within the sides.
 
     `x_in_support` are its n points (m), z normal to the support plane; `roughness` is their noise (m). The spread is
     the standard deviation (m) of heights at the top. The rotation (rad, about z) is that from the x axis to the longer
-    side; `given_rad` replaces its estimate. Centre, side lengths and the k corners of the outline are in m in the plane.
+    side; `given_rad` replaces its estimate. Centre, side lengths and the k points are in m in the plane.
     """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
@@ -138,12 +139,13 @@ def _shape(
     low, high = np.quantile(along, ends, axis=0, weights=area, method="inverted_cdf")
     within = ((along >= low) & (along <= high)).all(1)
     center = middle + (low + high) / 2 @ _axes(rotation_rad)
-    return top, spread, rotation_rad, center, high - low, _outline(xy[within] - middle) + middle
+    return top, spread, rotation_rad, center, high - low, xy[within]
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """Return the k corners of the convex hull of n points (m); they must be near the origin, because float32 is used."""
-    return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
+    """Return the k corners of the convex hull of n points (m), in order."""
+    middle = xy.mean(0)  # float32 is precise near the origin only
+    return cv2.convexHull((xy - middle).astype(np.float32))[:, 0] + middle
 
 
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
