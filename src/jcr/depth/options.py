@@ -23,7 +23,7 @@ class DepthOptions:
         ),
     ] = True
     """Fill plain surfaces with planes. Networks predict them anyway."""
-    pointmap_size_px: tyro.conf.Suppress[int] = 400
-    """Long side of the pointmaps."""
+    pointmap_size_px: tyro.conf.Suppress[int] = 384
+    """Long side of the pointmaps: at full and half resolution a multiple of the 16 pixels that are matched at once."""
     neighbours: tyro.conf.Suppress[int] = 10
     """Other images that the depth of each is checked against; matched with the best of them."""
