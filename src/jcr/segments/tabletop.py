@@ -132,7 +132,27 @@ def _objects(
     `x_in_support` are the points (m), z normal to the plane. `bare` marks points of the plane with nothing above them.
     Raises InputError if too little of the plane is bare.
     """
-    part = _joined(part, x_in_support, options)
+    # Groups are joined if their outlines overlap in the plane, such as the two sides of a ring, and if a small one is
+    # above the plane and close to a larger one, such as a cup's handle.
+    count = np.bincount(part)
+    count[0] = 0
+    joined = np.arange(len(count))
+    rows = [np.flatnonzero(part == k) if count[k] >= 3 else np.zeros(0, int) for k in range(len(count))]
+    hull = [cv2.convexHull(x_in_support[own, :2].astype(np.float32)) if len(own) else None for own in rows]
+    order = [k for k in np.argsort(-count) if hull[k] is not None]
+    for at, small in enumerate(order):
+        is_above = x_in_support[rows[small], 2].min() > 2 * options.object_gap
+        for large in order[:at]:
+            shared, _ = cv2.intersectConvexConvex(hull[small], hull[large])
+            if shared > 0.2 * cv2.contourArea(hull[small]) or (
+                is_above
+                and count[small] < 0.25 * count[large]
+                and KDTree(x_in_support[rows[large], :2]).query(x_in_support[rows[small], :2])[0].min()
+                < 2.5 * options.object_gap
+            ):
+                joined[small] = joined[large]
+                break
+    part = joined[part]
     count = np.bincount(part)
     # A part mostly outside of the bare plane is background, such as a wall; a small part is noise.
     plane_xy = x_in_support[bare, :2]
@@ -153,33 +173,3 @@ def _objects(
     rank = np.zeros(len(count), int)
     rank[np.argsort(-np.where(good, count, 0))[: good.sum()]] = np.arange(1, good.sum() + 1)
     return rank[part]
-
-
-def _joined(
-    part: Int[ndarray, " n"], x_in_support: Float[ndarray, "n 3"], options: TabletopOptions
-) -> Int[ndarray, " n"]:
-    """Return `part`, the number of each point's connected group (0: none), after joining groups of one object.
-
-    Groups are joined if their outlines overlap in the plane, such as the two sides of a ring, and if a small one is
-    above the plane and close to a larger one, such as a cup's handle. `x_in_support` are the points (m).
-    """
-    count = np.bincount(part)
-    count[0] = 0
-    joined = np.arange(len(count))
-    rows = [np.flatnonzero(part == k) if count[k] >= 3 else np.zeros(0, int) for k in range(len(count))]
-    hull = [cv2.convexHull(x_in_support[own, :2].astype(np.float32)) if len(own) else None for own in rows]
-    order = [k for k in np.argsort(-count) if hull[k] is not None]
-    for at, small in enumerate(order):
-        floats = x_in_support[rows[small], 2].min() > 2 * options.object_gap
-        for large in order[:at]:
-            shared, _ = cv2.intersectConvexConvex(hull[small], hull[large])
-            overlap = shared > 0.2 * cv2.contourArea(hull[small])
-            if overlap or (
-                floats
-                and count[small] < 0.25 * count[large]
-                and KDTree(x_in_support[rows[large], :2]).query(x_in_support[rows[small], :2])[0].min()
-                < 2.5 * options.object_gap
-            ):
-                joined[small] = joined[large]
-                break
-    return joined[part]
