@@ -64,9 +64,11 @@ def camera_error_covariance(
 ) -> Float[ndarray, "s s"] | None:
     """Return the estimated covariance (6n,6n) of the errors of n camera poses; None if the poses show none.
 
-    Components are added one by one, each with the largest log evidence of the `used` poses, while the gain exceeds
-    CLEAR. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
-    `error_covariance`, `noise_floor` and `priors` are those of `pose_problem`; `adding_up` adds errors that accumulate.
+    Rows are the steps of each pose (geometry.retract; recon axes and unit, rad). Components are added one by one, each
+    with the largest log evidence of the `used` poses, while the gain exceeds CLEAR. Fewer than FEWEST used poses give
+    None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
+    `error_covariance`, `noise_floor` and `priors` are those of `pose_problem`. `adding_up`: errors that accumulate
+    along the images are tested too.
     """
     rows = np.flatnonzero(used)
     if len(rows) < FEWEST:
@@ -115,8 +117,9 @@ def camera_error_part(
 ) -> Float[ndarray, "s s"]:
     """Return the covariance (6m,6m) of the errors of camera poses `rows` by one part, for its typical size.
 
-    The errors are steps of the poses (geometry.retract; recon axes). `scale` is in metres per unit of the
-    reconstruction; random walks run over all n poses of `recon_from_camera`.
+    The errors are steps of the poses (geometry.retract; recon axes and unit, rad), pose by pose; `rows` are indices of
+    poses. `scale` is in metres per unit of the reconstruction; random walks run over all n poses of
+    `recon_from_camera`.
     """
     n, position, axis = len(recon_from_camera), recon_from_camera[:, :3, 3], recon_from_camera[:, :3, 2]
     if part in WALKS:

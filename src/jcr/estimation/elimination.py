@@ -20,9 +20,10 @@ _solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float
 
 
 def cholesky(matrix: Matrices) -> Matrices:
-    """Return the lower Cholesky factor L of a positive semidefinite matrix: L Lᵀ = `matrix`.
+    """Return the lower Cholesky factors L (...,n,n) of positive semidefinite matrices (...,n,n): L Lᵀ = `matrix`.
 
-    A matrix that is singular up to rounding, as of degenerate motions, is allowed.
+    A matrix that is singular up to rounding, as of degenerate motions, is allowed; its diagonal is then increased
+    slightly.
     """
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None] / size[..., None, :]
@@ -38,17 +39,17 @@ def cholesky(matrix: Matrices) -> Matrices:
 
 
 def lower(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return L⁻¹ · right, for lower Cholesky factors L = `root`."""
+    """Return L⁻¹ · right (...,n,r), for lower Cholesky factors L = `root` (...,n,n)."""
     return _triangular(root, right, transposed=False)
 
 
 def upper(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return L⁻ᵀ · right, for lower Cholesky factors L = `root`."""
+    """Return L⁻ᵀ · right (...,n,r), for lower Cholesky factors L = `root` (...,n,n)."""
     return _triangular(root, right, transposed=True)
 
 
 def over(root: Matrices, right: Columns) -> Float[ndarray, "*k n r"]:
-    """Return V⁻¹ · right, for V = L Lᵀ with lower Cholesky factors L = `root`."""
+    """Return V⁻¹ · right (...,n,r), for V = L Lᵀ with lower Cholesky factors L = `root` (...,n,n)."""
     return upper(root, lower(root, right))
 
 
@@ -59,12 +60,12 @@ def inverse_of(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
 
 
 def log_root_determinant(root: Matrices) -> Float[ndarray, "*k"] | np.floating:
-    """Return log √det V for V = L Lᵀ, with lower Cholesky factors L = `root`."""
+    """Return log √det V for each V = L Lᵀ, with lower Cholesky factors L = `root` (...,n,n)."""
     return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
 
 
 def _triangular(root: Matrices, right: Columns, transposed: bool) -> Float[ndarray, "*k n r"]:
-    """Return L⁻¹ · right, or L⁻ᵀ · right if `transposed`, for lower triangular L = `root`."""
+    """Return L⁻¹ · right (...,n,r), or L⁻ᵀ · right if `transposed`, for lower triangular L = `root` (...,n,n)."""
     # A row-major L is a column-major Lᵀ, which LAPACK takes without a copy.
     if root.ndim == right.ndim == 2:
         return _solve_triangular(root.T, right, lower=0, trans=not transposed)[0]
@@ -105,9 +106,10 @@ class Sightings:
 
     @staticmethod
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
-        """Return the index of sorted observations from the point and the image (or rig) of each.
+        """Return the index of observations from the point and the image (or rig) of each, sorted by point, then image.
 
-        Every point has at least one observation. `images` is the number of images (or rigs).
+        Points are numbered from 0, and every point has at least one observation. `images` is the number of images (or
+        rigs).
         """
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(image, np.flatnonzero(np.diff(point, prepend=-1)), rows)
@@ -128,7 +130,10 @@ class Normal:
     L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """Return the p points after their Gauss-Newton step; `step` (d,) is the step of all other unknowns."""
+        """Return the p points after their Gauss-Newton step, in the same frame as `points`.
+
+        `step` (d,) is the step of all other unknowns, which determines that of the points.
+        """
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -142,7 +147,7 @@ def with_fixed_points(
     """Return Hessian JᵀJ (d,d) and right side −Jᵀr (d,) of all unknowns but the points, as if the points were fixed.
 
     The d unknowns are the columns that all images share, then the columns of each rig. J and r are the derivatives and
-    residuals in `rows`.
+    residuals in `rows`, whose rigs `seen` lists.
     """
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)
@@ -167,8 +172,8 @@ def without_points(
 ) -> Normal:
     """Return the normal equations of the d unknowns other than the points, which are eliminated (Schur complement).
 
-    `hessian` and `right` are those of `with_fixed_points` and are overwritten. `damping` increases the diagonal of each
-    point's block by this share.
+    `hessian` and `right` are those of `with_fixed_points` for `rows` and `seen`, and are overwritten. `damping`
+    increases the diagonal of each point's block by this share.
     """
     s, o = rows.shared.shape[2], rows.own.shape[2]
     blocks, ends = [], np.append(seen.starts, len(seen.image))
@@ -203,7 +208,11 @@ def without_points(
 
 
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
-    """Return the 3x3 block JᵀJ of each of n points; J is `by_point`, `starts` are the points' first observations."""
+    """Return the 3x3 block JᵀJ of each of n points, with a small increase of the diagonal that makes it invertible.
+
+    J is `by_point`, the weighted derivative of k observations by their points, sorted by point. `starts` are the
+    indices of the points' first observations.
+    """
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 
 

@@ -86,17 +86,17 @@ class Row:
 
     @property
     def of_camera(self) -> bool:
-        """Whether the parameters are those of a camera."""
+        """Whether the effect is on a camera; otherwise it is on the reported poses."""
         return self.kind.row.group == "camera"
 
     @property
     def beside(self) -> Float[ndarray, "c q"]:
-        """Directions that are free with and without the effect."""
+        """Directions (columns) in the c coordinates that are free with and without the effect; q = 0 for none."""
         return self.columns[:, :0] if self.nuisance is None else self.nuisance
 
     @property
     def both(self) -> Float[ndarray, "c r"]:
-        """Directions that are free with the effect: `beside`, then `columns`."""
+        """Directions (columns) in the c coordinates that are free with the effect: `beside`, then `columns`."""
         return np.concatenate([self.beside, self.columns], axis=1)
 
 
@@ -113,9 +113,10 @@ class Scores:
     """Ratio of the gradient's actual variance to the variance that the weights imply."""
 
     def gain(self, free: Float[ndarray, "c r"]) -> tuple[float, int]:
-        """Return the decrease of the cost along the directions `free`, and their rank.
+        """Return the decrease of the cost (squared standard deviations) by the best step along the columns of `free`.
 
-        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information.
+        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information. The second result is
+        the rank of S.
         """
         information, right = free.T @ self.information @ free, free.T @ self.gradient
         scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
@@ -125,7 +126,11 @@ class Scores:
         return float(whitened @ whitened), int(kept.sum())
 
     def log_p(self, row: Row) -> float:
-        """Return the log p-value of the score test of a row: the chance of its gain without the effect."""
+        """Return the natural log p-value of the score test of an effect: the chance of its gain without the effect.
+
+        The gain of `Row.both` minus that of `Row.beside`, over `dispersion` and the number of parameters, is tested by
+        an F distribution. The p-value is multiplied by `row.places`.
+        """
         (without, fewer), (gain, more) = self.gain(row.beside), self.gain(row.both)
         d = max(more - fewer, 1)
         ratio = max(gain - without, 0.0) / self.dispersion / d
@@ -177,19 +182,22 @@ class Adjustment:
 
     @property
     def combinations(self) -> Float[ndarray, "e p"] | None:
-        """Free directions of the camera, of all confirmed effects on it; None without such effects."""
+        """Free directions (columns) of the camera's e parameters (`Row`) for confirmed effects; None without."""
         each = [row.both for row in self.rows if row.of_camera]
         return np.concatenate(each, axis=1) if each else None
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Intrinsics of the camera after the adjustment."""
+        """Adjusted intrinsics of the tested camera; only if `camera` is not None."""
         assert self.camera is not None
         return self.solution.images.view.cameras[self.camera]
 
     @property
     def poses(self) -> tuple[Poses, slice]:
-        """Used poses of the tested arm, and their rows among the pose equations: 6 per pose, arm after arm."""
+        """Used reported base_from_gripper of the tested arm, and the slice of their residuals in `solution.equations`.
+
+        The equations have six residuals for each used pose, arm after arm.
+        """
         used, arms, arm = self.solution.poses.used, self.solution.problem.arms, self.arm or 0
         first = sum(len(one.rigs) for one in arms[:arm])
         own = used[first : first + len(arms[arm].rigs)]
@@ -198,21 +206,25 @@ class Adjustment:
 
     @cached_property
     def pose_scores(self) -> Scores:
-        """Cost of the residuals of the reported poses."""
+        """Quadratic cost of errors of the reported poses, with the unknowns of `solution` eliminated.
+
+        Its c coordinates are the residuals of the used poses of all arms (m, rad; base axes).
+        """
         at = self.solution.at_mode
         freedom = max(len(at.weighed_left) - self.solution.problem.arm_unknowns, 1)
         return Scores(information=at.projection, gradient=at.weighed_left, freedom=freedom)
 
     @cached_property
     def camera_scores(self) -> Scores:
-        """Cost of the parameters of the camera."""
+        """Quadratic cost of the e parameters (`Row`) of the tested camera, as by the function `camera_scores`."""
         assert self.camera is not None
         return camera_scores(self.solution, self.camera)
 
     def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
         """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
 
-        Raises LinAlgError if the problem becomes singular.
+        An effect on the camera frees its directions. An effect on the poses adds errors whose parameters have the prior
+        standard deviation `Row.unit`. Raises LinAlgError if the problem becomes singular.
         """
         free, own = replace(self, rows=tuple(rows)), self.poses[1]
         errors = [row.unit * row.columns[own] for row in rows if not row.of_camera]
@@ -221,15 +233,20 @@ class Adjustment:
 
 
 def rank(model: Adjustment, rows: Sequence[Row]) -> list[tuple[Row, float]]:
-    """Return the rows with the log p-values of their score tests, the most significant row first."""
+    """Return the effects `rows` with the natural log p-values of their score tests, the smallest p-value first.
+
+    The p-value is that of `Scores.log_p`, for the camera or the poses of `model`.
+    """
     each = [(model.camera_scores if row.of_camera else model.pose_scores).log_p(row) for row in rows]
     return sorted(zip(rows, each, strict=True), key=lambda one: one[1])
 
 
 def confirm(model: Adjustment, row: Row) -> Test:
-    """Return Wald's test of an effect, with the error sizes estimated together with the effect.
+    """Return Wald's test of one possible effect `row`: whether its estimate differs significantly from 0.
 
-    An effect on the camera is estimated by an adjustment, which raises LinAlgError if it is singular.
+    The error sizes are estimated anew together with the effect. An effect on the poses is estimated in the linearised
+    equations of `model`. An effect on the camera is estimated by a new adjustment with all confirmed effects of
+    `model`, which raises LinAlgError if it is singular.
     """
     if not row.of_camera:
         test = confirm_in_equations(model.solution.equations, row)
@@ -262,17 +279,21 @@ def confirm(model: Adjustment, row: Row) -> Test:
 
 
 def mean_square(estimate: Float[ndarray, " d"], covariance: Float[ndarray, "d d"]) -> float:
-    """Return eᵀC⁻¹e / d of an estimate e of d parameters with covariance C: the statistic of Wald's test."""
+    """Return eᵀC⁻¹e / d of an estimate e of d parameters with covariance C: the statistic of Wald's test.
+
+    C⁻¹ is the pseudo-inverse if C is singular.
+    """
     size = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
     inverse = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9)
     return float((estimate / size) @ inverse @ (estimate / size)) / len(estimate)
 
 
 def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None) -> Test:
-    """Return Wald's test of an effect on the poses, averaged over the error sizes; its `shift` is that of p unknowns.
+    """Return Wald's test of an effect on the poses: an F test of its parameters, averaged over the error sizes.
 
-    `freedom` is the denominator's degrees of freedom of each F test; None: those of all residuals, which is
-    conservative.
+    The rows of `row.columns` are those of `equations.residual`. The average weighs each choice of the sizes by its
+    posterior (`over_sizes`). `Test.shift` is the change of all p unknowns, in the order of `equations`. `freedom` is
+    the denominator's degrees of freedom of each F test; None: those of all residuals, which is conservative.
     """
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     free = replace(
@@ -303,9 +324,11 @@ def confirm_in_equations(equations: Equations, row: Row, freedom: float | None =
 
 
 def explains_by_order(scores: Scores, row: Row) -> bool:
-    """Return whether a motion explains the residuals better than it does in nearly all random orders of the images.
+    """Return whether at most the share BY_CHANCE of random orders of the images reach the score gain of a motion.
 
-    This permutation test of the score gain allows for errors with heavy tails and single wrong poses.
+    `row` must have `motion` and `share`. ORDERS permutations of the share among the poses that move are compared by
+    `Scores.gain` of motion times share. This permutation test allows for errors with heavy tails and single wrong
+    poses.
     """
     assert row.motion is not None and row.share is not None
     rng, own = np.random.default_rng(0), row.motion[::6].any(axis=1)
@@ -323,8 +346,9 @@ def explains_by_order(scores: Scores, row: Row) -> bool:
 def pose_rows(model: Adjustment) -> Iterator[Row]:
     """Yield the effects on the poses of the tested arm: those of the image order, then those of the gripper pose.
 
-    They are slip of the camera, base moved, drift and delayed poses; strain, lean and sag of the arm. Slip and moved
-    base have one row for each of several images at which they may happen. The arm needs six poses or more.
+    They are drift, slip of the camera, base moved and delayed poses; then those of `arm_rows`. Slip and moved base have
+    one row for each of at most MANY_PLACES images at which they may happen. Parameters are steps (m, rad) of X for
+    drift and slip, of Z for a moved base, and a number of images for the delay. The arm needs six poses or more.
     """
     # These imports are slow and rarely needed.
     from scipy.interpolate import CubicSpline
@@ -359,7 +383,12 @@ def pose_rows(model: Adjustment) -> Iterator[Row]:
 
 
 def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
-    """Yield the effects that depend on the gripper pose: strain of all lengths, leaning base, sagging tool."""
+    """Yield the effects that depend on the gripper pose: strain of all lengths, leaning base, sagging tool.
+
+    Columns are errors of n poses (6n rows: m, then rad, pose by pose; base axes, z up). Parameters of the strain are
+    the coefficients of the five STRAINS. The lean is in rad per metre of horizontal distance of the gripper. The sag is
+    in rad for a weight on a horizontal lever, along each of the three gripper axes.
+    """
     position, rotation = base_from_gripper[:, :3, 3], base_from_gripper[:, :3, :3]
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
@@ -376,16 +405,17 @@ def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
 
 
 def _flat(columns: Float[ndarray, "n 6 d"]) -> Float[ndarray, "s d"]:
-    """Return the columns (n,6,d) as a matrix with s = 6n rows."""
+    """Return the columns (n,6,d) of n poses as a matrix (s,d) with s = 6n rows, pose by pose."""
     return columns.reshape(-1, columns.shape[2])
 
 
 def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffsets:
     """Return each joint's offset (rad), true minus reported angle, with its standard deviation.
 
-    The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at the most likely
-    error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation: the size σ_s of
-    the systematic errors.
+    `joints` (n,dof) are the reported angles (rad) of the n used poses; the systematic errors of `poses` must be those
+    of `arm_errors`. The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at
+    the most likely error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation:
+    the size σ_s of the systematic errors.
     """
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
@@ -406,9 +436,10 @@ OfImage = Literal["focal", "shear", "x", "y"]
 
 
 def tested_intrinsics(model: Adjustment) -> list[str]:
-    """Return the names of the parameters that the row "intrinsics contradict the images" tests.
+    """Return the names of the camera's parameters that the test of FindingKind.INTRINSICS frees.
 
-    A given distortion that folds over was not used, which its prior shows; it is not tested either.
+    They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, as far as the camera has them. A given distortion coefficient is
+    not tested if its prior is at least as wide as in ESTIMATED: its value was not used.
     """
     assert model.camera is not None
     prior, tested = model.solution.problem.cameras[model.camera], TESTED_IF_ESTIMATED
@@ -421,10 +452,12 @@ def tested_intrinsics(model: Adjustment) -> list[str]:
 
 
 def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
-    """Yield the effects on the tested camera: focal lengths, shears and offsets of its images, thin prism, intrinsics.
+    """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
-    A common error of the focal length is free beside all others. With fewer than `min_images` images, wrong intrinsics
-    are the only effect. A change of the focal length has one row for each image at which it may happen.
+    Effects on images are focal lengths, shears (rolling shutter) and offsets by gravity. They include a zoom, with one
+    row for each image at which it may happen. Each has the common error of the focal length as nuisance; offsets and
+    prism also have the principal point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
+    prism is tested only if there is one camera.
     """
     problem, state = model.solution.problem, model.solution.state
     observations, view = problem.observations, model.solution.images.view
@@ -476,9 +509,10 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
 
 
 def camera_scores(solution: Solution, camera: int) -> Scores:
-    """Return the cost of changes of the e parameters of one camera (`Row`) from their values in a solution.
+    """Return the quadratic cost of changes of the e parameters (`Row`) of the camera with index `camera`.
 
-    What the solution has freed already remains free.
+    The changes are from the values in `solution`, in the units of problem.rows_of and with its weak prior. All other
+    unknowns are eliminated, including the directions that the solution has freed.
     """
     problem, likely, state = solution.problem, solution.most_likely, solution.images.state
     rows, units, weak = _rows_of(problem, camera)
@@ -511,13 +545,16 @@ def camera_scores(solution: Solution, camera: int) -> Scores:
 def _rows_of(
     problem: Problem, camera: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return problem.rows_of for a camera of a problem with observations: rows, units and weak prior std."""
+    """Return the rows, units and weak prior standard deviations of problem.rows_of for the camera with index `camera`.
+
+    The problem must have observations; all images of the camera are included.
+    """
     assert problem.observations is not None
     return rows_of(problem, camera, np.flatnonzero(problem.observations.camera == camera), problem.n_images)
 
 
 def _dispersion(images: ImageEvidence) -> float:
-    """Return the variance of the weighted residuals over the variance that their weights imply.
+    """Return the actual variance of the weighted residuals (weight · px) over the variance that their weights imply.
 
     The larger of two estimates is returned: from single residuals, and from their sums over image cells, which are
     clusters in the sense of Liang and Zeger (Biometrika 73, 1986).
@@ -532,7 +569,8 @@ def _dispersion(images: ImageEvidence) -> float:
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
     """Return directions (columns) in the e parameters of a camera (`Row`) that give each of p images a focal length.
 
-    The first column is the common focal length, the others are differences between images; `images` is p.
+    The first column changes fx and fy by the same factor. The others change the logarithms of the images' focal lengths
+    by the columns of `differences`. `images` is p.
     """
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))

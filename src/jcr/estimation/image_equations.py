@@ -51,7 +51,10 @@ class RigInformation(NamedTuple):
     """Vector g of the cost ½ sᵀ H s + gᵀ s."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
-        """Return the steps (r,) from the reference poses to the rigs of a state: (m, rad) of each rig in turn."""
+        """Return the steps (r,) from the reference poses to the rigs of a state: six numbers of each rig in turn.
+
+        They are translation (unit of the world), then rotation vector (rad), in axes of the world.
+        """
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
@@ -73,14 +76,15 @@ class ImageEvidence:
 
     @cached_property
     def weight(self) -> Float[ndarray, " k"]:
-        """Weight of each observation, 1/px²."""
+        """Weight (1/px²) of each of k observations at `state`, by the pixel noise and the Cauchy loss."""
         return weights_of(self.problem, self.state, self.view)
 
     @cached_property
     def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
         """Conditional distribution of the steps r of the arms' rigs, given steps f of the columns `Problem.free`.
 
-        Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b.
+        Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b. Steps are in the order of
+        `Problem.by_arm`.
         """
         by_arm, free = self.problem.by_arm, self.problem.free
         root = cholesky(self.information[np.ix_(by_arm, by_arm)])
@@ -93,7 +97,7 @@ class ImageEvidence:
 def adjust_images(problem: Problem, state: State) -> State:
     """Return the state after bundle adjustment without reported poses, for cameras with exact intrinsics.
 
-    Mean position, mean rotation and extent of the rigs (the camera poses) stay fixed.
+    Rigs (camera poses) and points are adjusted. Mean position, mean rotation and extent of the rigs stay fixed.
     """
     unseen = information_along(similarities_of_rigs(state.world_from_rig), 1.0)
     world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
@@ -104,10 +108,10 @@ def adjust_images(problem: Problem, state: State) -> State:
 
 
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
-    """Return the state with the pixel noise estimated from the residuals in `view`.
+    """Return the state with the pixel noise estimated from the residuals in `view`, the projection of the state.
 
-    The first estimate has one size for all observations; later ones distinguish groups (one for each camera, one for
-    board corners) and the stated variances.
+    The first estimate has one size for all observations. Later ones distinguish groups (one for each camera, one for
+    board corners) and use the observations' stated variances.
     """
     layout, residual_px, depth, before = problem.layout, view.residual_px, view.depth, state.pixel_noise
     if before is None or (layout.groups == 1 and not layout.states_variances):
@@ -127,15 +131,19 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
 
 
 def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
-    """Return the weight (1/px²) of each of k observations, by the pixel noise of the state and the robust loss."""
+    """Return the weight (1/px²) of each of k observations, by the pixel noise of the state and the Cauchy loss.
+
+    `view` is the projection of the state; points behind or very near a camera have weight 0 (`PixelNoise.weights`).
+    """
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
 
 def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
-    """Return the state after bundle adjustment with constant weights, those of the observations at the start.
+    """Return the state after bundle adjustment with constant weights, those of the observations at the initial `state`.
 
-    `known` is information about the rigs in addition to that of the images and `problem.known_rigs`.
+    The arms' X, scale and Z stay. `known` is information about the rigs in addition to that of the images and
+    `problem.known_rigs`.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
@@ -163,14 +171,18 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the normal distribution of `Problem.columns` (intrinsics, boards, rigs) by images and priors at a state."""
+    """Return the normal distribution of `Problem.columns` by images and priors, linearised at a state.
+
+    The columns are intrinsics, boards and rigs. The points are eliminated; reported poses are not used.
+    """
     return linearised(problem, state, view_of(problem, state))[0]
 
 
 def linearised(problem: Problem, state: State, view: ProjectedObservations) -> tuple[ImageEvidence, Normal]:
     """Return the evidence of images and priors about a state, and the normal equations from which points are stepped.
 
-    The evidence is the normal distribution of `Problem.columns`.
+    The evidence is the normal distribution of `Problem.columns` (intrinsics, boards, rigs). `view` is the projection of
+    the state.
     """
     weight = weights_of(problem, state, view)
     normal = _normal_equations(problem, state, view, weight, _known_rigs(problem), 0.0)
@@ -196,7 +208,7 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
     """Return the evidence with a new estimate of the size of each camera's model error.
 
     The model error is the distortion that the camera model cannot express. The second result is the largest absolute
-    change of the logarithm of a size.
+    change of the natural logarithm of a size; 0 if no model errors are estimated.
     """
     state, change, sizes = images.state, 0.0, images.state.model_error_std.copy()
     columns = {k: own for k, own in enumerate(images.problem.columns.model_error) if own.stop > own.start}
@@ -217,7 +229,10 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
 
 
 def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Float[ndarray, " n"]:
-    """Return the median reprojection error (px) of each of n images; NaN for an image without observations."""
+    """Return the median length (px) of the reprojection errors of each of n images; NaN for one without observations.
+
+    `view` has the residuals.
+    """
     assert problem.observations is not None
     length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
     out = np.full(problem.n_images, np.nan)
@@ -237,9 +252,9 @@ def cost_of_images(images: ImageEvidence, state: State) -> float:
 
 
 def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
-    """Return an information matrix of this strength in the space of seven `steps`, those of a similarity of the world.
+    """Return the information matrix with the value `strength` in all directions that the seven columns of `steps` span.
 
-    The seven columns are orthonormalised first, so only the space that they span matters.
+    The columns are those of a similarity of the world. They are orthonormalised first; all other directions have 0.
     """
     unseen = np.linalg.qr(steps)[0]
     return strength * unseen @ unseen.T
@@ -252,7 +267,10 @@ def _cost(
     weight: Float[ndarray, " k"],
     known: Sequence[RigInformation],
 ) -> float:
-    """Return the cost in squared standard deviations: weighted residuals, priors, boards and `known` information."""
+    """Return the cost in squared standard deviations: weighted residuals, priors, boards and `known` information.
+
+    `weight` (1/px²) is that of each of k observations in `view`, the projection of the state.
+    """
     total = float(weight @ (view.residual_px**2).sum(1))
     total += float(((state.camera_steps / problem.prior_std(state)) ** 2).sum())
     if problem.boards is not None:
@@ -267,7 +285,10 @@ def _cost(
 
 
 def _known_rigs(problem: Problem) -> list[RigInformation]:
-    """Return the normal distribution `Problem.known_rigs` as a list with one quadratic cost; an empty list if None."""
+    """Return the normal distribution `Problem.known_rigs` as a list with one quadratic cost; an empty list if None.
+
+    The distribution must have a covariance.
+    """
     if problem.known_rigs is None:
         return []
     poses, covariance = problem.known_rigs
@@ -285,7 +306,8 @@ def _normal_equations(
 ) -> Normal:
     """Return the normal equations of the d unknowns in the order of `Problem.columns` (cameras, boards, rigs).
 
-    The points are eliminated. `known` is information about rigs; `damping` is that of `without_points`.
+    The points are eliminated. `weight` (1/px²) is that of each of k observations in `view`; `known` is information
+    about rigs. `damping` increases the diagonal by this share, as in `without_points`.
     """
     first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
     weighted = derivatives(problem, state, view, weight)

@@ -70,8 +70,9 @@ def camera_with_prior(
 ) -> CameraPrior:
     """Return the prior of a camera with mean `intrinsics` and standard deviations `std`.
 
-    `std` is a mapping with keys as in MEASURED, or one number for each element of `camera.parameters`; NaN stands for
-    the value of MEASURED. Coefficients that the distortion model does not have are ignored.
+    `std` is a mapping with keys and units as in MEASURED; parameters without a key are exact. Or it is one number for
+    each element of `camera.parameters`, in its unit; NaN stands for the value of MEASURED, 0 for an exact parameter.
+    Coefficients that the distortion model does not have are ignored.
     """
     if isinstance(std, ndarray):
         usual = camera_with_prior(intrinsics)
@@ -99,8 +100,9 @@ def camera_about(
 ) -> CameraPrior:
     """Return the prior of a camera with mean `found`.
 
-    If the intrinsics were `given`, `std` are their standard deviations; None: MEASURED. If a reconstruction estimated
-    them, or the distortion alone where it is not `distortion_given`, the standard deviations are ESTIMATED.
+    `given`: the user gave the intrinsics, and `std` has their standard deviations (camera.parameters; None: MEASURED).
+    Otherwise a reconstruction estimated them, with the standard deviations ESTIMATED. `distortion_given` False: given
+    intrinsics whose distortion was estimated, which has those of ESTIMATED.
     """
     if not given:
         return camera_with_prior(found, ESTIMATED)
@@ -116,10 +118,11 @@ def camera_about(
 def decentring(camera: Intrinsics, x: Transform) -> Float[ndarray, "r 2"]:
     """Return the steps of gripper_from_camera `x`, log scale and q intrinsics that images confuse with a thin prism.
 
-    Column 0 is for a prism that displaces along x, column 1 along y; there are 7 + q rows. To second order, a prism
-    that displaces x by s · radius² equals p2 = s, the principal point moved by 2 · s · fx and the camera rotated by 2 ·
-    s about its y axis. s is one standard deviation: DECENTRING, or the estimated tangential distortion if larger,
-    because one defect of the optics causes both.
+    Column 0 is for a prism that displaces along x, column 1 along y. The 7 + q rows are translation, rotation (gripper
+    axes), log scale and camera.parameters, with p1 and p2 among them. To second order, a prism that displaces
+    normalised x by s · radius² equals three changes. They are p2 = s, the principal point moved by 2 · s · fx, and the
+    camera rotated by 2 · s about its y axis. s is one standard deviation: DECENTRING, or the estimated tangential
+    distortion if larger, because one defect of the optics causes both.
     """
     names = parameter_names(camera)
     out = np.zeros((7 + len(names), 2))
@@ -148,8 +151,8 @@ def displacements(
 ) -> Float[ndarray, "k 2 e"]:
     """Return the displacement (px) of k observations by each of e polynomials of the distortion outside the model.
 
-    The polynomials have a coefficient of one image width. The part that a change of the q intrinsics along `directions`
-    (columns) can produce is removed.
+    The polynomials (POLYNOMIALS, Legendre) have a coefficient of one image width. The part that a change of the q
+    intrinsics along `directions` (columns) can produce is removed: the least-squares fit at the pixels `x_px`.
     """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     basis = np.linalg.qr(by_prior.reshape(2 * len(x_px), -1))[0]
@@ -160,8 +163,8 @@ def displacements(
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
     """Return the likeliest size (image widths) of the distortion that one camera's model cannot express.
 
-    The method is MacKay's fixed-point iteration. `likeliest` and `covariance` of the e polynomial coefficients were
-    estimated under a prior of size `std`.
+    The size is the prior standard deviation of the e polynomial coefficients. The method is MacKay's fixed-point
+    iteration. `likeliest` and `covariance` of the coefficients were estimated under a prior of size `std`.
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
@@ -184,7 +187,8 @@ def expressed(
 ) -> Float[ndarray, "q e"]:
     """Return the change of q intrinsics along `directions` that best fits each of e polynomials at the pixels `x_px`.
 
-    The polynomials describe distortion outside the camera model and have a coefficient of one image width.
+    The polynomials describe distortion outside the camera model and have a coefficient of one image width. The q rows
+    are in the order of camera.parameters. Best is the least sum of squares.
     """
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
     rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
@@ -198,7 +202,8 @@ def second_moment_px2(
 ) -> Float[ndarray, "*points 2 2"]:
     """Return the second moment (px²) at pixels of the distortion `left` that the model cannot express.
 
-    This squared mean plus covariance is the expected squared error of a projection that uses the intrinsics alone.
+    This squared mean plus covariance is the expected squared error of a projection that uses the intrinsics alone; rows
+    and columns are x, y.
     """
     flat = x_px.reshape(-1, 2)
     by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
@@ -209,8 +214,8 @@ def second_moment_px2(
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
     """Return the displacements (px) of k pixels by e polynomials with a coefficient of one image width.
 
-    The polynomials are products of Legendre polynomials in both coordinates; the first half displaces along x, the
-    second half along y.
+    The polynomials are products of Legendre polynomials in both pixel coordinates, of total degree ≤ DEGREE. The first
+    half displaces along x, the second half along y.
     """
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
@@ -227,7 +232,8 @@ def joint_covariance(
 ) -> JointCovariance:
     """Return the joint covariance of gripper_from_camera, scale and the q intrinsics from its blocks.
 
-    `covariance` is that of transform and scale, `of_camera` that of the intrinsics, `cross` their cross-covariance.
+    `covariance` is that of transform and log scale (COVARIANCE_ORDER), `of_camera` that of the intrinsics
+    (camera.parameters), `cross` their cross-covariance. `camera` gives the names of the intrinsics.
     """
     together = np.block([[covariance, cross], [cross.T, of_camera]])
     return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))

@@ -65,9 +65,10 @@ class Region:
 
     @staticmethod
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
-        """Return the fit for residuals with the derivative `by_unknown` (s,u) by X and Z.
+        """Return the fit for residuals with the derivative `by_unknown` (s,u) by X and Z of each arm.
 
-        `unknowns` is the number of all unknowns of the problem, with the scale and cameras.
+        The s = 6n rows are m, then rad, pose by pose. `unknowns` is the number of all unknowns of the problem, with the
+        scale and cameras.
         """
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
@@ -76,7 +77,7 @@ class Region:
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
 
-        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error, J the derivative
+        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error (`fit`), J the derivative
         `by_unknown`.
         """
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
@@ -84,11 +85,11 @@ class Region:
         return half - (half @ self.fit.T) @ self.by_unknown.T
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
-        """Return the covariance of all p unknowns that is due to the choice of the m poses.
+        """Return the covariance of all p unknowns that is due to the choice of the m poses; 0 except for X and Z.
 
         The poses are a sample of the workspace; other poses would give another effective transform. `second_moment` is
-        E[e'e'ᵀ] (m,6,6) of the error e' of each pose that X and Z do not absorb. It is corrected for each pose's
-        leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
+        E[e'e'ᵀ] (m,6,6) of the error e' of each pose that X and Z do not absorb (m, then rad). It is corrected for each
+        pose's leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
         """
         m, u = second_moment.shape[-3], self.by_unknown.shape[1]
         own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
@@ -120,7 +121,7 @@ def predicted_gripper_poses(
 ) -> Float[ndarray, "*batch n 4 4"]:
     """Return predicted base_from_gripper (...,n,4,4): Z · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z).
 
-    X is gripper_from_camera, Z base_from_recon; S_λ multiplies translations by the scale λ.
+    X is gripper_from_camera, Z base_from_recon; S_λ multiplies translations by the scale λ (metres per recon unit).
     """
     scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
     return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
@@ -136,6 +137,7 @@ def pose_residuals(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
     """Return steps (m, rad; base axes) from reported to predicted gripper poses, and derivatives by X, log scale, Z.
 
+    Six components of a step are translation, then rotation vector; the 13 columns are steps of X (6), log scale, Z (6).
     X is gripper_from_camera, Z is base_from_recon. `exchanged`: the camera is fixed and the gripper carries the scene.
     X is then base_from_camera, Z is gripper_from_recon, and the predicted gripper_from_base is inverted before it is
     compared.
@@ -164,8 +166,8 @@ def pose_by_pose(blocks: Float[ndarray, "n 6 6"], matrix: Float[ndarray, "r c"])
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
     """Return the diagonal information matrix of a weak prior (PRIOR_STD) on each arm's X and on log scale; zero for Z.
 
-    X is gripper_from_camera, Z base_from_recon. The u = 12 · arms + 1 unknowns are X (6), log scale and Z (6) of the
-    first arm, then X and Z of further arms.
+    X is gripper_from_camera, Z base_from_recon. The u = 12 · arms + 1 unknowns are X, log scale and Z of the first arm,
+    then X and Z of further arms. X and Z have six each: translation (m), then rotation (rad).
     """
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
@@ -175,9 +177,9 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Return the largest factor ≤ 1 with which a step's rotations and log scale are at most LARGEST_ROTATION.
+    """Return the largest factor ≤ 1 that keeps a step's rotations and log scale within ±LARGEST_ROTATION.
 
-    `step` (u,) has the order of `weak_prior`.
+    `step` (u,) has the order of `weak_prior`; the limit applies to each component times the factor.
     """
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
@@ -185,9 +187,9 @@ def share_within_limits(step: Float[ndarray, " u"]) -> float:
 
 
 def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
-    """Return the covariance (7,7) of gripper_from_camera X and log scale with the weak prior.
+    """Return the covariance (7,7) of gripper_from_camera X (m, rad) and log scale with the prior `weak_prior`.
 
-    `hessian` (13,13) is the information matrix of X, log scale and base_from_recon without a prior.
+    `hessian` (13,13) is the information matrix of X (6), log scale and base_from_recon (6) without a prior.
     """
     return np.linalg.inv(hessian + weak_prior())[..., :7, :7]
 
@@ -199,10 +201,11 @@ def paper_residuals(
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:
-    """Return the paper's δ_t (m) and δ_R, mean norms of A·X − X·B(λ) over consecutive used images (eq. 16).
+    """Return the residuals δ_t (m) and δ_R of AX = XB: mean norms of A·X − X·B(λ) over consecutive used images.
 
-    A and B are the motions of gripper and camera between two images; X is gripper_from_camera, λ the scale. δ_R is the
-    Frobenius norm of the rotation part.
+    A and B are the motions of gripper and camera from one used image to the next; X is gripper_from_camera. B(λ) has
+    its translation multiplied by `scale`. δ_R is the Frobenius norm of the rotation part. The method paper defines them
+    in eq. 16.
     """
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)
@@ -223,7 +226,7 @@ class PoseEquations:
 
     @cached_property
     def equations(self) -> Equations:
-        """Equations of the used poses."""
+        """Equations of the used poses only, in the order of `every`."""
         return self.every if self.used.all() else self.every.of_poses(np.flatnonzero(self.used))
 
 
@@ -232,8 +235,9 @@ def reported_poses(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
     """Return the residuals of the n reported poses of all arms, and their derivatives.
 
-    Residuals are steps (m, rad; base axes) from reported to predicted poses. The derivatives are by the u unknowns of
-    the arms (X, log scale and Z), and by a step of the rig (camera pose) that belongs to each pose.
+    Poses are arm after arm. Residuals are steps (m, then rad; base axes) from reported to predicted poses. The first
+    derivatives are by the u unknowns of the arms (X, log scale and Z, as in `weak_prior`). The second are by a step of
+    the rig (camera pose) that belongs to each pose.
     """
     each, begin = [], 0
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
@@ -260,7 +264,9 @@ def reported_poses(
 def pose_equations(problem: Problem, state: State, images: ImageEvidence | None) -> PoseEquations:
     """Return the equations of the reported poses about a state, after the rigs (camera poses) are integrated out.
 
-    The distribution of the rigs is that of `images`; None: that of `Problem.known_rigs`.
+    The distribution of the rigs is that of `images`; None: that of `Problem.known_rigs`. Unknowns are those of the
+    arms, then the columns `Problem.free`. Prior information includes the weak prior, the linear priors and that of
+    `images`.
     """
     residual, by_arms, by_rig = reported_poses(problem, state)
     n, arms, free = len(residual), problem.arm_unknowns, problem.free
@@ -329,8 +335,8 @@ def fit_known_scale(
 ) -> Fit:
     """Return the least-squares fit of X and Z from the initial estimate `start` (X, Z), for camera poses in metres.
 
-    `noise` (m, rad) weighs the residuals; `exchanged` is that of `pose_residuals`. Directions that the motions do not
-    determine stay as in `start`.
+    The inverse of `noise` (m, rad) weighs position and rotation residuals; `exchanged` is that of `pose_residuals`.
+    Directions that the motions do not determine stay as in `start`.
     """
     weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
 

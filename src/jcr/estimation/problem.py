@@ -42,9 +42,10 @@ UNKNOWNS = 13
 
 
 def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
-    """Return the 12 columns of an arm's X (gripper_from_camera) and Z (base_from_recon) among the unknowns.
+    """Return the 12 columns of an arm's X (gripper_from_camera) and Z (base_from_world) among the unknowns.
 
-    `arm` counts from 0; column 6 is the log scale, which all arms share.
+    X and Z have six columns each: translation, then rotation. `arm` counts from 0; column 6 is the log scale, which all
+    arms share.
     """
     first = 12 * arm
     return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)
@@ -107,14 +108,17 @@ class LinearPrior(NamedTuple):
 
 
 def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
-    """Return the prior that the scale is `metres_per_unit` with the relative standard deviation `std`."""
+    """Return the prior that the scale is `metres_per_unit` with the relative standard deviation `std`.
+
+    It is for a problem of one arm with exact cameras, which has UNKNOWNS unknowns.
+    """
     return LinearPrior(np.eye(UNKNOWNS)[6], float(np.log(metres_per_unit)), std)
 
 
 def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> LinearPrior:
     """Return the prior that the camera is at `metres` ± `std` (m) from the gripper's origin along a unit `axis`.
 
-    The axis is in the gripper frame.
+    The axis is in the gripper frame. The prior is for a problem of one arm with exact cameras (UNKNOWNS unknowns).
     """
     return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
 
@@ -200,7 +204,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> Columns:
-        """Layout of the unknowns of the image equations, which are steps of cameras, boards and rigs."""
+        """Layout of the d unknowns of the image equations: cameras, model errors, boards, mounts, rigs (6 each)."""
         boards = 0 if self.boards is None else len(self.boards.shape_std)
         mounts = [6 * camera.mount_free for camera in self.cameras]
         counts = [self.directions.shape[1], *self.model_error_counts, boards, *mounts]
@@ -212,7 +216,7 @@ class Problem:
 
     @cached_property
     def parameters_of(self) -> tuple[slice, ...]:
-        """Rows of `directions` for the intrinsics of each camera."""
+        """Slice of the rows of `directions` that are the intrinsics of each camera (camera.parameters)."""
         ends = np.cumsum([len(camera.directions) for camera in self.cameras]).tolist()
         return tuple(slice(a, b) for a, b in pairwise([0, *ends]))
 
@@ -220,8 +224,8 @@ class Problem:
     def directions(self) -> Float[ndarray, "r l"]:
         """Directions (columns) in which the parameters of cameras and images may differ from the means of their priors.
 
-        Rows: intrinsics of each camera; focal lengths of all images, then shears, x and y offsets (OF_IMAGE); s1 to s4
-        of the thin prism.
+        Rows: intrinsics of each camera (camera.parameters); focal lengths of all images, then shears, x and y offsets
+        (OF_IMAGE); s1 to s4 of the thin prism. Columns: directions of each camera's prior, then `freed`.
         """
         own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
         own = np.pad(own, ((0, OF_IMAGE * self.n_images + PRISM), (0, 0)))
@@ -229,14 +233,20 @@ class Problem:
 
     @cached_property
     def model_error_counts(self) -> list[int]:
-        """Number of distortion polynomials of each camera; 0 for exact intrinsics or too few observations."""
+        """Number of distortion polynomials of each camera.
+
+        It is 0 for exact intrinsics and for a camera with POLYNOMIALS observations or fewer, else POLYNOMIALS.
+        """
         counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
         seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
         return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
 
     @cached_property
     def layout(self) -> Layout:
-        """Groups, image cells and stated variances of the observations, from which the pixel noise is estimated."""
+        """Camera, group, image cell and stated variance of each observation, from which the pixel noise is estimated.
+
+        A group is the features of one camera, or all board corners.
+        """
         assert self.observations is not None
         observations, cameras = self.observations, len(self.cameras)
         camera, rig = observations.camera[observations.image], observations.rig[observations.image]
@@ -267,10 +277,10 @@ class Problem:
 
     @cached_property
     def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
-        """Four results about the rows of the image equations: sorting order, sorted points, sorted rigs, their index.
+        """Order, points and rigs of the r rows of the image equations after sorting by point and rig, and their index.
 
-        Before sorting, the rows are the observations, then two rows for each board corner; the order is by point, then
-        rig.
+        A row has two residuals. Before sorting, the rows are the observations, then two rows for each board corner; the
+        order holds their numbers before sorting.
         """
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
@@ -284,7 +294,10 @@ class Problem:
 
     @cached_property
     def displacements(self) -> Float[ndarray, "k 2 e"]:
-        """Derivatives (px) of each observation by the e coefficients of distortion polynomials (image widths)."""
+        """Derivatives (px) of each observation's predicted pixel by the e model error coefficients (image widths).
+
+        Model errors are polynomials of distortion, camera after camera; derivatives by those of other cameras are 0.
+        """
         assert self.observations is not None
         each = zip(self.cameras, self.parameters_of, self.model_error_counts, self.camera_rows, strict=True)
         x_px, columns = self.observations.x_px, [np.zeros((len(self.observations.x_px), 2, 0))]
@@ -301,7 +314,7 @@ class Problem:
 
     @cached_property
     def prism(self) -> Float[ndarray, "k 2 4"]:
-        """Derivatives (px) of each observation by the thin prism coefficients s1 to s4."""
+        """Derivatives (px) of each observation's pixel x and y by the thin prism coefficients s1 to s4 of OpenCV."""
         assert self.observations is not None
         out = np.zeros((len(self.observations.image), 2, PRISM))
         for camera, rows in zip(self.cameras, self.camera_rows, strict=True):
@@ -330,7 +343,7 @@ class Problem:
 
     @cached_property
     def free(self) -> Int[ndarray, " e"]:
-        """Columns that are unknowns: cameras, model errors, boards, mounts, and rigs that no arm moves."""
+        """Columns (of `columns`) that are unknowns: cameras, model errors, boards, mounts, rigs that no arm moves."""
         return np.setdiff1d(np.arange(self.columns.count), self.by_arm)
 
     @property
@@ -339,7 +352,10 @@ class Problem:
         return self.arm_unknowns + len(self.free)
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
-        """Return the prior standard deviations of the first l columns: cameras, model errors, boards."""
+        """Return the prior standard deviations of the first l columns: cameras, model errors, boards.
+
+        The sizes of the model errors are those of `state`.
+        """
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std
@@ -358,7 +374,11 @@ class Problem:
         )
 
     def coordinates(self, state: State) -> Float[ndarray, " p"]:
-        """Return the p values of linear priors: translation of the first X (m), log scale, camera steps; else 0."""
+        """Return the p coordinates for linear priors, in the order of the unknowns.
+
+        They are the translation of the first X (m), the log scale, and the steps of cameras, model errors and boards;
+        all others are 0.
+        """
         out = np.zeros(self.unknowns)
         out[:3], out[SCALE] = state.x[0][:3, 3], np.log(state.scale)
         steps = self.free[self.free < self.columns.boards.stop]
@@ -369,8 +389,9 @@ class Problem:
 def with_observations(problem: Problem, state: State, observations: Observations) -> tuple[Problem, State]:
     """Return the problem with the observations of all points that have two or more, and its initial state.
 
-    Observations are sorted by point and rig. Only the first observation of a point in an image is kept, and points are
-    numbered anew. Intrinsics start at the means of their priors.
+    `observations.point` are rows of `state.points_in_world`; points that are left out are removed from state and
+    boards. Observations are sorted by point and rig. Only the first observation of a point in an image is kept, and
+    points are numbered anew. Intrinsics and boards start at the means of their priors.
     """
     rig = observations.rig[observations.image]
     order = np.lexsort((observations.image, rig, observations.point))
@@ -421,8 +442,9 @@ def rows_of(
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
     """Return three vectors for the e parameters of a camera, its m images and the prism: rows, units, weak prior std.
 
-    Rows are those of `Problem.directions`. Units are fx and fy for the focal lengths, the image width for the principal
-    point, else 1. The standard deviations are in these units. `images` are the camera's images among `n_images`.
+    Rows are those of `Problem.directions`: q intrinsics; focal lengths, shears, x and y offsets of the m images; s1 to
+    s4. Units are fx and fy for the focal lengths, the image width for the principal point, else 1. The standard
+    deviations are in these units. `images` are the indices of the camera's images among all `n_images`.
     """
     intrinsics, own, end = (
         problem.cameras[camera].intrinsics,
@@ -447,8 +469,9 @@ def freed(
 ) -> Problem:
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
-    `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. `images` are the
-    numbers of the camera's m images among all `n_images`.
+    `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. The intrinsics part
+    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images` are the indices of
+    the camera's m images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -474,7 +497,7 @@ OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacement
 
 
 def with_free(problem: Problem, **changes: Any) -> Problem:
-    """Return the problem with other priors or other free directions of the cameras (`freed`, `freed_std`) as `changes`.
+    """Return the problem with `changes` of its fields: `priors`, or free directions of cameras (`freed`, `freed_std`).
 
     The cached properties OF_OBSERVATIONS are kept, although `displacements` would change a little with the directions.
     """
@@ -485,9 +508,9 @@ def with_free(problem: Problem, **changes: Any) -> Problem:
 
 
 def transferred(problem: Problem, state: State, other: Problem) -> State:
-    """Return the state converted to the problem `other`, which has the same rigs and the same points or fewer.
+    """Return a state of `problem`, converted to the problem `other` with the same rigs and the same points or fewer.
 
-    Camera parameters keep their values as far as the free directions of `other` allow.
+    Camera parameters keep their values as far as the free directions of `other` allow. Poses and error sizes stay.
     """
     before, after = problem.columns, other.columns
     off, along = problem.displacement(state), np.zeros(after.boards.stop)
@@ -516,7 +539,8 @@ def stepped(
     """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
 
     `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
-    arms; `columns` (d,) has the order of `Problem.columns`. None: no step. Points do not move.
+    arms; `columns` (d,) has the order of `Problem.columns`. Six numbers of a transform are translation, then rotation
+    (rad), as in geometry.retract. None: no step. Points do not move.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -539,7 +563,7 @@ def stepped(
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
     """Return the state after a step of all p unknowns: X, log scale and Z of the arms, then the columns `Problem.free`.
 
-    Points and the rigs that arms move stay.
+    Steps are those of `stepped`. Points and the rigs that arms move stay.
     """
     columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
     columns[problem.free] = step[arms:]
@@ -549,7 +573,10 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
 def step_to(
     problem: Problem, state: State, other: State
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
-    """Return the steps of the arms' unknowns and of `Problem.columns` by which `stepped` turns `state` into `other`."""
+    """Return the steps of the arms' unknowns and of `Problem.columns` by which `stepped` turns `state` into `other`.
+
+    Steps of points and of error sizes are not included.
+    """
     own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
     arms = np.zeros(problem.arm_unknowns)
     arms[SCALE] = np.log(other.scale / state.scale)
@@ -565,7 +592,11 @@ def step_to(
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
-    """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation."""
+    """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation.
+
+    The seven columns are 1, 3 and 3 numbers; scale and rotation are about the world's origin. The rows of each rig are
+    translation, then rotation (geometry.retract).
+    """
     position = world_from_rig[:, :3, 3]
     rigs = np.zeros((len(position), 6, 7))
     rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
@@ -584,7 +615,8 @@ def wrist_arm(
 ) -> ReportedPoses:
     """Return the reported poses of an arm with a wrist camera: pose i belongs to image (rig) i.
 
-    `error_covariance` (6n,6n) is the covariance of the systematic errors for a size of 1 rad; None: `smooth_errors`.
+    `error_covariance` (6n,6n) is the covariance of the systematic errors for a size σ_s of 1 rad; None:
+    `smooth_errors`. Its rows are position (m), then rotation (rad), pose by pose, in base axes.
     """
     if error_covariance is None:
         error_covariance = smooth_errors(base_from_gripper)
@@ -605,8 +637,8 @@ def pose_problem(
     """Return the problem of reported gripper poses and given camera poses, without images, and its initial state.
 
     `start` is the initial (gripper_from_camera, scale, base_from_recon). `camera_covariance` (6n,6n) is of the steps of
-    the camera poses; None: exact. `error_covariance` is that of `wrist_arm`, `noise_floor` a lower bound (m, rad) on
-    the random errors.
+    the camera poses (geometry.retract; recon axes and unit, rad); None: exact. `error_covariance` is that of
+    `wrist_arm`, `noise_floor` a lower bound (m, rad) on the random errors. `priors` are linear priors on X and scale.
     """
     x, scale, z = start
     problem = Problem(
@@ -631,9 +663,10 @@ def wrist_problem(
 ) -> tuple[Problem, State]:
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
-    `arm` has one pose per image; None: images alone, without boards. `start` is the initial (gripper_from_camera,
-    scale, base_from_recon). `noise` is a lower bound on the random errors of the poses (m, rad). `combinations` are
-    additional free parameters of the camera, as in `freed`.
+    The world is the frame of the reconstruction, scaled by the initial scale. `arm` has one pose per image; None:
+    images alone, without boards. `start` is the initial (gripper_from_camera, scale, base_from_recon). `tracks` has
+    points and observations in the images of `recon_from_camera`. `noise` is a lower bound on the random errors of the
+    poses (m, rad). `combinations` are additional free parameters of the camera, as in `freed`.
     """
     x, scale, z = start
     arms, n = () if arm is None else (arm,), len(recon_from_camera)

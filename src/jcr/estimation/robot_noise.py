@@ -31,10 +31,11 @@ LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of the errors (m, rad; base axes) of n poses that vary smoothly from pose to pose.
+    """Return the covariance (6n,6n) of errors of n poses whose correlation decreases with the distance of the poses.
 
-    Standard deviations are 1 rad and REACH metres per axis. Half of the variance is constant in base axes, half in
-    gripper axes.
+    Rows are position (m), then rotation (rad), pose by pose, in base axes. Standard deviations are REACH metres and 1
+    rad per axis. The correlation is e^(−1/2) at the distance ALIKE. Half of the variance is constant in base axes, half
+    in gripper axes.
     """
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
@@ -48,9 +49,10 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
 
 
 def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
-    """Return the covariance (6n,6n) of pose errors (m, rad; base axes) by errors of an arm's joint offsets and links.
+    """Return the covariance (6n,6n) of the errors of n poses that an arm's joint offsets and link errors cause.
 
-    Joint offsets have 1 rad standard deviation, link errors LINK_PER_JOINT metres; `joints` (n,dof) are angles in rad.
+    Rows are position (m), then rotation (rad), pose by pose, in base axes. Joint offsets have 1 rad standard deviation,
+    link translations LINK_PER_JOINT metres, link rotations as in `error_std`. `joints` (n,dof) are angles in rad.
     """
     columns = error_jacobian(arm, joints) * error_std(arm, 1.0, LINK_PER_JOINT)
     stacked = columns.reshape(-1, columns.shape[2])
@@ -160,7 +162,7 @@ class Equations:
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), sizes of camera errors.
+        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), squared camera error sizes.
 
         The random variances are σ_t² and σ_r² plus the squares of `least`.
         """
@@ -169,9 +171,9 @@ class Equations:
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
-        """Return log σ_t, log σ_r and log σ_s of a noise record: the inverse of `noise`.
+        """Return log σ_t, log σ_r and log σ_s of a noise record: the inverse of the method `noise`.
 
-        Each σ is at least LEAST_BESIDE times the bound `least`.
+        The squared bounds `least` are subtracted. Each σ is at least LEAST_BESIDE times its bound.
         """
         squared = np.square([noise.translation, noise.rotation]) - self.least**2
         beside = np.sqrt(np.maximum(squared, (LEAST_BESIDE * self.least) ** 2))
@@ -183,7 +185,7 @@ class Equations:
         return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
     def noise(self, log_sizes: LogSizes) -> RobotNoise:
-        """Return the record of robot errors (random and systematic; m, rad) for these log sizes."""
+        """Return the record of robot errors (random and systematic; m, rad) for one vector of c log sizes."""
         metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
         left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
@@ -197,7 +199,10 @@ class Equations:
         )
 
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
-        """Return the covariance V (s,s) of the residuals (m, rad) for one vector of c log sizes, or k of them."""
+        """Return the covariance V (s,s) of the residuals (m, rad) for one vector of c log sizes, or k of them.
+
+        V is the sum of the random part, the systematic part, camera pose errors and confirmed effects.
+        """
         covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
         variances = self.variances(log_sizes)[..., 2:]
         for k, part in enumerate((self.systematic, *self.camera_errors)):
@@ -235,7 +240,7 @@ class LinearSolution:
 
     @property
     def covariance(self) -> Float[ndarray, "*k p p"]:
-        """Covariance C of the unknowns."""
+        """Covariance C = (JᵀV⁻¹J + prior information)⁻¹ of the p unknowns, for each choice of the error sizes."""
         return over(self.information_root, np.eye(self.step.shape[-1]))
 
     @cached_property
@@ -259,7 +264,8 @@ Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
     """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions.
 
-    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and sizes of camera errors.
+    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and one size for each of
+    `equations.camera_errors`.
     """
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
@@ -287,8 +293,9 @@ def left_out(
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
     """Return the residual of each of m poses from a fit without that pose, and its covariance.
 
-    They are P_ii⁻¹ (P r)_i and P_ii⁻¹ for the block i of a pose, with P = `solution.projection` and the residuals r.
-    `noise` (m, rad) scales the matrices before they are inverted.
+    The six components are position (m), then rotation (rad), in base axes. The results are P_ii⁻¹ (P r)_i and P_ii⁻¹
+    for the block i of a pose, with P = `solution.projection` and the residuals r. `noise` (m, rad) scales the matrices
+    before they are inverted, for numerical accuracy.
     """
     sigma, m = np.repeat(noise, 3), len(solution.root) // 6
     own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
@@ -304,10 +311,10 @@ def most_likely(
 ) -> tuple[LogSizes, Information]:
     """Return the logarithms of the c error sizes at the mode of their posterior, and expected information (c,c) there.
 
-    The search begins at `start` (None: mode of the prior) and ends with a step below `settled`. If there are more than
-    TOO_MANY poses, TOO_MANY of them are used, evenly spaced. Fisher scoring is corrected by the curvature along the
-    last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006, eq. 6.19), because steps oscillate where the
-    expected information is half of the curvature.
+    Sizes are in the order of `LogSizes`. The search begins at `start` (None: mode of the prior) and ends with a step
+    below `settled`. If there are more than TOO_MANY poses, TOO_MANY of them are used, evenly spaced. Fisher scoring is
+    corrected by the curvature along the last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006, eq. 6.19),
+    because steps oscillate where the expected information is half of the curvature.
     """
     if (poses := len(equations.residual) // 6) > TOO_MANY:
         some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
@@ -337,7 +344,7 @@ def most_likely(
 
 
 def log_evidence(equations: Equations, at_mode: LinearSolution, information: Information) -> float:
-    """Return the log marginal density of the s residuals, times (2π)^(s/2), by Laplace's method.
+    """Return the natural logarithm of (2π)^(s/2) times the marginal density of the s residuals, by Laplace's method.
 
     Unknowns and sizes are integrated out. `at_mode` is the solution at the mode of the log sizes, `information` their
     expected information there.
@@ -354,11 +361,12 @@ def over_sizes(
     information: Information,
     density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
 ) -> Weighed:
-    """Return a grid of log sizes about their mode with posterior weights and solutions, in groups.
+    """Return a grid of log sizes about their mode: groups of posterior weights, log sizes and solutions.
 
-    `density` returns the log posterior of the sizes of a solution, up to a constant; `information` is that of
-    `most_likely`. Grid axes are eigenvectors of the information, with a step length for each direction, because the
-    posterior is skewed: sizes have longer tails on one side.
+    All weights together sum to 1. `density` returns the log posterior of the sizes of a solution, up to a constant;
+    `information` is that of `most_likely`. Grid axes are eigenvectors of the information. Each side of an axis has its
+    own step length, because the posterior is skewed: sizes have longer tails on one side. With more than TOO_MANY poses
+    the mode is the only grid point.
     """
     poses = len(equations.residual) // 6
     sizes, log_volumes = mode[None], np.zeros(1)
@@ -383,7 +391,10 @@ def over_sizes(
 
 
 def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Information]:
-    """Return the log posterior of the logarithms of c error sizes, its gradient (c,), and expected information (c,c)."""
+    """Return the log posterior of c log error sizes (up to a constant), gradient (c,) and expected information (c,c).
+
+    `log_sizes` (c,) has the order of `LogSizes`; derivatives are by the log sizes.
+    """
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
     masks = np.stack([equations.of_position, 1 - equations.of_position])

@@ -141,12 +141,18 @@ class Solution:
 
     @cached_property
     def log_evidence(self) -> float:
-        """Log evidence of m used poses: density of the residuals times (2π)^(3m), unknowns and sizes integrated out."""
+        """Natural logarithm of (2π)^(3m) times the marginal density of the 6m residuals of m used poses.
+
+        Unknowns and error sizes are integrated out.
+        """
         return log_evidence(self.equations, self.at_mode, self.size_information)
 
     @cached_property
     def leave_one_out(self) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-        """Residual of each of n poses from the fit to the others (m, rad; base axes), and its covariance."""
+        """Residual of each of n reported poses from the fit to the other used poses, and its covariance.
+
+        A residual is the step from the reported to the predicted pose: position (m), then rotation (rad); base axes.
+        """
         used, every, noise, solution = self.poses.used, self.poses.every, self.noise, self.at_mode
         random, n = (noise.translation, noise.rotation), len(used)
         found, covariance = every.residual.reshape(n, 6).copy(), np.empty((n, 6, 6))
@@ -171,18 +177,27 @@ class Solution:
         return slice(first + columns.start, first + columns.stop)
 
     def intrinsics_covariance(self, camera: int) -> Float[ndarray, "q q"]:
-        """Return the covariance of a camera's q intrinsics, in the order of camera.parameters."""
+        """Return the covariance of the q intrinsics of one camera, in the order of camera.parameters.
+
+        `camera` is its index in the problem; focal lengths and principal point are in px.
+        """
         own = self.camera_unknowns(self.problem.columns.cameras)
         directions = self.problem.directions[self.problem.parameters_of[camera]]
         return directions @ self.covariance[own, own] @ directions.T
 
     def transform(self, of: Callable[[State], Transform]) -> tuple[Transform, Float[ndarray, "6 6"]]:
-        """Return the transform `of(state)` at the estimate, and the covariance (6,6) of its step (geometry.retract)."""
+        """Return the transform `of(state)` at the estimate, and the covariance (6,6) of its step (geometry.retract).
+
+        The step is translation, then rotation vector (rad), in axes of the frame to which the transform maps.
+        """
         j = self.derivative(of)
         return of(self.state), j @ self.covariance @ j.T
 
     def derivative(self, of: Callable[[State], Transform]) -> Float[ndarray, "6 p"]:
-        """Return the derivative of the step of the transform `of(state)` by the p unknowns, by numerical differences."""
+        """Return the derivative of the step of the transform `of(state)` by the p unknowns, by numerical differences.
+
+        The six rows are translation, then rotation vector (rad), in axes of the frame to which the transform maps.
+        """
         found, cameras = of(self.state), self.problem.arm_unknowns
         size = TINY_STEP * np.ones(len(self.covariance))
         std = np.sqrt(np.diag(self.covariance))
@@ -204,9 +219,10 @@ def solve(
 ) -> Solution:
     """Solve a problem from an initial state; return the estimate with its covariance.
 
-    If `start` has an estimate of the pixel noise already, it is taken as near the solution. `averaged`: average over
-    the sizes of the robot's errors, else use their most likely values, which is faster and understates the uncertainty.
-    `start_noise` is the initial size of the random errors of the poses (m, rad).
+    If `start` has an estimate of the pixel noise already, it is taken as near the solution. Otherwise a bundle
+    adjustment with assumed robot errors precedes the rounds. `averaged`: average over the sizes of the robot's errors,
+    else use their most likely values, which is faster and understates the uncertainty. `start_noise` are these assumed
+    random errors of the poses (m, rad), unless the problem has a lower bound.
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)
@@ -234,9 +250,9 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
 ) -> Solution:
     """Return the bundle adjustment of a wrist camera's images together with the reported poses.
 
-    Arguments are those of `wrist_problem` and `solve`. `arm` may be poses, with the systematic errors `smooth_errors`;
-    `camera` may be intrinsics, which are then exact. The iteration begins at `near`, a solution for the same poses and
-    the same or more points; None: at `start`.
+    Arguments are those of `wrist_problem` and `solve`. `arm` may be base_from_gripper of each image, with the
+    systematic errors `smooth_errors`; `camera` may be intrinsics, which are then exact. The iteration begins at `near`,
+    a solution for the same poses and the same or more points; None: at `start`.
     """
     arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
     if isinstance(camera, Intrinsics):
@@ -250,7 +266,10 @@ def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
 
 
 def uncertainty_of(found: Solution) -> Uncertainty:
-    """Return the uncertainty of the first arm's X (gripper_from_camera), the scale and the first camera's intrinsics."""
+    """Return the uncertainty of the first arm's X (gripper_from_camera), the scale and the first camera's intrinsics.
+
+    It includes the budget by cause, and the model error where it was estimated; `found` is the solution.
+    """
     problem, observations, model_error = found.problem, found.problem.observations, None
     known, directions = problem.intrinsics(found.state)[0], problem.directions[problem.parameters_of[0]]
     own, cameras = problem.columns.model_error[0], found.camera_unknowns(problem.columns.cameras)
@@ -288,13 +307,19 @@ def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
 
 
 def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
-    """Return the solution with `priors` in place of its linear priors; the images are not adjusted again."""
+    """Return the solution with `priors` in place of its linear priors on X, scale and cameras.
+
+    The arms' unknowns, error sizes and covariance are estimated anew; the images are not adjusted again.
+    """
     problem = with_free(solution.problem, priors=tuple(priors))
     return with_covariance(problem, solution.most_likely, solution.evidence, True)
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
-    """Return log(estimated size / stated size) of the boards, and its derivative by the p unknowns of the solution."""
+    """Return log(estimated size / stated size) of the boards, and its derivative by the p unknowns of the solution.
+
+    All boards share the size. The logarithm is natural; the problem must have boards.
+    """
     problem, column = solution.problem, solution.problem.columns.boards.start
     assert problem.boards is not None
     by_unknown = np.zeros(problem.unknowns)
@@ -304,7 +329,7 @@ def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
 
 
 def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
-    """Estimate error sizes and step all unknowns, in rounds until both converge.
+    """Estimate error sizes and step all unknowns, in at most ROUNDS rounds until both converge.
 
     Return the state, the evidence of the images, whether the rounds converged, their number, and the largest last step
     of an arm's unknown in standard deviations.
@@ -360,6 +385,7 @@ def _joint_step(
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
     """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
 
+    `equations` are those of the reported poses about `images.state`, `log_sizes` the log sizes of the robot's errors.
     The columns (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the
     columns `Problem.free`.
     """
@@ -380,8 +406,9 @@ def _accelerated(
 ) -> Float[ndarray, " n"]:
     """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
 
-    `ends` and `steps` hold for each round the coordinates at its end and its step, n numbers. The combination of rounds
-    minimises the step of the p coordinates `judged` (their numbers), in units of their `std`; the others follow.
+    `ends` and `steps` hold for each round the n coordinates (`_coordinates`) at its end, and its step. The combination
+    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`. All n
+    coordinates are combined by the same factors.
     """
     if len(steps) == 1:
         return ends[-1]
@@ -402,8 +429,9 @@ def with_covariance(
 ) -> Solution:
     """Return the solution with its covariance, from a state near the solution and the evidence of the images.
 
-    `images` None: camera poses are given. `averaged` is that of `solve`. `expected` is the assumed robot noise of a
-    predicted solution, whose residuals are 0; None: the noise is estimated.
+    The arms' unknowns and error sizes are first iterated to convergence. `images` None: camera poses are given.
+    `averaged` is that of `solve`. `expected` is the assumed robot noise of a predicted solution, whose residuals are 0
+    and whose state is not iterated; None: the noise is estimated.
     """
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
@@ -453,7 +481,8 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
     """Return the information of the reported poses about the rigs (camera poses), with X, scale and Z eliminated.
 
-    `root` is the lower Cholesky factor of the covariance of the pose errors.
+    `root` (6n,6n) is the lower Cholesky factor of the covariance of the n poses' errors. Reference poses are the rigs
+    of `state`. Information along the seven similarities of the world is added.
     """
     residual, jacobian, by_rig = reported_poses(problem, state)
     jacobian = jacobian.reshape(len(root), -1)
@@ -471,7 +500,10 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`."""
+    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`.
+
+    Steps are those of `step_to`.
+    """
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 
