@@ -35,9 +35,10 @@ def extend(
 ) -> Reconstruction:
     """Return the reconstruction with the images of `added` (oldest first), their depth, and camera poses by the robot.
 
+    A camera pose is the added image's `base_from_gripper` times `gripper_from_camera`, converted to the recon frame.
     The added images are the last rows; their `image_index` counts from `capture_size`, the number of images of the
-    capture. Pixels of an earlier image that a later image contradicts get confidence 0. Raises InputError for an added
-    image that gets too little depth.
+    capture. Pixels get confidence 0 if a later added image sees through their points, or shows a surface in front of
+    them. Raises InputError for an added image with depth at less than 0.5 % of its pixels.
     """
     dense, old, new = reconstruction.dense, len(reconstruction.recon_from_camera), len(added)
     pinhole = dense.intrinsics
@@ -83,7 +84,8 @@ def extend(
 def _joined(dense: Pointmaps, found: Pointmaps, colors: UInt8[ndarray, "m h w 3"]) -> Pointmaps:
     """Return the pointmaps `dense` followed by the pointmaps `found` of later images; `colors` are those of all images.
 
-    The confidences of `found` are multiplied so that their median is that of `dense`.
+    The confidences of `found` are multiplied by one factor, so that their median over pixels with depth is that of
+    `dense`. The result has no `depth_std` if `dense` has none.
     """
     assert found.reason is not None and found.depth_std is not None
     known, unit = dense.confidence > 0, 1.0
@@ -109,9 +111,12 @@ def _contradicted(
     later: int,
     pinhole: Intrinsics,
 ) -> Bool[ndarray, "h w"]:
-    """Return which pixels of image `earlier` have a depth that image `later` contradicts; `known` marks depths.
+    """Return the mask of pixels of image `earlier` whose depth image `later` contradicts.
 
-    The later image shows a surface behind the earlier point, or has points in front of the earlier surface.
+    `earlier` and `later` are image indices; all images are on the pixel grid of `pinhole`. `known` marks pixels with
+    depth. The later image contradicts a point if its surface, within two pixels of the projection, is 1.5 % or more
+    behind (depth z). The later image also contradicts a pixel if two of its points project within one pixel and are
+    that much in front.
     """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
@@ -137,7 +142,10 @@ def _contradicted(
 def _pixels(
     x_in_camera: Float[ndarray, "n 3"], pinhole: Intrinsics
 ) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
-    """Return each point's nearest pixel u and v, its depth, and whether it lies in the image; outside, u = v = 0."""
+    """Return for n points the nearest pixel's u and v, the depth z, and a mask of points that project into the image.
+
+    The image is that of `pinhole`. All four arrays have shape (n,); u and v are integers, and 0 for points outside.
+    """
     z = x_in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = np.round(project(pinhole, x_in_camera)).T
@@ -148,7 +156,11 @@ def _pixels(
 def _with_projections(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], first: int, pinhole: Intrinsics
 ) -> Tracks:
-    """Return the tracks with the projections of all points into the images from row `first` on as more observations."""
+    """Return the tracks with the projections of all points into the images from index `first` on as more observations.
+
+    Each projection is the nearest pixel on the grid of `pinhole`. Points outside of an image are left out; points that
+    are hidden by others are not.
+    """
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row in range(first, len(recon_from_camera)):
         u, v, _, inside = _pixels(apply(inverse(recon_from_camera[row]), tracks.points_in_recon), pinhole)

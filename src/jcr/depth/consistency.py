@@ -23,10 +23,10 @@ error."""
 def inverse_depth_evidence(
     inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
 ) -> Float[ndarray, "m h _"]:
-    """Return inverse depth with a code in its sign: 0 where it is not `known`, negative where `sees` is false.
+    """Return inverse depth 1/z with a code in its sign: 0 where it is not `known`, negative where `sees` is false.
 
-    Such maps are the input of `agreement`. A pixel of `sees` may contradict depths of other images. The rows are padded
-    with zeros to a multiple of LANES.
+    Such maps are the input of `agreement`. A pixel of `sees` may contradict depths of other images. The image width w
+    is padded with zeros to a multiple of LANES (16).
     """
     maps = np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0).astype(np.float32, copy=False)
     return np.pad(maps, [(0, 0), (0, 0), (0, -maps.shape[2] % LANES)])
@@ -37,12 +37,15 @@ def inverse_depth_evidence(
 def agreement(i, compared, others, a, b, centre, k, width, tolerance):
     """Compare the depth of each pixel of image i with the depths of the images `others`; return four maps (4,h,w).
 
-    The maps are the mean inverse depth over image i and the images that agree, the number of images that agree, the
-    number of images that see through the point, and Σ |∂x/∂(inverse depth)|² (px²) over the pixels x in the images that
-    agree. `compared` comes from `inverse_depth_evidence`, and `width` is the images' width before padding. With the
-    rotation R and translation t from image i to another image and intrinsics K, `a` (n,3,3) is K R and `b` (n,3) is K
-    t; `centre` (n) is the z coordinate of the other camera in image i; `k` is fx, fy, cx, cy; `tolerance` is the
-    largest relative difference of depths that agree.
+    Map 0 is the mean inverse depth over image i and the images that agree, converted to image i. Maps 1 and 2 are the
+    numbers of images that agree, and that see a surface more than 1 % behind the point. Map 3 is the sum over the
+    agreeing images of |∂x/∂(inverse depth)|², x being the point's pixel there. Their depth is interpolated bilinearly,
+    or is that of the nearest pixel if one of the four has none.
+
+    `compared` (m,h,w padded) comes from `inverse_depth_evidence`; `width` is the images' width before padding. `others`
+    (n) are image indices. R and t transform points of camera i to another camera, and K are the intrinsics. `a` (n,3,3)
+    is K R and `b` (n,3) is K t; `centre` (n) is the z coordinate of the other camera's centre in camera i. `k` is fx,
+    fy, cx, cy; `tolerance` is the largest relative difference of inverse depths that agree.
     """
     _, h, w = compared.shape
     one, tolerance = np.float32(1), np.float32(tolerance)
@@ -62,10 +65,12 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tolerance):
     """Count for each pixel of image i the images that show its point in the same colour, in another, or see through it.
 
-    The three counts are (3,h,w). `asked` (h,w) is the inverse depth to test at each pixel, 0 for none. `inverse_depth`
-    (m,h,w) is the matched inverse depth of all images, 0 for none, and `colors` (m,h,w,3) are their colours. An image
-    with a nearer matched depth at a point does not see the point and is not counted. `tolerance` is the least
-    difference of colours that are not the same. `others`, `a`, `b`, `centre` and `k` are as in `agreement`.
+    The result (3,h,w) has the three counts in this order. `asked` (h,w) is the inverse depth 1/z to test at each pixel,
+    0 for none. `inverse_depth` (m,h,w) is the matched inverse depth of all images, 0 for none. `colors` (m,h,w,3) are
+    their RGB colours (0 to 1). Both are read at the nearest pixel. An image sees through the point if its matched depth
+    is more than 1 % behind. An image whose matched depth is more than 1 % in front is not counted; one without depth is
+    taken to see the point. Colours are the same if their Euclidean distance is below `tolerance`. `others` are the
+    indices of the images to compare; their projections `a`, `b` and `k` are as in `agreement`. `centre` is not used.
     """
     h, w = asked.shape
     half, most = np.float32(0.5), np.float32(tolerance * tolerance)
@@ -100,8 +105,9 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
 def _row(v, n, a, b, k, width, height):
     """Return the coefficients that project the pixels of row v into the n-th other image; a, b, k as in `agreement`.
 
-    The first three elements (f, g, h) are for x, y and z of the homogeneous pixel f·(x of the ray) + g + h·(inverse
-    depth). The last element are the largest x and y in an image of `width` and `height`, cx and 1/fx.
+    The first three elements are (f, g, h) for x, y and z of the homogeneous pixel f·r + g + h·(inverse depth). Here r
+    is the x coordinate of the pixel's ray with z = 1. The last element is (largest x, largest y, cx, 1/fx) for images
+    of `width` times `height` pixels.
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]
@@ -115,7 +121,9 @@ def _row(v, n, a, b, k, width, height):
 def _compare_depths(typing, sums, compared, place, rays, rest):
     """Add to `sums`, the maps of `agreement`, the comparison of 16 pixels of image i with image j.
 
-    `place` is (i, j, v, u), with u the first column; `rays` comes from `_row`; `rest` is (centre, tolerance).
+    `typing` is numba's typing context, which is not used; `compared` is that of `agreement`. `place` is (i, j, v, u):
+    the two images, the row, and the first of the 16 columns. `rays` comes from `_row`; `rest` is (`centre` of image j,
+    `tolerance`).
     """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:

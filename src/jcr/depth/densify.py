@@ -29,10 +29,10 @@ def densify(
     options: DepthOptions | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Return the reconstruction with a depth for the pixels of its images (pointmaps), or unchanged where it has them.
+    """Return the reconstruction with pointmaps estimated from its images, or unchanged if it has pointmaps.
 
-    Only cameras, intrinsics and tracks are used, so that the stage may run before or after the calibration. Raises
-    InputError for an image that cannot be read.
+    Only the capture's images and the reconstruction's cameras, intrinsics and tracks are used. The stage may therefore
+    run before or after the calibration. Raises InputError for an image that cannot be read.
     """
     if reconstruction.pointmaps is not None:
         return reconstruction
@@ -69,7 +69,11 @@ def densify(
 def undistorted(
     folder: Path, names: Sequence[str], intrinsics: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "m h w 3"]:
-    """Read images of a camera with `intrinsics` from `folder`; return them undistorted, on the grid of `pinhole`."""
+    """Read the RGB images `names` in `folder`; return them without distortion, on the pixel grid of `pinhole`.
+
+    `intrinsics` are those of the files' images. Colours are interpolated bilinearly, and averaged over areas if
+    `pinhole` has fewer pixels.
+    """
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])
 
@@ -77,10 +81,11 @@ def undistorted(
 def choose_neighbours(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int
 ) -> list[Int[ndarray, " _"]]:
-    """Return for each image the rows of up to `count` other images to match with, best first.
+    """Return for each of m images the indices of `count` other images to match with, best first.
 
-    The score is the number of shared points, each weighted by the angle between its two rays. The weight is largest at
-    15°, as in MVSNet (Yao et al., ECCV 2018, section 4.1).
+    There are fewer only if m - 1 is less than `count`. The score is the sum, over shared points, of a weight that
+    depends on the angle between the two rays. The weight is largest at 15°, as in MVSNet (Yao et al., ECCV 2018,
+    section 4.1).
     """
     m = len(recon_from_camera)
     seen = np.zeros((m, len(tracks.points_in_recon)), dtype=bool)
@@ -100,10 +105,10 @@ def choose_neighbours(
 def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
     """Return for each image the farthest and nearest plane of its depth search, as vectors p with p·x_in_camera = 1.
 
-    The inverse depth of a pixel on plane p is p·(x/z, y/z, 1). Both planes have the slope of the plane fitted to the
-    image's points, mostly the table (least absolute deviations of inverse depth). Percentiles 1 to 99 of the points lie
-    between them, with some margin. Fronto-parallel planes gave 6 % fewer pixels a depth, and 1.6 times the median
-    error.
+    The inverse depth of a pixel on plane p is p·(x/z, y/z, 1). Both planes share the slope (p₀, p₁) of a plane fitted
+    to the image's track points, mostly the table. The fit uses least absolute deviations of inverse depth. Percentiles
+    1 to 99 of the points lie between the two planes, with a margin. The margin is 15 % of the interval plus 2 % of the
+    median inverse depth. Planes parallel to the image gave 6 % fewer pixels with depth, and 1.6 times the median error.
     """
     planes = np.empty((len(recon_from_camera), 2, 3))
     for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
@@ -132,12 +137,14 @@ def dense_pointmaps(
     priors: bool = True,
     before: Pointmaps | None = None,
 ) -> Pointmaps:
-    """Estimate pointmaps of undistorted images in the recon frame, with confidence, origin of the depth, and its error.
+    """Estimate pointmaps (recon frame) of m undistorted images, with confidence, origin of the depth, and its std.
 
-    The confidence is the correlation times the number of images that agree, 0 for no estimate. `neighbours` and
-    `planes` come from `choose_neighbours` and `sweep_planes`. With `priors`, fitted planes give depth where no match is
-    found. `before` are pointmaps of the first images, from an earlier time: only later images are matched, the scene
-    may have changed, and `priors` is ignored.
+    All images are on the pixel grid of `pinhole`; `neighbours` and `planes` come from `choose_neighbours` and
+    `sweep_planes`. The confidence of a match is its correlation times the number of images that agree, twice that on a
+    fitted plane. With `priors`, fitted planes give depth where no match is found, with confidence 0.5 per image that
+    agrees. The confidence is 0 without an estimate. `before` are pointmaps of the first images, from an earlier time.
+    With `before`, only later images are matched, the scene may have changed, and `priors` is ignored; the result has
+    all m images.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth
@@ -181,7 +188,8 @@ def pointmaps_of(
 ) -> Pointmaps:
     """Return pointmaps from the depths (z, recon units) of undistorted images with known camera poses.
 
-    `relative_std` is the standard deviation of a depth divided by the depth; `reason` is the origin of a depth.
+    All images are on the pixel grid of `pinhole`. `relative_std` is the standard deviation of a depth divided by the
+    depth. `reason` is the origin of a depth: NO_DEPTH, MATCHED, PRIOR or BOTH.
     """
     points, direction = np.empty((*depth.shape, 3)), rays(pinhole)
     for k, pose in enumerate(recon_from_camera):

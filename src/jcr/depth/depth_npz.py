@@ -33,9 +33,10 @@ class DepthHeader(BaseModel):
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write depth, confidence and standard deviation of a reconstruction's pointmaps to a file, whole or not at all.
+    """Write depth z, its std and origin, and confidence of a reconstruction's pointmaps to a file depth.npz.
 
-    `made_from` is the fingerprint of reconstruction and options that `is_made_from` compares.
+    After an error there is no incomplete file. `made_from` is the fingerprint of reconstruction and options that
+    `is_made_from` compares.
     """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
@@ -68,7 +69,8 @@ def is_made_from(path: Path, made_from: str) -> bool:
 def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | None) -> Pointmaps:
     """Read the pointmaps of a reconstruction, coloured by the images of the capture, or grey without a capture.
 
-    Raises InputError for a file that is damaged, of another version, or of other images.
+    The points are computed from the file's depths and the camera poses of `reconstruction`. Raises InputError for a
+    file that is damaged, of another version, or of other images.
     """
     with read_npz(path, FORMAT) as (text, file):
         pinhole = DepthHeader.model_validate_json(text, strict=True).intrinsics

@@ -57,10 +57,13 @@ def fused_depth(
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Return maps (m,h,w) of inverse depth, confidence, reason (origin of the depth) and relative standard deviation.
 
-    A matched depth needs two other images that agree (one, with fewer than three neighbours), and more than twice as
-    many as see through the point (not counted in `changing` scenes). Only pixels with enough agreeing images count as
-    seeing through. With `priors`, pixels without a match get the depth of a fitted plane where no image contradicts it.
-    `score` is the correlation of the matches. Confidence and standard deviation are 0 without depth.
+    `inverse_depth` (1/z) and `score` (correlation) are the matches of the images; `neighbours` are the indices of the
+    images to check each with. A matched depth needs a correlation of 0.3 and two other images that agree (one, with
+    fewer than three neighbours). Except in `changing` scenes, more than twice as many images must agree as see through
+    the point. Only pixels with enough agreeing images count as seeing through. With `priors`, pixels without a match
+    get the depth of a fitted plane where no image contradicts it. Confidence is that of `dense_pointmaps`; the reason
+    is NO_DEPTH, MATCHED, PRIOR or BOTH. Without depth, confidence and standard deviation are 0 and the inverse depth
+    has no meaning. `report` is called with the finished fraction.
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]
@@ -115,8 +118,9 @@ def _checked(
 ) -> list[ndarray]:
     """Return the four maps of `agreement` for all images, (m,h,w) each; `tolerance` is relative to the inverse depth.
 
-    The first map is the averaged inverse depth, and the given inverse depth `depth` where it is not `known`. `views`
-    are the projections between the images. Only pixels of `sees` can contradict the depth of other images.
+    `depth` is the inverse depth 1/z of each pixel, and `known` marks the pixels that have one. The first map is the
+    averaged inverse depth, and `depth` itself at other pixels. `views` are the projections of each image into its
+    neighbours (`relative`). Only pixels of `sees` can contradict the depth of other images.
     """
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
     found = pool.map(
@@ -135,7 +139,11 @@ def _priors(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
 ) -> list[ndarray]:
-    """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks."""
+    """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks.
+
+    The support plane that these need is fitted first, to `inverse_depth` (1/z) at the pixels of `matched`. `views` are
+    the projections of each image into its neighbours (`relative`).
+    """
     ray, x_in_recon = rays(pinhole), []
     for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
         some = np.flatnonzero(there)[::EVERY]
@@ -161,10 +169,10 @@ def _chosen(
     reasons: list[int],
     stds: list[Float[ndarray, "m h w"]],
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return the given inverse depth, and for each pixel the confidence, reason and standard deviation that apply.
+    """Return inverse depth (unchanged), confidence, reason and standard deviation of each pixel, chosen by masks.
 
-    They come from the lists' element at the first mask of `which` that is true at the pixel; without any they are 0,
-    NO_DEPTH and 0.
+    The elements of the four lists belong together. At each pixel, the first mask of `which` that is true selects
+    confidence, reason and standard deviation. These are 0, NO_DEPTH and 0 where no mask is true.
     """
     return (
         inverse_depth,

@@ -13,28 +13,36 @@ class Lanes:
     """Vector of numbers or conditions (one per lane) in a register, as the LLVM value that `builder` has emitted."""
 
     def __init__(self, builder: Any, value: Any) -> None:
-        """Wrap `value`, an LLVM value of a vector type."""
+        """Wrap `value`, an LLVM value of a vector type; `builder` is the LLVM IR builder that emits operations on it."""
         self.builder, self.value, self.count = builder, value, value.type.count
 
     @classmethod
     def constant(cls, builder: Any, numbers: Any, kind: Any = FLOAT) -> "Lanes":
-        """Return a vector of constants, one of the `numbers` per lane, of LLVM type `kind`."""
+        """Return a vector constant for the IR builder `builder`: one of the `numbers` per lane, of LLVM type `kind`."""
         return cls(builder, ir.Constant(ir.VectorType(kind, len(numbers)), [kind(n) for n in numbers]))
 
     @classmethod
     def repeated(cls, builder: Any, number: Any, count: int) -> "Lanes":
-        """Return a vector with the scalar `number` in all `count` lanes."""
+        """Return a vector that the IR builder `builder` emits, with the LLVM scalar `number` in all `count` lanes."""
         empty = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
         return cls(builder, builder.insert_element(empty, number, INT(0))).at([0] * count)
 
     @classmethod
     def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
-        """Load `count` consecutive numbers from memory, beginning at element `place` of the array `start`."""
+        """Load `count` consecutive numbers from memory, beginning at element `place` of the array `start`.
+
+        `builder` is the IR builder; `start` is an LLVM pointer, `place` an LLVM integer, and `kind` the LLVM type of
+        the numbers.
+        """
         there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any, used: int) -> "Lanes":
-        """Load 64 bits for each of the first `used` lanes, at `start` plus the lane's index; other lanes are 0."""
+        """Load 64 bits for each of the first `used` lanes; later lanes of the result are 0.
+
+        The lanes of this vector are indices of elements, counted from the LLVM pointer `start`, at which the 64 bits
+        begin.
+        """
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
         for lane in range(used):
             place = b.zext(b.extract_element(self.value, INT(lane)), LONG)
@@ -43,7 +51,7 @@ class Lanes:
         return Lanes(b, found)
 
     def _same(self, other: Any) -> Any:
-        """Return `other` as a vector like this one; a plain number is repeated in every lane."""
+        """Return the Python number `other` in every lane of a vector of this type; return a vector `other` unchanged."""
         kind = self.value.type.element
         return other if isinstance(other, Lanes) else Lanes.constant(self.builder, [other] * self.count, kind)
 
@@ -69,7 +77,10 @@ class Lanes:
         return (self < 0.0).choose(self * -1.0, self)
 
     def choose(self, yes: Any, no: Any) -> "Lanes":
-        """Return per lane `yes` where this vector of conditions is true, else `no`; numbers are repeated as floats."""
+        """Return per lane `yes` where this vector of conditions is true, else `no`.
+
+        Both are vectors or Python numbers; numbers are repeated in every lane as floats.
+        """
         zero = Lanes.constant(self.builder, [0.0] * self.count)
         return Lanes(
             self.builder, self.builder.select(self.value, zero._same(yes).value, zero._same(no).value)
@@ -85,7 +96,7 @@ class Lanes:
         return Lanes(self.builder, self.builder.sitofp(self.value, ir.VectorType(FLOAT, self.count)))
 
     def as_pairs(self, kind: Any = FLOAT) -> "tuple[Lanes, Lanes]":
-        """Split each 64-bit lane into its low and its high 32 bits, as two vectors."""
+        """Split each 64-bit lane into its low and its high 32 bits; return vectors (low, high) of 32-bit type `kind`."""
         pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(kind, 2 * self.count)))
         return pairs.at(range(0, 2 * self.count, 2)), pairs.at(range(1, 2 * self.count, 2))
 
@@ -100,11 +111,11 @@ class Lanes:
         return Lanes(self.builder, self.builder.call(root, [self.value]))
 
     def at(self, lanes: Any) -> "Lanes":
-        """Return the vector of the lanes at the constant indices `lanes`, in this order."""
+        """Return the vector of the lanes at the indices `lanes`, a sequence of Python integers, in this order."""
         chosen = Lanes.constant(self.builder, lanes, INT).value
         return Lanes(self.builder, self.builder.shuffle_vector(self.value, self.value, chosen))
 
     def write(self, start: Any, place: Any) -> None:
-        """Store the lanes to memory as consecutive floats, beginning at element `place` of the array `start`."""
+        """Store the lanes to memory as consecutive elements, from element `place` of the LLVM pointer `start` on."""
         there = self.builder.bitcast(self.builder.gep(start, [place]), self.value.type.as_pointer())
         self.builder.store(self.value, there, align=4)

@@ -40,7 +40,9 @@ def relative(
 ) -> Relative:
     """Return the motion from image i to the n images `others` in the form that the compiled loops read (`Relative`).
 
-    All images are on the pixel grid of `pinhole`.
+    The result is (`others`, K R (n,3,3), K t (n,3), z (n)). R and t (recon units) transform points of camera i to
+    another camera, and K is the matrix of `pinhole`. The last array is the z coordinate of the other camera's centre in
+    camera i. All images are on the pixel grid of `pinhole`.
     """
     motion = inverse(recon_from_camera[others]) @ recon_from_camera[i]
     a, b = pinhole.matrix @ motion[:, :3, :3], motion[:, :3, 3] @ pinhole.matrix.T
@@ -71,8 +73,9 @@ class _Level:
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
         """Return the arguments `packed`, `motions`, `windows` and `k` of patch_match.py to match image i with `others`.
 
-        They are the greys of the other images, the projections into them, the windows of image i, which are written to
-        the buffer `space`, and fx, fy, cx, cy.
+        `others` are n image indices. `packed` are their greys, packed by `quads`; `motions` (n,12) are the rows of K R,
+        and K t, to each of them. `windows` are those of image i, which are written to the buffer `space`; `k` is (fx,
+        fy, cx, cy).
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
@@ -83,7 +86,10 @@ class _Level:
         return self.packed[others], motions, windows(image, space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
-        """Return a map of half the resolution at this resolution; each pixel is repeated where it lies."""
+        """Return a map (c,h,w) from one (c,h/2,w/2) of half the resolution; each pixel is repeated at 2 x 2 pixels.
+
+        The width of the result is rounded up to a multiple of LANES.
+        """
         h, w = self.pinhole.height, self.pinhole.width
         row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
         column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)
@@ -100,12 +106,13 @@ def match_depth(
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[Float[ndarray, "k h w"], Float[ndarray, "k h w"]]:
-    """Estimate the depth of the k images `rows` by PatchMatch stereo with their neighbours, `threads` images at once.
+    """Estimate the depth of the k images of indices `rows` by PatchMatch stereo, `threads` images at once.
 
-    Returns for each pixel the inverse depth (1/z, per recon unit) and the correlation with its best neighbours (-1 to
-    1). `colors` and poses are of all m undistorted images, on the pixel grid of `pinhole`; `neighbours` and `planes`
-    come from `choose_neighbours` and `sweep_planes`. The search covers the inverse depths between an image's two planes.
-    `report` is called with the share that is done. The result does not depend on `threads`.
+    Returns for each pixel the inverse depth (1/z, per recon unit) and the mean correlation with its two best neighbours
+    (-1 to 1). `colors` and poses are of all m undistorted images, on the pixel grid of `pinhole`. `neighbours` and
+    `planes` come from `choose_neighbours` and `sweep_planes`. The search covers the inverse depths between an image's
+    two planes, from a quarter of the largest on. `report` is called with the finished fraction. The result does not
+    depend on `threads`.
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)

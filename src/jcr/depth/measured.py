@@ -28,10 +28,11 @@ def with_measured_depth(
 ) -> tuple[Reconstruction, tuple[str, ...]]:
     """Return the reconstruction with the measured depth images merged into its pointmaps, and notes for the user.
 
-    `check` compares the depth images with the robot's motions; it is None if no comparison is reliable, and then they
-    are not used. `scale` is in metres per recon unit. The depth is divided by the scale error of `check`. Measured and
-    matched depth are averaged where they agree; where they differ the matched depth stays. Measured depth replaces the
-    depth of fitted planes.
+    `check` compares the depth images with the robot's motions; None means that no comparison is reliable. The depth
+    images are not used without `check`, or if it finds a scale error above 20 %. The depth is divided by one plus this
+    error. `scale` is in metres per recon unit. Measured and matched depth within 3 standard deviations are averaged,
+    weighted by inverse variance; otherwise the matched depth stays. Measured depth replaces the depth of fitted planes,
+    and fills pixels without depth.
     """
     if capture.depths is None:
         return reconstruction, ()
@@ -82,9 +83,10 @@ def with_measured_depth(
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
-    """Return the depth (m) of a depth image at the pixels `at` (u, v), and where it is valid.
+    """Return the depth (m) of a depth image (m, 0: none) at the integer pixels `at` (p,q,2), and where it is valid.
 
-    It is valid away from edges and within the range REACH_M.
+    `at` has u, then v, in its last axis. A depth is valid if it is within REACH_M, and the 3 x 3 depths around are
+    known and differ by less than 5 %.
     """
     height, width = depth.shape
     u, v = at[..., 0], at[..., 1]

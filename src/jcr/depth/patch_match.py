@@ -45,9 +45,11 @@ def _ray(v, u, k):
 def _look(v, u, asked, packed, motions, k, near, starts):
     """Write the projections of 16 pixels of row v, from column u on, into their neighbours to `near` and `starts`.
 
-    `asked` are the indices of each pixel's neighbour images. A neighbour has intrinsics K, rotation R and translation t
-    from this image. `near` holds K R times the change of a ray by one patch sample in u and in v, K R times the ray,
-    and K t. `starts` are the indices at which the neighbour images begin in `packed`.
+    `asked` (a,h,w) are the indices of each pixel's neighbour images. `motions` (n,12) has the rows of K R, and K t, for
+    each neighbour; `k` is fx, fy, cx, cy. K are the intrinsics, and R and t transform points of this camera to the
+    neighbour's. `near` (a,12,16) holds four vectors of three numbers. The first two are K R times the change of a ray
+    by one window sample in u, and in v. The others are K R times the ray, and K t. `starts` (a,16) are the indices at
+    which the neighbour images begin in the flattened `packed` (n,y,x).
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     size = packed.shape[1] * packed.shape[2]
@@ -69,8 +71,10 @@ def _look(v, u, asked, packed, motions, k, near, starts):
 def _score(v, u, tried, packed, windows, k, near, starts, each):
     """Write to row 6 of `tried` the scores of 16 planes: the mean of the BEST highest correlations with neighbours.
 
-    Rows 0 to 2 of `tried` are the planes of the pixels of row v from column u on. The correlations are written to
-    `each`; the other arrays are described in the module's docstring.
+    The pixels are those of row v from column u on. Rows 0 to 2 of `tried` (7,16) are their planes p, with p·x = 1 in
+    the camera frame. Rows 3 to 5 are overwritten with the input of `correlate`. The correlations are written to `each`
+    (a,16), one row per neighbour. `packed` (n,y,x) are the neighbours' greys from `quads`, and `near` and `starts` come
+    from `_look`. `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
@@ -93,8 +97,9 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
 def _keep_better(found, v, u, k, tried):
     """Replace the planes of 16 pixels in `found` by those in `tried` with a higher score that face the camera.
 
-    Planes that are too slanted are not used. Rows of both arrays: the first three are the plane; the score is row 3 of
-    `found` and row 6 of `tried`.
+    The pixels are those of row v from column u on. A plane faces the camera if the cosine between its normal and the
+    ray is above MOST_SLANTED. Rows of `found` (4,h,w) and `tried` (7,16): the first three are the plane; the score is
+    row 3 of `found` and row 6 of `tried`. Row 5 of `tried` is the inverse depth; `k` is fx, fy, cx, cy.
     """
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
@@ -109,10 +114,10 @@ def _keep_better(found, v, u, k, tried):
 @inlined
 @no_type_check
 def _try_passed(found, row, u, side, tried):
-    """Write to `tried` for 16 pixels from column u on the planes that `found` has in row `row`.
+    """Write to rows 0 to 2 of `tried` the planes that `found` (4,h,w) has in image row `row`, for 16 pixels.
 
-    They are those of the same columns (`side` 0), or the planes of highest score within _BESIDE columns to the left
-    (-1) or right (1).
+    The pixels are those from column u on. For `side` 0 the planes are those of the same columns. For `side` -1 (1) they
+    are those of highest score among the _BESIDE columns to the left (right).
     """
     last = found.shape[2] - 1
     for lane in range(LANES):
@@ -128,10 +133,11 @@ def _try_passed(found, row, u, side, tried):
 @inlined
 @no_type_check
 def _try_changed(found, v, u, k, search, halvings, state, tried):
-    """Write to `tried` the planes of 16 pixels of row v, from column u on, with random changes of depth and normal.
+    """Write to rows 0 to 2 of `tried` the planes of 16 pixels with random changes of depth and normal.
 
-    The first three elements of `search` are the lowest and highest inverse depth and the largest relative change, which
-    is halved `halvings` times. `state` is that of the random numbers.
+    The planes are those in `found` (4,h,w) of row v, from column u on; `k` is fx, fy, cx, cy. The first three elements
+    of `search` are lowest inverse depth, highest one, and its largest relative change, which is halved `halvings`
+    times. `state` is the state of the random generator `uniform`, which is updated.
     """
     lowest, highest, size = search[:3]
     scale = size * 0.5**halvings
@@ -150,10 +156,11 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
 @compiled
 @no_type_check
 def random_planes(family, span, k, h, w, seed):
-    """Return a random plane without a score for each pixel, (4,h,w): half of them lie between the two of `family`.
+    """Return a random plane for each pixel, (4,h,w): rows 0 to 2 are the plane, and row 3 is the score UNKNOWN.
 
-    The other planes have random normals and an inverse depth in `span` (lowest, highest). Planes are vectors p with p·x
-    = 1; k is fx, fy, cx, cy.
+    Planes are vectors p in the camera frame with p·x = 1; `k` is fx, fy, cx, cy. About half of the planes are random
+    mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span` (lowest,
+    highest).
     """
     state = random_state(seed)
     lowest, highest = span
@@ -182,9 +189,12 @@ def random_planes(family, span, k, h, w, seed):
 def spread_planes(found, asked, packed, motions, windows, k, search, seed):
     """Update the planes of all pixels in `found` once by planes of the row before or random changes that score higher.
 
-    The module's docstring describes the arrays. Rows are visited downwards for even and upwards for odd seeds (Bleyer
-    et al. 2011, section 3.2). `search` is (lowest inverse depth, highest one, relative change to try, number of tries,
-    whether the planes have no score yet). The change of inverse depth and normal halves from try to try.
+    `found` (4,h,w), plane and score, is changed in place; `asked` (a,h,w) are the indices of each pixel's neighbours.
+    `packed` (n,y,x) are the neighbours' greys from `quads`, and `motions` (n,12) the rows of K R, and K t, to them.
+    `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy. Rows are visited downwards
+    for even and upwards for odd seeds (Bleyer et al. 2011, section 3.2). `search` is (lowest inverse depth, highest
+    one, relative change to try, number of tries, whether the planes have no score yet). The change of inverse depth and
+    normal halves from try to try.
     """
     state = random_state(seed)
     slots, h, w = asked.shape
@@ -214,7 +224,8 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
 def best_neighbours(found, asked, packed, motions, windows, k, count):
     """Return for each pixel the indices (count,h,w) of the neighbours with which its plane correlates best, best first.
 
-    `found` are the planes, and `asked` the neighbours to compare. The module's docstring describes the arguments.
+    `found` (4,h,w) are the planes, and `asked` (a,h,w) the indices of the neighbours to compare. If `count` is larger
+    than a, the result is (a,h,w). The other arguments are as in `spread_planes`.
     """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
@@ -241,8 +252,9 @@ def best_neighbours(found, asked, packed, motions, windows, k, count):
 def peaks(found, asked, packed, motions, windows, k, step):
     """Return the inverse depth (h,w) of best score for each pixel, at the peak of a parabola through three scores.
 
-    The scores are those of the pixel's plane with inverse depth times 1 - step, 1 and 1 + step. The module's docstring
-    describes the other arguments.
+    The scores are those of the pixel's plane in `found` (4,h,w) with inverse depth times 1 - step, 1 and 1 + step. The
+    peak is limited to this interval. `asked` (a,h,w) are the indices of each pixel's neighbours; the other arguments
+    are as in `spread_planes`.
     """
     slots, h, w = asked.shape
     near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)

@@ -25,10 +25,10 @@ region. Pixels along one edge do not determine the slope across it, and may belo
 
 
 def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"], int]:
-    """Return for each pixel the number of its region of one colour, and the number of regions.
+    """Return for each pixel the index of its region of one colour (from 0), and the number of regions.
 
-    The method is that of Felzenszwalb and Huttenlocher, IJCV 2004. The image is smoothed first, with its edges kept;
-    otherwise noise and JPEG blocks would join regions.
+    `color` is RGB, 0 to 1. The method is that of Felzenszwalb and Huttenlocher, IJCV 2004. The image is smoothed first,
+    with its edges kept; otherwise noise and JPEG blocks would join regions.
     """
     smooth = cv2.bilateralFilter(color, 7, 0.07, 3)
     pairs = (smooth[:, 1:], smooth[:, :-1]), (smooth[1:], smooth[:-1])
@@ -92,11 +92,14 @@ def region_planes(
 ) -> tuple[ndarray, ...]:
     """Fit to the matched pixels of each region a plane p with p·ray = inverse depth (RANSAC, then least squares).
 
-    Returns per region: plane (count,3), whether it is the plane `support`, numbers of inliers and of matched pixels,
-    root mean square of the inliers' relative residuals, and mean (count,2) and inverse covariance (count,2,2) of the
-    inliers' pixels. A region without a plane has 0 inliers. `label` is each pixel's region. `support` is the scene's
-    main plane in the camera frame, preferred where it has nearly as many inliers as the best plane. `tolerance` is
-    relative to the inverse depth.
+    Returns seven arrays with a row per region. The first four are plane p (count,3), whether it is the plane `support`,
+    number of inliers, and number of matched pixels. The fifth is the root mean square of the inliers' relative
+    residuals. The last two are mean (count,2) and inverse covariance (count,2,2) of the inliers' pixels (u, v). A
+    region without a plane has 0 inliers.
+
+    `label` is each pixel's region from 0 to `count` - 1; `rays` have z = 1. `support` is the scene's main plane, as p
+    in the camera frame. It is preferred where it has 80 % of the best plane's inliers or more. `tolerance` is the
+    largest residual of an inlier, relative to the inverse depth; `seed` is that of RANSAC.
     """
     pixel = np.stack(np.nonzero(label >= 0)[::-1], -1).astype(float)
     fixed = np.bincount(label[matched], minlength=count)
@@ -141,8 +144,10 @@ def _drawn_planes(
 ) -> tuple[Float[ndarray, "n 3"], Bool[ndarray, " n"]]:
     """Return for each of n regions the plane p, p·ray = inverse depth, of most inliers, and whether it is `support`.
 
-    The planes tried are random ones through three pixels, and `support`. The k pixels are sorted by region; `of_region`
-    are index of the first pixel and number of pixels of each region. `depth` is inverse depth, `tolerance` relative.
+    The planes tried are random ones through three pixels, drawn with `seed`, and `support`, which needs only 80 % of
+    the others' inliers. The k pixels are sorted by region; `of_region` are the index of the first pixel and the number
+    of pixels of each region. `ray` has z = 1, and `depth` is inverse depth. `tolerance` is the largest relative
+    residual of an inlier.
     """
     start, size = of_region
     share = np.random.default_rng(seed).random((len(start), TRIALS, 3))
@@ -167,7 +172,10 @@ def _drawn_planes(
 def _moments(
     label: Int[ndarray, " n"], pixel: Float[ndarray, "n 2"], count: int
 ) -> tuple[Int[ndarray, " r"], Float[ndarray, "r 2"], Float[ndarray, "r 2 2"]]:
-    """Return number, mean (px) and covariance (px²) of the pixels of each label from 0 to `count` - 1."""
+    """Return number, mean (px) and covariance (px²) of the pixels of each label, for the r = `count` labels from 0 on.
+
+    `label` and `pixel` (u, v) are those of n pixels. Mean and covariance of a label without pixels are 0.
+    """
     number = np.bincount(label, minlength=count)
 
     def mean(values: Float[ndarray, " n"]) -> Float[ndarray, " r"]:

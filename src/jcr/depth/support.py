@@ -18,10 +18,11 @@ def support_plane(
 ) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], float] | None:
     """Fit the plane with most of n points that has all cameras on one side; None if no plane has a tenth of the points.
 
-    Returns the unit normal towards the cameras, a point of the plane amid its points, and the robust standard deviation
-    of their distances from it. `far` is the typical distance of points from the cameras, in the unit of the points.
-    `z_is_up`: planes that are level in the frame of the points are preferred, because most arms stand upright and a
-    wall may have more points than the table.
+    Returns the unit normal towards the cameras, the weighted mean of the plane's points, and the robust standard
+    deviation of their distances from it. `far` is the typical distance of points from the cameras, in the unit of the
+    points. A point is on a plane within 0.5 % of `far`. With `z_is_up`, points of planes within 26° of level count five
+    times; z is that of the points' frame. Level planes are preferred because most arms stand upright and a wall may
+    have more points than the table.
     """
     draw = np.random.default_rng(0)
     some = points[draw.choice(len(points), min(SAMPLE, len(points)), replace=False)]

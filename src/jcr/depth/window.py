@@ -35,9 +35,9 @@ COLOR_SIGMA = 25.5
 
 
 def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
-    """Return for each pixel four greys in 64 bits, from the lowest: its own, right, below, below right.
+    """Return for each pixel four 16-bit greys in 64 bits, from the lowest: its own, right, below, below right.
 
-    A bilinear interpolation then reads memory once.
+    Border pixels are repeated beyond the border. A bilinear interpolation then reads memory once.
     """
     own = np.pad(grey, (0, 1), "edge").astype(np.uint64)
     rows = own[:, :-1] | own[:, 1:] << 16
@@ -49,11 +49,12 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 def windows(image, space):
     """Return weight and weighted grey of each tap (sampled pixel) of each pixel's window.
 
-    The shape is (rows, blocks of 16 pixels, taps, 2, 16). `image` (4,h,w) are the three colours and grey of an image,
-    padded by MARGIN on all sides and to whole blocks. The weights of a window have the sum 1; a tap's weight grows with
-    the similarity of its colour to the central one (Schönberger et al., ECCV 2016, eq. 6, with 1 / (1 + x/16)^16 for
-    exp(-x)). The weighted grey is weight · (grey - mean) / standard deviation, both over the window, the latter with
-    noise. The result is written to the beginning of the float buffer `space`, which is reused for every image.
+    The shape is (rows, blocks of 16 pixels, taps, 2, 16), the weight first in the axis of 2. `image` (4,h,w) are the
+    three colours and grey of an image, padded by MARGIN on all sides and to whole blocks. The weights of a window have
+    the sum 1. A tap's weight grows with the similarity of its colour to the central one (Schönberger et al., ECCV 2016,
+    eq. 6). The function 1 / (1 + x/16)^16 replaces exp(-x), where x is the squared distance of the colours over 2
+    COLOR_SIGMA². The weighted grey is weight · (grey - mean) / sqrt(variance + NOISE²), with weighted mean and variance
+    of the window. The result is written to the beginning of the float buffer `space`, which is reused for every image.
     """
     h, blocks = image.shape[1] - 2 * MARGIN, (image.shape[2] - 2 * MARGIN) // LANES
     rows = space[: h * blocks * TAPS * 2 * LANES].reshape((h, blocks, TAPS, 2, LANES))
@@ -71,7 +72,11 @@ def blocks_of(columns: int) -> int:
 @intrinsic
 @no_type_check
 def _write_windows(typing, rows, image, v, block):
-    """Write to `rows`, the result of `windows`, the weights and weighted greys of the 16 pixels of a block of row v."""
+    """Write to `rows`, the result of `windows`, the weights and weighted greys of the 16 pixels of a block of row v.
+
+    `typing` is numba's typing context, which is not used. `image` is that of `windows`; `block` counts the blocks of 16
+    columns.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         out, channels = (context.make_array(signature.args[k])(context, builder, given[k]) for k in range(2))
@@ -111,10 +116,11 @@ def _write_windows(typing, rows, image, v, block):
 def correlate(typing, out, slot, packed, starts, motions, windows, place, tried):
     """Write to out[slot] the correlation of each of 16 pixels' windows with another image; -1 where it lies outside.
 
-    `place` (v, block) is the position of the pixels in `windows`. starts[slot] (16) are the indices at which the other
-    images begin in `packed` (n,y,x; made by `quads`, padded by `PAD`). Rows 3 to 5 of `tried` (7,16) are the changes of
-    inverse depth from one sampled pixel of the window to the next, in a row and in a column, and the inverse depth.
-    motions[slot] (12,16) are the projections into the other images (`near` of patch_match.py).
+    `out` is (a,16) for a slots, and `typing` is numba's typing context, which is not used. `windows` is the result of
+    `windows` for this image; `place` is the row v and the block of 16 columns in it. The 16 numbers starts[slot] are
+    the indices at which the other images begin in `packed` (n,y,x; made by `quads`, padded by `PAD`). Rows 3 and 4 of
+    `tried` (7,16) are the changes of inverse depth from one window sample to the next, in u and v. Row 5 is the inverse
+    depth. The array motions[slot] (12,16) has the projections into the other images (`near` of patch_match.py).
     """
     sums = signature(types.void, out, types.int64, packed, starts, motions, windows, place, tried)
 
@@ -146,10 +152,11 @@ def correlate(typing, out, slot, packed, starts, motions, windows, place, tried)
 def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) -> tuple[list[Lanes], Lanes]:
     """Project the windows of 16 pixels into the padded other images; return places, and whether they lie inside.
 
-    The places are six vectors (px): centre x, y, and the steps x, y from one sampled pixel of the window to the next in
-    a row, and in a column. `motion` are the 12 numbers of the projection (`near` of patch_match.py), `plane` is the
-    change of inverse depth along a row, along a column, and the inverse depth, `size` width and height of the images.
-    The homography of a window is approximated as affine about its centre, which saves divisions.
+    The places are six vectors (px). They are the centre x, y, and the steps x, y from one window sample to the next in
+    a row, and in a column. A window lies inside if its centre is in the image without padding and no sample leaves the
+    padding. `motion` are the 12 numbers of the projection (`near` of patch_match.py). `plane` is the change of inverse
+    depth from one sample to the next in a row, in a column, and the inverse depth. `size` is width and height of the
+    padded images. The homography of a window is approximated as affine about its centre, which saves divisions.
     """
     (x0, y0, z0, x1, y1, z1, x, y, z, tx, ty, tz), (du, dv, here) = motion, plane
     z = z + tz * here
@@ -170,9 +177,10 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
     """Return Σ c·g / std(g) per lane: g are the greys at a window's sampled pixels in `image`, c those of this image.
 
-    `image` are the packed other images, with `width` columns and the lane's image from index `start` on. The greys g
-    are interpolated bilinearly at the places `window`; `weights` has weights and weighted greys c from `windows`. The
-    standard deviation std(g) includes the pixel noise.
+    `image` is the LLVM pointer to the packed other images, with `width` columns and the lane's image from index `start`
+    on. The greys g are interpolated bilinearly at the places `window` (px), the result of `_window_there`. `weights`
+    has weight and weighted grey c of each sample, by turns, from `windows`. The standard deviation std(g) is weighted
+    and includes the pixel noise.
     """
     center_x, center_y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]

@@ -38,7 +38,8 @@ def build_scene(
     """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
 
     `values` are other properties of the cloud's n points by name, (n,d) each, which the networks learn, too. Raises
-    InputError if fewer than 100 points lie in the workspace, or a number is not finite.
+    InputError if fewer than 100 points lie in the workspace, or a number is not finite. The same error is raised for
+    `values` with the preset "paper". `device` is a torch device, such as "cuda".
     """
     options = options or MapOptions()
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
@@ -87,7 +88,11 @@ def build_scene(
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
-    """Return three grids of trainable features: nodes 4 map cells apart everywhere, 1 near surfaces, 1/2 on surfaces."""
+    """Return three grids of trainable features: nodes 4 map cells apart everywhere, 1 near surfaces, 1/2 on surfaces.
+
+    A map cell has twice the side of a cell of `seen`. Near surfaces are map cells up to two cells (NEAR) from a hit
+    one. On surfaces are cells of `seen` up to one cell from a hit one.
+    """
     hit = (seen.state & HIT) != 0
     nz, ny, nx = ((n // 2 + 3) // 4 for n in hit.shape)
     everywhere = torch.ones(nz, ny, nx, dtype=torch.bool, device=hit.device)

@@ -41,8 +41,9 @@ def point_cloud(
 ) -> PointCloud:
     """Return the confident points of the depth images in the base frame, with colour, label, std (m) and image of each.
 
-    `labels` (m,h,w) are indices into `label_names`, 0 = none, at the pixels of the m registered images' depth. Raises
-    InputError if no point has enough confidence.
+    `options` set the least confidence or its percentile, and the largest number of points. `labels` (m,h,w) are indices
+    into `label_names`, 0 = none, at the pixels of the m registered images' depth. None gives label 0 to all points.
+    Raises InputError if no point has enough confidence.
     """
     options = options or CloudOptions()
     dense = reconstruction.dense
@@ -111,9 +112,10 @@ def position_std(
 ) -> Float[ndarray, " n"]:
     """Return the standard deviation (m) of n points in the base frame along their worst direction, from the calibration.
 
-    `recon_from_camera` (m,4,4) and points `x_in_recon` (n,3) are scaled to metres; `image` is the index of the image of
-    each point. After a bundle adjustment the covariance of the scene's pose in the base frame is propagated, otherwise
-    that of gripper_from_camera and scale, at the point's position in its camera.
+    It is the root of the largest eigenvalue of each point's covariance. `recon_from_camera` (m,4,4) and points
+    `x_in_recon` (n,3) are scaled to metres; `image` is the index of the image of each point. After a bundle adjustment
+    the covariance of the scene's pose in the base frame is propagated. Otherwise that of gripper_from_camera and scale
+    is propagated, at the point's position in its camera.
     """
     placed = hand_eye.uncertainty.scene
     if placed is not None:
@@ -128,10 +130,11 @@ def position_std(
 
 
 def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None = None) -> None:
-    """Write a cloud as binary PLY: points with colour, label, confidence, margin (m) and image.
+    """Write a cloud as binary PLY: points with colour, label, confidence, margin and image.
 
-    Comments in the header hold the label names and camera centres, which `read_cloud` reads. `notes` are further
-    comments, one line per name and text.
+    The margin is the standard deviation (m) of a point due to the calibration. Origin and standard deviation (m) of the
+    depth are written if the cloud has them. Comments in the header hold the label names and camera centres, which
+    `read_cloud` reads. `notes` are further comments, one line per name and text.
     """
     columns = dict(zip(_COLUMNS, (*cloud.points_in_base.T, *cloud.color.T), strict=False))
     for name in list(_COLUMNS)[6:]:

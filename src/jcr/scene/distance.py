@@ -33,11 +33,17 @@ class DistanceGrid:
     """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Return distance (m) and its derivatives along x, y, z (n,4), interpolated at points (n,3) m of the box."""
+        """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
+
+        The points are in the base frame; a point outside of the grid has the values of the nearest point on its border.
+        """
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the signed distance (n,) m at points (n,3) m of the box, interpolated trilinearly."""
+        """Return the signed distance (n,) m at points (n,3) m of the base frame, interpolated trilinearly.
+
+        A point outside of the grid has the value of the nearest point on its border.
+        """
         return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 
@@ -46,9 +52,10 @@ def distance_grid(
 ) -> DistanceGrid:
     """Return the signed distances (m) of grid nodes from the boundary of solid space, negative inside.
 
-    The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m) on. `is_solid` tests points (n,3)
-    m. `closed`: space outside of the grid is solid. Nodes next to the boundary have an interpolated boundary point;
-    every other node takes that of the nearest such node. Without any boundary, the distance is the grid's diagonal.
+    The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m, base frame) on. `is_solid`
+    returns the mask of the points (n,3) m that are in solid space. If `closed`, space outside of the grid is solid.
+    Nodes next to the boundary have an interpolated boundary point; every other node takes that of the nearest such
+    node. Without any boundary, the distance is the grid's diagonal.
     """
     node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
@@ -81,9 +88,10 @@ def _boundary(
 ) -> tuple[Float[ndarray, "3 nz ny nx"], Bool[ndarray, "nz ny nx"]]:
     """Return the offsets (z, y, x; in cells) from grid nodes to the nearest boundary point, and a mask of valid nodes.
 
-    Valid are nodes with an edge that the boundary of solid space intersects. With t_a the signed distance of the
-    intersection along axis a, the nearest point of the plane through the intersections has the offset
-    (1/t_a) / Σ 1/t_b², summed over the axes b (Adalsteinsson and Sethian 1999).
+    `solid` is the result of `is_solid` at the nodes, which are `cell` m apart from the corner `lower` (m) on. Valid are
+    nodes with an edge that the boundary of solid space intersects. Let t_a be the signed distance (cells) from a node
+    to the intersection along axis a. The nearest point of the plane through the intersections has the offset (1/t_a) /
+    Σ 1/t_b², summed over the axes b (Adalsteinsson and Sethian 1999).
     """
     inverse = np.zeros((3, *solid.shape), np.float32)
     for axis in range(3):

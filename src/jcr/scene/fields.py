@@ -27,9 +27,9 @@ class Lattice(nn.Module):
     def __init__(
         self, lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], nodes: Int[Tensor, " k"]
     ) -> None:
-        """Create a grid of `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m) on.
+        """Create a grid of `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m, base frame) on.
 
-        `nodes` are the flat indices of the selected nodes.
+        `nodes` are the indices of the selected nodes in the flattened grid, in which x changes fastest.
         """
         super().__init__()
         self.cell, self.shape = cell, shape
@@ -43,7 +43,7 @@ class Lattice(nn.Module):
     def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
         """Return the grid whose selected nodes are the corners of the cells that are True in `near`.
 
-        `lower` is the lower corner (m), `cell` the side (m) of a cell.
+        `lower` is the lower corner (m, base frame) of the first cell, `cell` the side (m) of a cell.
         """
         corner = F.pad(near, (1, 1, 1, 1, 1, 1))
         for axis, n in enumerate(corner.shape):
@@ -52,7 +52,11 @@ class Lattice(nn.Module):
         return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
 
     def corners(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
-        """Return the 8 nodes around each of n points (m), as rows of the table of features, and trilinear weights."""
+        """Return the 8 nodes around each of n points (m), as rows of the table of features, and trilinear weights.
+
+        The order of the 8 columns is that of the cell's corners with x changing fastest, z slowest. Row 0 stands for a
+        node that is not selected. A point outside of the grid is moved to the border.
+        """
         nz, ny, nx = self.shape
         at = (x_in_base - self.lower) * (1.0 / self.cell)
         last = torch.tensor([nx - 2, ny - 2, nz - 2], dtype=torch.int32, device=at.device)
@@ -75,14 +79,18 @@ class Interpolate(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
         """Return the sum of 8 weighted rows of `table` (k, features) for each of n points, shape (features, n).
 
-        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights.
+        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights; `ctx` is torch's context of the
+        operation.
         """
         ctx.save_for_backward(table, rows, weight)
         return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
-        """Return the gradient by `table`, None for `rows`, and the gradient by `weight`; None if one is not needed."""
+        """Return the gradient by `table`, None for `rows`, and the gradient by `weight`; None if one is not needed.
+
+        `gradients` has one element, the gradient (features,n) by the result of `forward`; `ctx` is torch's context.
+        """
         (gradient,) = gradients
         table, rows, weight = ctx.saved_tensors
         of_table = of_weight = None
@@ -103,9 +111,11 @@ def interpolate_grid(
     cell: float,
     x_in_base: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "k n"]:
-    """Return k quantities of a regular grid, interpolated trilinearly at n points (m) in its box, shape (k,n).
+    """Return k quantities of a regular grid, interpolated trilinearly at n points (m), shape (k,n).
 
-    `table` has the k quantities at each node; `lower` is the position (m) of the first node, `cell` the spacing (m).
+    `table` (k,nz,ny,nx) has the k quantities at each node. `lower` is the position (m) of the first node in the frame
+    of the points; `cell` is the spacing (m). A point outside of the grid has the values of the nearest point on its
+    border.
     """
     cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
     at = ((x_in_base - lower) * (2.0 / (cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
@@ -113,7 +123,10 @@ def interpolate_grid(
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a linear layer with initial weights from `generator`, distributed as those of torch.nn.Linear."""
+    """Return a linear layer whose initial weights are drawn from `generator`, uniformly from ±1/√inputs.
+
+    torch.nn.Linear has the same distribution. None uses torch's own generator.
+    """
     # torch.nn.utils.skip_init would import SymPy, which takes 0.3 s; the caller's random numbers must not advance.
     with torch.random.fork_rng([]):
         layer, bound = nn.Linear(inputs, outputs), inputs**-0.5
@@ -140,9 +153,9 @@ class Field(nn.Module):
     ) -> None:
         """Initialise the layers from `generator`; `heads` maps the name of each property to its number of outputs.
 
-        `hidden` is the number of hidden units, `box` (2,3) m the workspace. A position is encoded by sinusoids of
-        `frequencies` octaves, or, if this is 0, by features of `lattices` (grids of nodes); each entry of `grids` is
-        the index of a lattice and its number of features per node.
+        `hidden` is the number of hidden units; `box` are lower and upper corner (m, base frame) of the workspace. A
+        position is encoded by sinusoids of `frequencies` octaves, or, if this is 0, by features of `lattices` (grids of
+        nodes). Each entry of `grids` is the index of a lattice and its number of features per node.
         """
         super().__init__()
         self.about = {"heads": heads, "hidden": hidden, "frequencies": frequencies, "grids": grids}
@@ -170,7 +183,10 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set offset and scale of the outputs that are no logits to mean and std of their `targets` (n, outputs)."""
+        """Set offset and scale of all outputs but occupancy and label to mean and std of the property's `targets`.
+
+        `targets` has an array (n, outputs) for each property, such as the colours of n points.
+        """
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
@@ -184,14 +200,17 @@ class Field(nn.Module):
 
     @property
     def tables(self) -> nn.ParameterList:
-        """Trainable features: for each grid of nodes a table with a row per node and a column per feature."""
+        """Trainable features: for each grid a table with a row per selected node, after a row 0 for all others.
+
+        The columns are the features of a node.
+        """
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Return the f inputs of the network's first layer for n points (m): interpolated features, or sinusoids.
 
-        The sinusoids are sin and cos of 2^k·π·x, k = 0, 1, …, for coordinates x scaled to [-1, 1] (Mildenhall 2020,
-        eq. 4).
+        The sinusoids are sin and cos of 2^k·π·x, k = 0, 1, … (Mildenhall 2020, eq. 4). The coordinates x are scaled so
+        that the longest side of the workspace is [-1, 1].
         """
         if len(self.frequency):
             angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
@@ -203,7 +222,10 @@ class Field(nn.Module):
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Return the outputs (n, outputs) of the network at points (n,3) m, by name of the property."""
+        """Return the network's outputs (n, outputs) at points (n,3) m of the base frame, by name of the property.
+
+        Occupancy and label are logits; other properties are plain values.
+        """
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
@@ -227,7 +249,10 @@ class Fields(nn.Module):
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`."""
+        """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`.
+
+        Occupancy and label are logits; other properties are plain values.
+        """
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):
@@ -240,10 +265,10 @@ CHUNK = {"cpu": 1 << 15, "cuda": 1 << 22}
 
 
 def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
-    """Return the tensors of `ask(*columns)`, computed for a limited number of rows at a time.
+    """Return the tensors of `ask(*columns)`, computed for at most CHUNK rows at a time.
 
-    `ask` is a function that treats each row alone. Its gradients are kept if a column requires them; otherwise the
-    calls are divided among the cores.
+    The columns have equally many rows (first axis), and `ask` must treat each row alone. Gradients are kept if a column
+    requires them; otherwise the calls are divided among the cores.
     """
     wanted = any(column.requires_grad for column in columns)
 

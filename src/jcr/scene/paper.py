@@ -18,7 +18,10 @@ class PaperField(Field):
     """Network for one property as in the paper: sinusoids of the position, 256 hidden ReLU units, linear output."""
 
     def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
-        """Initialise the layers of the property `name` from `generator`; `box` (2,3) m scales the positions."""
+        """Initialise the layers of the property `name` from `generator`; the network has `outputs` outputs.
+
+        `box` (2,3) m is the workspace, whose longest side is scaled to [-1, 1].
+        """
         super().__init__({name: outputs}, HIDDEN, box, frequencies=FREQUENCIES, generator=generator)
 
 
@@ -32,8 +35,10 @@ def train_paper(
 ) -> dict[str, PaperField]:
     """Return trained networks by property: "occupancy", "color" and, if the cloud has several labels, "label".
 
-    `weighted`: points weigh by their confidence. `box` (2,3) m is the workspace; None: from the cloud. Losses: binary
-    cross-entropy of points (occupied) and as many uniform positions (free), squared error of color, cross-entropy.
+    If `weighted`, the confidence of a point is its weight in the loss. `box` are lower and upper corner (m, base frame)
+    of the workspace; None computes them from the cloud. The training ends after `steps` steps or `max_seconds`. The
+    loss is the sum of three terms: squared error of colours, cross-entropy of labels, and binary cross-entropy of
+    occupancy. Points are occupied, and as many positions drawn uniformly in the workspace are free.
     """
     box = workspace_box(cloud, None) if box is None else box
     inside, start = rows_inside(cloud, box), time.perf_counter()

@@ -141,7 +141,8 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
 def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
     """Return the joints of a robot, parents before children; a joint names its two links by their indices in `links`.
 
-    Raises InputError, begun with `path`, for a type of joint that is not supported.
+    `links` are the names of the links. Raises InputError, begun with `path`, for an unsupported type of joint, or a
+    joint that mimics a dependent one.
     """
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
@@ -171,8 +172,9 @@ def spheres_of_shape(
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
     """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
-    `link_from_shape` is the pose of the shape in the link's frame. The spheres exceed the shape by at most `excess` (m)
-    plus half a voxel, which is a sixth of the excess for shapes up to 15 cm.
+    `shape` is in metres, and `link_from_shape` is its pose in the link's frame. The spheres exceed the shape by at most
+    `excess` (m) plus half a voxel. Half a voxel is a sixth of the excess for shapes up to 15 cm. A sphere is returned
+    as it is.
     """
     from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 
@@ -194,9 +196,10 @@ def cover_with_spheres(
 ) -> tuple[Integer[ndarray, "k 3"], Float[ndarray, " k"]]:
     """Return the voxel indices of the centres, and radii (m), of spheres that contain every voxel touching solid space.
 
-    `distance` d is the signed distance (m) from solid space at the centres of voxels with side `step` (m). A sphere with
-    centre c and radius excess - d(c) exceeds solid space by at most `excess`. Greedy cover: the deepest voxel that is
-    not yet covered becomes the next centre; a voxel is covered if its whole cube is inside a sphere.
+    `distance` d is the signed distance (m), negative inside, from solid space at the centres of voxels with side `step`
+    (m). A sphere with centre c and radius excess - d(c) exceeds solid space by at most `excess`. The cover is greedy:
+    the deepest voxel that is not yet covered becomes the next centre. A voxel is covered if its whole cube is inside a
+    sphere.
     """
     half = 0.5 * np.sqrt(3.0) * step
     left = distance <= half

@@ -45,8 +45,8 @@ class Sample:
     ) -> None:
         """Prepare a query of the map `scene` at n points (m, base frame).
 
-        `unknown`: unseen space counts as "occupied" or "free", or is reported ("report"). `tensors`: the results are
-        tensors, else arrays.
+        `unknown` sets whether unseen space counts as "occupied" or "free", or is reported ("report"). The results are
+        tensors if `tensors` is true, else arrays.
         """
         self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
 
@@ -62,12 +62,15 @@ class Sample:
 
     @property
     def distance(self) -> Any:
-        """Signed distance (n,) m to the nearest surface, negative inside solids; NaN outside of the workspace."""
+        """Signed distance (n,) m to the nearest surface, negative inside solids; NaN outside of the workspace.
+
+        Unseen space is solid if the query has unknown = "occupied", otherwise empty.
+        """
         return self._distance_gradient[0]
 
     @property
     def gradient(self) -> Any:
-        """Gradient (n,3) of the distance, which points away from the nearest surface; NaN outside of the workspace."""
+        """Gradient (n,3) of the distance in the base frame, away from the nearest surface; NaN outside the workspace."""
         return self._distance_gradient[1]
 
     @cached_property
@@ -77,7 +80,7 @@ class Sample:
 
     @cached_property
     def label(self) -> Any:
-        """Label (n,) as row of the map's `label_names`; 0 = none, and in unseen space."""
+        """Label (n,) as index into the map's `label_names`; 0 = none, and in unseen space."""
         scene = self._map
 
         def label(x: Tensor) -> tuple[Tensor]:
@@ -130,11 +133,14 @@ class Sample:
         return self._answers(distance_gradient)
 
     def _continuous(self, name: str, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n d"]:
-        """Return the d values of the property `name`, such as "color", at n points (m); NaN outside of the workspace."""
+        """Return the d values of the property `name` at n points (m, base frame); NaN outside of the workspace."""
         return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
-        """Return the results of the function `ask` at the query's points, as tensors or arrays like the query."""
+        """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
+
+        `ask` maps points (n,3) m to tensors with n rows.
+        """
         answers = in_chunks(ask, self._x)
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 
@@ -174,7 +180,10 @@ class SceneMap:
 
     @property
     def cell(self) -> float:
-        """Spacing (m) of the nodes of the distance grid, and of the features near surfaces."""
+        """Spacing (m) of the nodes of the distance grid, and of the features near surfaces.
+
+        Cells of the grid of seen space have half this side.
+        """
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
@@ -211,8 +220,9 @@ class SceneMap:
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether spheres collide: centres (…,3) m in the base frame, radii (m) that broadcast to (…).
 
-        With `unknown` "occupied", a sphere that reaches unseen space, or leaves the workspace, collides; with "free",
-        only seen surfaces count. "report" returns FREE, OCCUPIED or UNKNOWN (0, 1, 2) instead of booleans. Raises
+        A sphere collides if the signed distance of its centre is less than its radius. With `unknown` "occupied", a
+        sphere that reaches unseen space, or whose centre leaves the workspace, collides; with "free", only seen
+        surfaces count. With "report", the result is FREE, OCCUPIED or UNKNOWN (0, 1, 2) instead of booleans. Raises
         InputError for a wrong shape, a value that is not finite or a negative radius.
         """
         centers = np.asarray(centers_in_base)
@@ -242,9 +252,9 @@ class SceneMap:
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether spheres collide while their centres move on lines from starts to ends (…,3), m, base frame.
 
-        `radii` (m), `unknown` and the result are those of `check_spheres`. Spheres are tested at steps of half a cell.
-        A corner of an obstacle may therefore be inside the swept volume by r - sqrt(r² - (cell/4)²) without being
-        detected: 0.2 mm for a radius r of 2 cm and the default cell.
+        `radii` (m), `unknown` and the result (…) are those of `check_spheres`. Spheres are tested at steps of half a
+        map cell (`cell`). A corner of an obstacle may therefore be inside the swept volume by r - sqrt(r² - (cell/4)²)
+        without being detected. This is 0.2 mm for a radius r of 2 cm and the default cell.
         """
         starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)
         if starts.ndim == 0 or starts.shape[-1] != 3 or starts.shape != ends.shape:
@@ -286,7 +296,10 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
-        """Return True for each of n spheres (centre `x`, `radius`; m) that collides; `unknown`: "occupied" or "free"."""
+        """Return True for each of n spheres that collides; `unknown` is "occupied" or "free", as in `check_spheres`.
+
+        `x` are the centres (m, base frame) and `radius` the radii (m).
+        """
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -302,11 +315,11 @@ class SceneMap:
         return in_chunks(touches, x, radius)[0]
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
-        """Return the grid of signed distances to the occupancy field's surfaces, computed at the first call.
+        """Return the grid of signed distances to the surfaces of occupancy 0.5, computed at the first call.
 
-        Unseen space counts as `unknown` says, "occupied" or "free". Within two cells behind a seen surface the field is
-        used in both cases, although no ray crossed these cells: otherwise the surface would have no thickness, and the
-        nodes of the grid could miss it.
+        Unseen space counts as `unknown` says, "occupied" or "free". Within two map cells behind a seen surface the
+        field is used in both cases, although no ray crossed these cells. Otherwise the surface would have no thickness,
+        and the nodes of the grid could miss it.
         """
         with self._lock:
             if (known := self._distance.get(unknown)) is not None:
@@ -360,7 +373,7 @@ class SceneMap:
 
 
 def digest(tensors: dict[str, Tensor]) -> str:
-    """Return a checksum over the names and values of all tensors of a map, by which a damaged file is detected."""
+    """Return a checksum (hexadecimal) over the names and values of all tensors of a map, to detect a damaged file."""
     total = blake2b(digest_size=16)
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
@@ -370,7 +383,8 @@ def digest(tensors: dict[str, Tensor]) -> str:
 def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
     """Combine the results of k spheres into one: OCCUPIED if any is occupied, else UNKNOWN if any is, else FREE.
 
-    If `unknown` is not "report", the results are booleans; the result is then True if any sphere collides.
+    The spheres are the last axis of `states`, which the result (*batch) lacks. If `unknown` is not "report", the
+    results are booleans; the result is then True if any sphere collides.
     """
     if unknown != "report":
         return np.asarray(states.any(-1))

@@ -41,7 +41,7 @@ class SeenGrid:
 
     @property
     def size(self) -> Float[Tensor, "3"]:
-        """Side lengths (m) of the workspace along x, y and z."""
+        """Side lengths (m) of the workspace along x, y and z of the base frame."""
         return torch.tensor(self.state.shape[::-1], device=self.lower.device) * self.cell
 
     @property
@@ -50,12 +50,15 @@ class SeenGrid:
         return torch.stack([self.lower, self.lower + self.size])
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> UInt8[Tensor, " n"]:
-        """Return the states of the cells at points (n,3) m; 0 (unseen) outside of the workspace."""
+        """Return the states of the cells at points (n,3) m of the base frame; 0 (unseen) outside of the workspace."""
         index, inside = self.index(x_in_base)
         return torch.where(inside, self.state.view(-1).index_select(0, index), 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Return the flat index of each point's cell (0 for points outside), and a mask of the points inside the box."""
+        """Return the index of each point's cell (0 for points outside), and a mask of the points inside the workspace.
+
+        The index counts cells of the flattened `state`, in which x changes fastest. The points are in m, base frame.
+        """
         nz, ny, nx = self.state.shape
         # Points beyond the range of int32, and NaN, must not become indices inside the box.
         at = ((x_in_base - self.lower) * (1.0 / self.cell)).nan_to_num(-1.0).clamp(-1.0, 1e6).floor().int()
@@ -67,9 +70,9 @@ class SeenGrid:
 def without_doubts(seen: SeenGrid) -> SeenGrid:
     """Return the grid in which crossed cells that are not hit, but next to an unseen cell, are unseen.
 
-    A ray shows only its own line, and the rest of such a cell may be inside an object. Hit cells next to a reset cell
-    lose the state CROSSED, because the object may continue there. Without this step, 13 times as much space inside of
-    objects counts as free.
+    Cells are next to each other if they share a face, an edge or a corner. A ray shows only its own line, and the rest
+    of such a cell may be inside an object. Hit cells next to a reset cell lose the state CROSSED, because the object
+    may continue there. Without this step, 13 times as much space inside of objects counts as free.
     """
     hit, state = (seen.state & HIT) != 0, seen.state.clone()
     unsure = dilate(state == 0, 1) & ((state & CROSSED) != 0) & ~hit
@@ -90,7 +93,7 @@ def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx
 
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
-    """Return the mask at half the resolution; a cell is set if any of its eight cells is set."""
+    """Return the mask at half the resolution; a cell is set if any of its 2 x 2 x 2 cells is set."""
     return F.max_pool3d(mask[None].float(), 2)[0] > 0
 
 
@@ -103,11 +106,12 @@ def carve(
     measured: Bool[ndarray, " n"],
     device: str = "cpu",
 ) -> SeenGrid:
-    """Return the grid of seen space from the rays between m cameras and n points; `box` has an even number of cells.
+    """Return the grid of seen space from the rays between m cameras and n points (base frame).
 
-    `image` is the index of each point's camera. Rays of points that are not `measured` cross no cells, and block
-    neighbouring rays behind their points. Blocks of 2 × 2 × 2 cells count as crossed if they are nearer to a camera
-    than the nearest point in their direction. The last 6 cm of each ray are followed cell by cell.
+    `image` is the index of each point's camera. `box` are lower and upper corner (m) of the workspace. `cell` is the
+    side (m) of a cell, of which each side of the box has an even number. Rays of points that are not `measured` cross
+    no cells, and block neighbouring rays behind their points. Blocks of 2 × 2 × 2 cells count as crossed if they are
+    nearer to a camera than the nearest point in their direction. The last 6 cm of each ray are followed cell by cell.
     """
     lower, block = box[0].astype(np.float32), np.float32(2 * cell)
     crossed = np.zeros(np.rint((box[1] - box[0]) / (2 * cell)).astype(int)[::-1], bool)
@@ -132,11 +136,12 @@ def carve(
 def _depth_image(
     points: Float[ndarray, "n 3"], measured: Bool[ndarray, " n"]
 ) -> tuple[Float[ndarray, "r c"], Float[ndarray, "3 3"], tuple[float, float], float]:
-    """Return a coarse depth image (r rows, c columns): depth (m) of the nearest point in each pixel, 0 without points.
+    """Return a coarse depth image (r rows, c columns), its rotation, its corner and its pixel size.
 
-    `points` (m) are relative to the camera centre, along the base axes. Return also the rotation from base axes to
-    image axes, whose z is the mean direction of the measured points; the x/z and y/z of the image's corner; and the
-    pixel size (x/z). Points that are not `measured` reduce the depth of a pixel, but fill no empty pixel.
+    A pixel has the depth z (m) of the nearest point in it, 0 without points. `points` (m) are relative to the camera
+    centre, along the base axes. The rotation is image_from_base, and the image's z axis is the mean direction of the
+    measured points. The corner is (x/z, y/z) of pixel (0, 0), and the pixel size is in x/z. Points that are not
+    `measured` reduce the depth of a pixel, but fill no empty pixel.
     """
     points, assumed = points[measured], points[~measured]
     axis = (points / np.linalg.norm(points, axis=1, keepdims=True)).mean(0)
@@ -167,8 +172,9 @@ def _depth_image(
 def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
     """Set `crossed` (z,y,x) for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
 
-    `nearest`, `rotation`, `corner` and `pitch` are the results of `_depth_image`; `start` is the centre (m) of the first
-    block, relative to the camera, in the axes of the depth image.
+    `crossed` is the mask of the blocks, which is changed in place. `nearest`, `rotation`, `corner` and `pitch` are the
+    results of `_depth_image`. `start` is the centre (m) of the first block, relative to the camera, in the axes of the
+    depth image.
     """
     per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
     rows, columns = nearest.shape
@@ -191,9 +197,10 @@ def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
 def _follow(state, points, towards, reach, measured, cell):
     """Set HIT in `state` for cells that contain a point, and CROSSED for cells that rays cross near their points.
 
-    A cell is crossed if it contains four samples of rays, taken every half `cell` (m). `points` (m) are relative to the
-    grid's lower corner; `towards` and `reach` are unit vector and distance (m) from a point to its camera. The cell half
-    a cell behind a point is hit, too, so that surfaces have a thickness. Rays that are not `measured` cross no cells.
+    `state` (nz,ny,nx) is changed in place. `points` (n,3) m are relative to the grid's lower corner, along the base
+    axes. `towards` (n,3) and `reach` (n) are unit vector and distance (m) from a point to its camera. A cell is crossed
+    if it contains four samples of rays, taken every half `cell` (m) on the last 6 cm. The cell half a cell behind a
+    point is hit, too, so that surfaces have a thickness. Rays that are not `measured` (n) cross no cells.
     """
     samples = np.zeros(state.shape, np.uint8)
     nz, ny, nx = state.shape

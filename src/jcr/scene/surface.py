@@ -18,9 +18,9 @@ def surface_mesh(
 ) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"], UInt8[ndarray, "v 3"]]:
     """Return vertices (v,3) m in the base frame, triangles (f,3) whose front faces free space, and vertex RGB (v,3).
 
-    Marching cubes (scikit-image) finds the surface of occupancy 0.5, in steps of half a cell. Only triangles near the
-    ends of rays are kept, because the field has a second, false surface behind each real one. Raises InputError if the
-    map has no surface.
+    A triangle has the indices of its vertices. Marching cubes (scikit-image) finds the surface of occupancy 0.5, in
+    steps of half a map cell. Only triangles near the ends of rays are kept, because the field has a second, false
+    surface behind each real one. Raises InputError if the map has no surface.
     """
     import torch
     from skimage.measure import marching_cubes
@@ -54,7 +54,8 @@ def sample_surface(
 ) -> tuple[Float[ndarray, "n 3"], UInt8[ndarray, "n 3"], Int[ndarray, " n"]]:
     """Return positions (n,3) m in the base frame, RGB (n,3) and label (n,) of `count` points of the seen surface.
 
-    The points are drawn uniformly over its area; there are none if the map has no surface.
+    The points are drawn uniformly over the area of `surface_mesh`; there are none if the map has no surface. Labels are
+    indices into the map's `label_names`.
     """
     try:
         vertices, faces, color = surface_mesh(scene)
@@ -70,7 +71,10 @@ def sample_surface(
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:
-    """Return the size (m) at which points (n,3) m are drawn so that few gaps remain: 2.2 times their median spacing."""
+    """Return the size (m) at which points (n,3) m are drawn so that few gaps remain, 0.01 for fewer than two points.
+
+    The size is 2.2 times the median distance from a point to the nearest other point.
+    """
     if len(points) < 2:
         return 0.01
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # takes a third of the time

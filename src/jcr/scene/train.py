@@ -62,9 +62,9 @@ def workspace_box(
 ) -> Float[ndarray, "2 3"]:
     """Return lower and upper corner (2,3) of the workspace (m, base frame), by default computed from the cloud.
 
-    `workspace` are the two corners as x y z x y z; None: computed. The computed box encloses the cameras and, along
-    each axis, 99 % of the points that are nearer to their camera than 1.5 times the median distance, with a margin of 5
-    cm. Raises InputError for an invalid `workspace` or an empty cloud.
+    `workspace` is (xmin, ymin, zmin, xmax, ymax, zmax), or None for the computed box. That box encloses the cameras
+    and, along each axis, 99 % of the near points, with a margin of 5 cm. Near points are closer to their camera than
+    1.5 times the median distance. Raises InputError for an invalid `workspace` or an empty cloud.
     """
     if workspace is not None:
         box = np.array(workspace, dtype=np.float64).reshape(2, 3)
@@ -84,7 +84,10 @@ def workspace_box(
 
 
 def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
-    """Return the indices of the cloud's points inside `box` (lower and upper corner, m); raise InputError below 100."""
+    """Return the indices of the cloud's points inside `box`, the lower and upper corner (m, base frame).
+
+    Raises InputError if fewer than 100 points are inside.
+    """
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
     if len(inside) < 100:
@@ -104,9 +107,10 @@ def workspace_rays(
 ) -> Rays:
     """Return the training rays of the points inside `box` (m), with colour, label and `values` of each point as targets.
 
-    `values` are other properties of the points by name, (n,d) each. The weight of a point is proportional to
-    w / (1 + (margin² + depth_std²) / cell²), with margin and depth_std its standard deviations (m) from calibration and
-    depth, and w its confidence divided by the median confidence, limited to 0.25 to 4.
+    `box` are lower and upper corner (base frame), and `cell` is the side (m) of a map cell. `values` are other
+    properties of the cloud's n points by name, (n,d) each. The weight of a point is proportional to w / (1 + (margin² +
+    depth_std²) / cell²). Here margin and depth_std are its standard deviations (m) from calibration and depth. The
+    factor w is its confidence divided by the median confidence, limited to 0.25 to 4.
     """
     inside = rows_inside(cloud, box)
     x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
@@ -148,9 +152,10 @@ rays, which also have the other properties."""
 def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samples:
     """Return positions (m) near a batch of rays, their occupancy (1 or 0), and their weights, to train the occupancy.
 
-    Occupancy 1: the points, and positions up to 2 map cells behind them that no ray crossed. Occupancy 0: positions
-    between camera and point, half of them near the point, and some anywhere in the workspace. The trained occupancy is
-    then 0.5 at the surface itself; with uniform negatives the offset would depend on the density of the points.
+    Occupancy is 1 at the points of the rays (the first rows), and up to 2 map cells behind points where no ray crossed.
+    It is 0 at positions between camera and point, half of them within about 2 map cells of the point. It is also 0 at
+    some positions anywhere in the workspace. The trained occupancy is then 0.5 at the surface itself; with uniform
+    negatives the offset would depend on the density of the points.
     """
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
@@ -187,7 +192,9 @@ def train(
 ) -> int:
     """Train the network `field` until the loss on 2 % validation rays no longer falls; return the number of steps.
 
-    `max_seconds` limits the time. `report` is called with the fraction of the work that is done.
+    The learning rate is reduced when the validation loss falls by less than 3 % between tests; the second reduction
+    ends the training. `max_seconds` limits the time; `seed` sets samples and order of the rays. `report` is called with
+    the fraction of the work that is done.
     """
     device, start = rays.x.device, time.perf_counter()
     generator = torch.Generator(device).manual_seed(seed)
@@ -235,8 +242,9 @@ def train(
 def total_loss(field: Field, rays: Rays, samples: Samples) -> Tensor:
     """Return the training loss: the sum over the properties of `field` of the weighted mean loss of each.
 
-    The loss is binary cross-entropy for occupancy, cross-entropy for labels, and for other properties the squared error
-    divided by the variance of the property, so that units do not matter.
+    `samples` come from `draw_samples` for `rays`. The loss is binary cross-entropy for occupancy and cross-entropy for
+    labels. For other properties it is the squared error divided by the variance of the property, so that units do not
+    matter.
     """
     (x, occupied, of_samples), losses = samples, []
     for name, out in field(x).items():

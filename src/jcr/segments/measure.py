@@ -63,10 +63,11 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     """Measure all labelled objects above the support plane; `support` is fitted if it is None.
 
     Label 0 and the support plane's own label are not objects. `scale_std` is the relative standard deviation of the
-    calibration's scale. Standard deviations come from a jackknife over images (Efron and Stein 1981), because depth
-    errors are correlated within an image. Added in quadrature are the error of the scale, half a cell for the sides and,
-    for the height, the bend of the table and the spread of the top divided by the root of the number of images. Raises
-    InputError if no plane carries the scene.
+    calibration's scale. Standard deviations come from a jackknife that leaves out one image at a time (Efron and Stein
+    1981). The reason is that depth errors are correlated within an image. The error of the scale is added in
+    quadrature, and half a cell (CELL) for the sides. For the height, the bend of the table is added, sqrt(noise² -
+    roughness²) of the support plane. The spread of heights at the top, divided by the root of the number of images, is
+    added, too. Raises InputError if no plane carries the scene.
     """
     support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
@@ -119,11 +120,12 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
 def _shape(
     x_in_support: Float[ndarray, "n 3"], roughness: float, given_rad: float | None = None
 ) -> tuple[float, float, float, Float[ndarray, "2"], Float[ndarray, "2"], Float[ndarray, "k 2"]]:
-    """Return height of the top, spread of the top, rotation, centre, sides of one object, and k points within the sides.
+    """Return height and spread of the top, rotation, centre and sides of one object, and k points within the sides.
 
-    `x_in_support` are its n points (m), z normal to the support plane; `roughness` is their noise (m). The spread is
-    the standard deviation (m) of heights at the top. The rotation (rad, about z) is that from the x axis to the longer
-    side; `given_rad` replaces its estimate. Centre, side lengths and the k points are in m in the plane.
+    `x_in_support` are its n points (m), z normal to the support plane; `roughness` is the standard deviation (m) of
+    their noise. The spread is the robust standard deviation (m) of heights at the top. The rotation (rad, about z) is
+    that from the x axis to the longer side; `given_rad` replaces its estimate. Centre, sides and points are in m and in
+    the plane; the sides are the lengths along the rotated x and y axes.
     """
     top, spread = _top(x_in_support[:, 2], roughness)
     xy, area = _dense(x_in_support[:, :2])
@@ -143,7 +145,7 @@ def _shape(
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """Return the k corners of the convex hull of n points (m), in order."""
+    """Return the k corners of the convex hull of n points (m), in the order in which they follow each other on it."""
     middle = xy.mean(0)  # float32 is precise near the origin only
     return cv2.convexHull((xy - middle).astype(np.float32))[:, 0] + middle
 
@@ -151,9 +153,10 @@ def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
 def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
     """Return the height (m) of an object's top, and the robust standard deviation (m) of its points' heights at the top.
 
-    `height` are the heights of the points, `roughness` their noise (m). The result is the median height around the
-    highest peak in the density of heights that is not scatter. A high quantile would be 2 % and more too large for
-    narrow tops with stray points above them.
+    `height` are the heights of the points above the plane (m), `roughness` the standard deviation (m) of their noise.
+    The result is the median height around the highest peak in the density of heights. Peaks below a quarter (TOP_SHARE)
+    of the object's mean density are scatter. A high quantile would be 2 % and more too large for narrow tops with stray
+    points above them.
     """
     width = max(2 * roughness, SHARPEST)
     step = width / 4
@@ -173,7 +176,8 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
     """Return the k of n points (m) that are not in the sparse fringe around an object, and a weight for each.
 
-    The weight is 1 / number of points in the same cell, a square of side CELL in the plane.
+    The points are counted in square cells of side CELL in the plane. The fringe are cells with less than 40 %
+    (EDGE_SHARE) of the median number. The weight is 1 / number of points in the same cell.
     """
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     count = np.zeros([rows.max() + 2 for rows in cell])
@@ -186,5 +190,5 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
 
 
 def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
-    """Return the unit vectors of the x and y axes after rotation by `rotation_rad`, as rows."""
+    """Return the unit vectors of the x and y axes after a counter-clockwise rotation by `rotation_rad`, as rows."""
     return rotation_exp(np.array([0.0, 0.0, -rotation_rad]))[:2, :2]

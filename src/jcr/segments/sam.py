@@ -43,7 +43,10 @@ OVERLAP = 0.5
 
 
 def load_sam(weights: str) -> "Sam2Model":
-    """Load Segment Anything 2 from a hub id or path; raise InputError if the weights are missing or damaged."""
+    """Load Segment Anything 2 from a hub id or path, onto the GPU if there is one.
+
+    A hub id must have been downloaded before. Raises InputError if the weights are missing or damaged.
+    """
     extra("transformers", "sam", "--segments sam")
     from transformers import Sam2Model, logging
 
@@ -78,9 +81,10 @@ def sam_labels(
     hand_eye: Calibration,
     progress: Progress | None = None,
 ) -> LabelImages:
-    """Return label images of the registered images, and label names.
+    """Return label images of the registered images, on the pixel grid of the pointmaps, and label names.
 
-    Labels are masks of Segment Anything, merged into objects by their overlap in space.
+    Labels are masks of Segment Anything, merged into objects by their overlap in the base frame, for which `hand_eye`
+    is needed.
     """
     dense = reconstruction.dense
     images = steps(progress or silent, "segment anything", list(dense.colors))
@@ -91,10 +95,11 @@ def sam_labels(
 
 @torch.no_grad()
 def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "k h w"]:
-    """Return the k masks that the network finds in one image, highest quality first, without duplicates.
+    """Return the k masks that the network finds in one RGB image, highest quality first, without duplicates.
 
     Prompts are points on a regular grid. The network gives three masks for each, of which the one of highest quality is
-    taken.
+    taken. The quality is the network's estimate of the mask's intersection over union with the truth. Masks below
+    LEAST_QUALITY or LEAST_STABILITY are left out.
     """
     device = next(model.parameters()).device
     size = model.config.prompt_encoder_config.image_size  # pyright: ignore
@@ -135,9 +140,10 @@ def merged(
 ) -> LabelImages:
     """Return label images (m,h,w) from the masks of m images, 1 for the largest object, 0 for none, and label names.
 
-    `masks` has the masks of each image, `x_in_base` the position of each pixel (m) and `known` the pixels with a
-    position. Two masks of different images show one object if they fill the same cells of space, counted in cells that
-    both images see. If there are several images, an object must appear in two or more.
+    `masks` has the masks of each image. `x_in_base` is the position of each pixel (m), and `known` marks the pixels
+    with a position. Two masks of different images show one object if they fill the same cells of space, counted in
+    cells that both images see. Their intersection over union in cells of 1 cm must exceed 0.5. If there are several
+    images, an object must appear in two or more. Where masks overlap, the smaller one is used.
     """
     low = x_in_base[known].min(0) if known.any() else np.zeros(3)
     cell = np.floor((x_in_base - low) / VOXEL).astype(np.int64)

@@ -19,11 +19,11 @@ MOST = 1024
 
 
 def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
-    """Read the capture's label images `labels/NAME.png`, resampled to the depth images; None if there are none.
+    """Read the capture's label images `labels/NAME.png` at the pixels of the pointmaps; None if there are no PNG files.
 
-    Label images have 8 or 16 bits and the image's size; 0 is no object. `labels/names.json` may name the labels: {"1":
-    "mug", …}. Raises InputError if the label image of a registered image is missing, unreadable, of another size, or
-    has labels beyond 1023.
+    NAME is the image's name without suffix, and the nearest pixel is read. Label images have 8 or 16 bits and the
+    image's size; 0 is no object. `labels/names.json` may name the labels: {"1": "mug", …}. Raises InputError if the
+    label image of a registered image is missing, unreadable, of another size, or has labels beyond 1023.
     """
     folder = capture.folder / "labels"
     if not any(folder.glob("*.png")):
@@ -57,7 +57,10 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Read the names of labels from names.json; empty if there is no such file."""
+    """Read the names of labels from names.json, by label; empty if there is no such file.
+
+    Raises InputError if the file has another format.
+    """
     if not path.is_file():
         return {}
     try:
@@ -75,10 +78,11 @@ def image_labels(
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:
-    """Return a label per pixel of the depth images, from label images or Segment Anything; None for other methods.
+    """Return a label per pixel of the pointmaps, and label names; None for methods that label the cloud.
 
-    With "auto" the result is None if the capture has no label images. Raises InputError if requested label images are
-    missing or Segment Anything cannot be loaded.
+    The labels come from the capture's label images or Segment Anything, as set by `options`. With "auto" the result is
+    None if the capture has no label images. Raises InputError if requested label images are missing or Segment Anything
+    cannot be loaded.
     """
     if options.segments in ("auto", "labels"):
         labels = read_labels(capture, reconstruction)
@@ -98,10 +102,10 @@ def image_labels(
 def label_cloud(
     cloud: PointCloud, options: SegmentOptions, support: Support | None = None
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """Return the cloud with labels of the objects on its support plane, and notes for the user.
+    """Return the cloud with labels of the objects on its support plane (`label_tabletop`), and notes for the user.
 
-    The cloud is unchanged if it has labels or the options exclude this method. `support` is fitted if it is None.
-    Raises InputError if the option is "tabletop" and no plane carries the scene.
+    The cloud is unchanged if it has labels or the options exclude this method. `support` is fitted if it is None. If no
+    plane carries the scene, InputError is raised with the option "tabletop"; with "auto" a note says so.
     """
     if options.segments not in ("auto", "tabletop") or len(cloud.label_names) > 1:
         return cloud, ()

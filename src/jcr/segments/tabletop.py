@@ -48,7 +48,7 @@ FEWEST_MEASURED = 1000
 
 
 def fit_support(cloud: PointCloud) -> Support:
-    """Fit the plane with most points that has all cameras on one side, by `support_plane`.
+    """Fit the plane with most points that has all cameras on one side, by `support_plane`; prefer level planes.
 
     Points filled in by plane priors are excluded from the fit and its noise, because they lie on planes by
     construction. Raises InputError if no plane holds a tenth of the points.
@@ -86,8 +86,9 @@ def label_tabletop(
 ) -> PointCloud:
     """Return the cloud with labels: 1 for the support plane, 2, 3, … for the objects that stand on it, largest first.
 
-    Objects are separated as seen from straight above, so objects that touch or lie on one another are one object.
-    Raises InputError if no plane carries the scene.
+    Other points have label 0, earlier labels are replaced, and the largest object is that with most points. `support`
+    is fitted if it is None. Objects are separated as seen from straight above, so objects that touch or lie on one
+    another are one object. Raises InputError if no plane carries the scene.
     """
     options = options or TabletopOptions()
     support = support or fit_support(cloud)
@@ -129,8 +130,9 @@ def _objects(
     """Return the number of each point's object: 1 for the object with most points, 2, 3, … for the others, 0 for none.
 
     `part` is the number of the connected group of points, seen from above, to which each point belongs, 0 for none.
-    `x_in_support` are the points (m), z normal to the plane. `bare` marks points of the plane with nothing above them.
-    Raises InputError if too little of the plane is bare.
+    Groups whose outlines overlap are joined; groups that are small, or mostly outside of the bare plane, are no
+    objects. `x_in_support` are the points (m), z normal to the plane. `bare` marks points of the plane with nothing
+    above them. Raises InputError if too little of the plane is bare.
     """
     # Groups are joined if their outlines overlap in the plane, such as the two sides of a ring, and if a small one is
     # above the plane and close to a larger one, such as a cup's handle.

@@ -99,7 +99,7 @@ def open_server(port: int, title: str) -> LocalServer:
 
 
 def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndarray, 'n dof']]":
-    """Return the robot of a URDF with its visual meshes, and its joint values (n,dof) at each image (rad or m).
+    """Return the robot of a URDF with its visual meshes, and its joint values (n,dof) at the n images (rad or m).
 
     The joint values of the capture are those of the first movable joints in the URDF; other joints, such as fingers,
     are at 0. Raises InputError if the URDF cannot be read or has fewer movable joints, or the capture has no joint
@@ -135,7 +135,11 @@ class Viewer:
         urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture."""
+        """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
+
+        There is no robot if `urdf` is None and the capture has no URDF or no joint values. Raises InputError as
+        `read_robot` does.
+        """
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
@@ -293,9 +297,9 @@ class Viewer:
                 self.robot.update_cfg(self._configurations[row])
 
     def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
-        """Select the image of registered camera number `camera`, and move the view of a client (browser) to its pose.
+        """Select the image of a registered camera, and move the view of a client (browser) to the pose of this camera.
 
-        `client` None: only select the image.
+        `camera` is its index among the registered images. With `client` None the image is only selected.
         """
         self.image.value = int(self.image_index[camera])
         if client is None:
@@ -333,7 +337,7 @@ class Viewer:
                     self.server.scene.remove_by_name(name)
 
     def show_slice(self) -> None:
-        """Draw the horizontal slice of the map with the selected property and height, or hide it.
+        """Draw the horizontal slice of the map with the selected property and height (base z), or hide it.
 
         Columns of the image follow the x axis of the base; rows follow y from the largest value to the smallest.
         """
@@ -380,7 +384,8 @@ class Viewer:
     def click(self, origin_in_base: Value, direction: Value) -> str:
         """Show the values of the map and the nearest measured point where a click hits a drawn point; return the text.
 
-        `origin_in_base` (m) is the origin of the ray, `direction` a unit vector in the base frame.
+        `origin_in_base` (m) is the origin of the click's ray, `direction` its unit vector in the base frame. The point
+        nearest to the origin within CLICK_RAD of the ray is hit. Without such a point, the text says so.
         """
         with self._lock:
             along = (self.points - origin_in_base) @ direction
