@@ -39,7 +39,7 @@ class _BodyCorners:
 
     @property
     def images(self) -> Int[ndarray, " i"]:
-        """Rows of the images that show at least FEWEST_POINTS corners of the board or tag."""
+        """Indices of the images that show at least FEWEST_POINTS corners of the board or tag."""
         return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
 
 
@@ -48,7 +48,9 @@ def with_boards(
 ) -> Reconstruction:
     """Add the corners of the board or tags that `spec` (the value of --board) names to the tracks of a reconstruction.
 
-    Raises InputError for a name that means no board.
+    Corners are detected in the registered images and triangulated in the recon frame. `progress` is called with stage
+    and finished fraction; None: no display. Without any detected corner, the tracks only record that no board was
+    found. Raises InputError for a name that means no board.
     """
     report = progress or silent
     readings = boards(spec)
@@ -88,7 +90,11 @@ def with_boards(
 def _at_one_place(
     seen: _BodyCorners, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
 ) -> Int[ndarray, " a"]:
-    """Return the rows of the largest set of images that see the board at one position; empty if no two agree."""
+    """Return the indices of the largest set of images that see the board at one position; empty if no two agree.
+
+    `cameras` are recon_from_camera of the m registered images, which the indices count. Images agree if their rms
+    distance from the projected triangulated corners is below SAME_PLACE image widths.
+    """
     images, best, limit_px = seen.images, np.zeros(0, int), SAME_PLACE * intrinsics.width
 
     def agreeing(by: Int[ndarray, " b"]) -> Int[ndarray, " a"]:
@@ -116,7 +122,11 @@ def _at_one_place(
 def _triangulated(
     x_px: Float[ndarray, "b c 2"], cameras: Float[ndarray, "b 4 4"], intrinsics: Intrinsics
 ) -> Float[ndarray, "c 3"]:
-    """Return the c corners in the recon frame, triangulated from b images; NaN for one in fewer than FEWEST_IMAGES."""
+    """Return the c corners in the recon frame, triangulated from b images; NaN for one in fewer than FEWEST_IMAGES.
+
+    `x_px` are pixels of the distorted images, NaN where a corner was not detected. `cameras` are recon_from_camera of
+    the b images.
+    """
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])
     for c in np.flatnonzero(shown.sum(0) >= FEWEST_IMAGES):
@@ -134,7 +144,11 @@ def _with_corners(
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
 ) -> tuple[Tracks, Body]:
-    """Return the tracks with a board's corners in `images` (rows) added, and the record of the board in these tracks."""
+    """Return the tracks with a board's corners in some images added, and the record of the board in these tracks.
+
+    `images` holds the indices of these images among the m registered ones. `cameras` are recon_from_camera of all m
+    images.
+    """
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))

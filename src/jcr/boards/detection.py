@@ -66,7 +66,7 @@ class Board:
 
 
 def boards(spec: str) -> list[Board]:
-    """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, its exact reading first.
+    """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, the one as written first.
 
     A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its marker
     length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word SIDE
@@ -130,7 +130,11 @@ def _tags(name: str) -> cv2.aruco.Dictionary:
 def _charuco(
     spec: str, count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary
 ) -> dict[str, Detector]:
-    """Return by name the detectors of a ChArUco board in both layouts, and with columns and rows swapped."""
+    """Return by name the detectors of a ChArUco board in both layouts, and with columns and rows swapped.
+
+    `spec` is the board's name, `count` its squares (columns, rows); `square` and `marker` are side lengths (m). Raises
+    ValueError for a marker that is not smaller than the square.
+    """
     if marker >= square:
         raise ValueError(f"a marker of {marker} m does not fit into a square of {square} m")
     detectors = {}
@@ -143,7 +147,7 @@ def _charuco(
 
 
 def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
-    """Return the detector of the inner corners of a ChArUco board."""
+    """Return the detector of the inner corners of a ChArUco board; its pixels have whole numbers at pixel centres."""
     detector = cv2.aruco.CharucoDetector(board)
     corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()
 
@@ -160,7 +164,10 @@ def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
 
 @cache
 def _charuco_shift_px() -> float:
-    """Return the shift, 0 or 0.5 px, of ChArUco corners in the installed OpenCV; pull request 28380 removed it."""
+    """Return how far (0 or 0.5 px) the installed OpenCV reports ChArUco corners too far right and down.
+
+    OpenCV's pull request 28380 removed this shift. It is measured once, in a drawn board.
+    """
     square, margin = 40, 20
     board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
     drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)
@@ -171,7 +178,10 @@ def _charuco_shift_px() -> float:
 
 
 def _chessboard(count: tuple[int, int], square: float) -> Detector:
-    """Return the detector of a chessboard with `count` inner corners (columns, rows) and squares of side `square`, m."""
+    """Return the detector of a chessboard with `count` inner corners (columns, rows) and squares of side `square`, m.
+
+    Raises ValueError if columns plus rows are even, because such a board looks the same after a rotation by 180°.
+    """
     across, down = count
     if (across + down) % 2 == 0:
         raise ValueError(
@@ -200,7 +210,10 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
 
 
 def _circles(count: tuple[int, int], spacing: float) -> Detector:
-    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart."""
+    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart.
+
+    Circles in a row are twice `spacing` apart, and every second row is displaced by `spacing`.
+    """
     across, down = count
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
@@ -225,7 +238,11 @@ def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
 
 
 def _single_tags(side: float, tags: cv2.aruco.Dictionary) -> Detector:
-    """Return the detector of single tags of a dictionary, whose black squares have this side, m."""
+    """Return the detector of single tags of a dictionary, whose black squares have this side, m.
+
+    The four corners have the order of OpenCV: top left, top right, bottom right, bottom left; the origin is the tag's
+    centre. A number that occurs twice in an image is ignored.
+    """
     parameters = cv2.aruco.DetectorParameters()
     # Fits lines to the edges; sub-pixel corners are drawn inwards by blur, 0.1 to 0.4 px. AprilTag's corners are counted
     # from the corner of the image.
@@ -255,8 +272,9 @@ def most_seen(
 ) -> tuple[Board, list[list[Sighting]]]:
     """Return the board of the candidates `readings` with most points in the images, and its detections in each image.
 
-    The first board is tried first. The others, and images whose strongly coloured pixels are filled in, are tried only
-    while the best board is found in fewer than half of the images.
+    The images are RGB. The first board is tried first. The others are tried only while the best board is found in fewer
+    than half of the images. All boards are then tried in images whose strongly coloured pixels are filled in, under the
+    same condition.
     """
     best, seen, points = readings[0], [], -1
     for fill in (False, True):

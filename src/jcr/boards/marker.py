@@ -39,8 +39,9 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     """Reconstruct cameras from a board or tags, in metres, or in sides of a square or tag if its size is unknown.
 
     The recon frame is that of the board or tag that most images show. `look_for` names the board in a form of
-    `detection.KINDS`. Unknown intrinsics are calibrated from the board. Raises InputError for a name that means no
-    board, and RejectedError when fewer than three images show it.
+    `detection.KINDS`. `progress` is called with stage and finished fraction; None: no display. Unknown intrinsics are
+    calibrated from the board. Raises InputError for a name that means no board, and RejectedError when fewer than three
+    images show it (four, if intrinsics are unknown).
     """
     report = progress or silent
     readings = boards(look_for)
@@ -92,7 +93,8 @@ def _intrinsics(
 ) -> tuple[Intrinsics, list[str]]:
     """Return the given intrinsics, or those calibrated from the board's detections `seen` in each image; and notes.
 
-    Calibrated are the focal length, principal point and two radial coefficients. The notes are for the user.
+    Calibrated are the focal length, principal point and two radial coefficients. The notes are for the user. Raises
+    RejectedError if fewer than FEWEST_FOR_INTRINSICS images show the board and no intrinsics are given.
     """
     if capture.intrinsics is not None:
         return capture.intrinsics, []
@@ -122,7 +124,8 @@ def _intrinsics(
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """Return (rms reprojection error in px, camera_from_body) of a detected board or tag, or None.
 
-    The result is None if the points are collinear, have large errors, or fit two poses.
+    The result is None if the points are collinear, have an rms error of WORST_PX or more, or fit a second pose nearly
+    as well. The translation is in the unit of `Sighting.x_in_body`.
     """
     x = sighting.x_in_body
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
@@ -139,10 +142,11 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
 def locate_cameras_and_bodies(
     poses: Sequence[dict[int, Pose]],
 ) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
-    """Return recon_from_camera by image row, and recon_from_body by number of the board or tag (body).
+    """Return recon_from_camera by image index, and recon_from_body by number of the board or tag (body).
 
-    The recon frame is that of the body that most images show. `poses` has for each image the pose of each body in it.
-    Poses are chained: a camera is located by its body of smallest error, and a body by the camera of smallest error.
+    The recon frame is that of the body that most images show. `poses` has for each image the pose of each body in it,
+    by the body's number. Poses are chained: a camera is located by its body of smallest error, and a body by the camera
+    of smallest error. Images and bodies without a chain to this frame are left out.
     """
     counts = Counter(body for bodies in poses for body in bodies)
     cameras: dict[int, Float[ndarray, "4 4"]] = {}

@@ -24,7 +24,10 @@ LONG_SIDE_PX = 800
 
 
 def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
-    """Return the value of --board for the board in the images, with SIDE as its length; None without a board."""
+    """Return the value of --board for the board in the images (RGB), with SIDE as its length; None without a board.
+
+    Three images (LOOKED_AT) are searched, first for tags, then for a chessboard.
+    """
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in chosen]
     if (factor := LONG_SIDE_PX / max(grey[0].shape)) < 1:
@@ -35,7 +38,8 @@ def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
 def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     """Return the value of --board for the tag dictionary with most tags in the images; None without tags.
 
-    The tags of a ChArUco board are proposed as single tags, because the user has to count its squares.
+    A tag counts if two or more images (FEWEST) show it. The tags of a ChArUco board are proposed as single tags,
+    because the user has to count its squares.
     """
     best: tuple[int, str, set[int]] = (0, "", set())
     for family in FAMILIES:
@@ -75,7 +79,8 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 def proposed(capture: Capture, board: str | None) -> tuple[Finding, ...]:
     """Return the finding that the capture's images show a board, with the value of --board that would use it.
 
-    The result is empty if they show none, if the option --board has a value (`board`), or if the camera is fixed.
+    The result is an empty tuple if they show none, if the option --board has a value (`board`), or if the camera is
+    fixed.
     """
     if board is not None or capture.mount == "base":
         return ()

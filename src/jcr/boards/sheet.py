@@ -22,7 +22,7 @@ MM_PER_INCH = 25.4
 
 
 def as_pdf(page: Image.Image, px_per_mm: float) -> bytes:
-    """Return a page as a PDF file of its true size, without lossy compression."""
+    """Return a page of `px_per_mm` pixels per millimetre as a PDF file of its true size, without lossy compression."""
     file = io.BytesIO()
     page.save(file, "PDF", resolution=MM_PER_INCH * px_per_mm)
     return file.getvalue()
@@ -31,8 +31,8 @@ def as_pdf(page: Image.Image, px_per_mm: float) -> bytes:
 def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
     """Return the black-and-white page of the ChArUco board or chessboard that `spec` names, and its resolution, px/mm.
 
-    A square is a whole number of pixels wide. Raises InputError for a name that means no such board, and for a board
-    that does not fit on the paper.
+    `spec` is a value of --board, `paper` a key of PAPERS_MM. A square is a whole number of pixels wide. Raises
+    InputError for a name that means no such board, and for a board that does not fit on the paper.
     """
     boards(spec)
     kind, *parts = spec.split(":")
@@ -83,9 +83,10 @@ def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
 def _ruler(
     pixels: Image.Image, px_per_mm: float, start_mm: tuple[float, float], length_mm: float, along_x: bool
 ) -> None:
-    """Draw a ruler with long ticks every 10 mm and short ticks every 1 mm, above the line (along x) or left of it.
+    """Draw a ruler of `length_mm` into the page `pixels`, with long ticks every 10 mm and short ticks every 1 mm.
 
-    The ruler begins at `start_mm` (x, y from the top-left corner of the page).
+    The ruler begins at `start_mm` (x, y from the top-left corner of the page) and goes right or, unless `along_x`,
+    down. The ticks are above a horizontal line and left of a vertical one.
     """
     draw, width = ImageDraw.Draw(pixels), round(0.15 * px_per_mm)
     x, y = start_mm

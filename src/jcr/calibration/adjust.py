@@ -47,10 +47,13 @@ effects of that size are not reported either (checks/effects.py)."""
 def with_adjusted_images(case: Case) -> Case:
     """Return the case after bundle adjustment, with the adjusted calibration in place of the fit to camera poses.
 
-    A rejected fit is replaced too, because without given intrinsics its camera poses are poor. For
-    correspondences between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
-    decreases. The fit is kept if the motions are degenerate, or if the adjustment fails (points behind the cameras).
-    A fit that cannot be adjusted gets the uncertainty of the intrinsics in its covariance.
+    A rejected fit is replaced too, because without given intrinsics its camera poses are poor. For correspondences
+    between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
+    (`LeaveOneOut.length_m`) decreases. The fit is kept if the motions are degenerate, or if the adjustment fails
+    (points behind the cameras).
+
+    If the case is not adjustable (`Case.is_adjustable`), the fit is kept. The uncertainty of given intrinsics, or of
+    the principal point for a network's camera poses, is added to its covariance.
     """
     if not case.is_adjustable and case.reconstruction.predicted_focal is not None:
         # Camera poses of a network do not depend on the focal length. An error of the principal point rotates their
@@ -101,10 +104,12 @@ def adjust_case(
 ) -> Solution:
     """Adjust the used images and gripper poses of a case, starting from its last adjustment or its fit to camera poses.
 
-    `combinations` (e,p) are p directions in the e parameters of the camera (hypotheses.Row) to estimate in addition.
-    `confirmed_errors` (s,b) are b error patterns of the gripper poses, s = 6 per used image, one standard deviation
-    each. The initial robot pose noise is taken from the residuals of the fit: a smaller one needs ten times the steps
-    if poses and images contradict.
+    `combinations` (e,p) are p directions in the e parameters of the camera (hypotheses.Row) to estimate in addition;
+    None: none. `confirmed_errors` (s,b) are b patterns of gripper pose errors of one standard deviation each; None:
+    none. Their rows, s = 6 per used image, are translation (m) and rotation vector (rad) in base axes.
+
+    The initial robot pose noise is taken from the residuals of the fit. A smaller one needs ten times the steps if
+    poses and images contradict.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
@@ -134,10 +139,14 @@ def with_intrinsics_considered(
     """Add the errors of the intrinsics to the covariance C of a calibration from camera poses alone: C + S Φ Sᵀ.
 
     This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
-    Φ is the covariance of the intrinsics. S is the derivative of the fit by the intrinsics: each parameter changes by
-    one standard deviation, and the camera poses change so that the pixels of `tracks` stay in place. All poses and
-    `systematic` (6m,6m) are those of the m used images; `systematic` is the covariance of the systematic robot errors if
-    the error of a joint had a standard deviation of 1 rad.
+    Φ is the covariance of the intrinsics, from their prior `camera`. S is the derivative of the fit by the intrinsics.
+    For S, each parameter changes by one standard deviation, and the camera poses change so that the pixels of `tracks`
+    stay in place.
+
+    `hand_eye` is the fit, and `priors` are the priors that the fit used. Poses, tracks and `systematic` are those of
+    the m used images. `systematic` (6m,6m) is the covariance (m, rad; base axes) of the systematic robot errors for a
+    joint error of 1 rad standard deviation. `hand_eye` is returned unchanged if an image has fewer than FEWEST
+    observations.
     """
     moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
     for row, pose in enumerate(recon_from_camera):
@@ -166,7 +175,10 @@ def with_intrinsics_considered(
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
-    """Return the calibration that the adjustment `found` of a case gives, without the findings that `judged` adds."""
+    """Return the calibration that the adjustment `found` of a case gives, with the findings of the fit to camera poses.
+
+    The findings of the kinds JUDGED still describe the fit; `judged` derives them again.
+    """
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]

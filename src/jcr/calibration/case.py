@@ -63,12 +63,15 @@ class Case:
 
     @property
     def base_from_gripper(self) -> Float[ndarray, "m 4 4"]:
-        """Reported gripper poses of the registered images, in the order of the reconstruction."""
+        """Reported gripper poses (m) of the m registered images, in the order of the reconstruction."""
         return self.capture.base_from_gripper[self.reconstruction.image_index]
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
-        """Camera poses from the images alone (`evidence`) if the reconstruction has them, else its camera poses."""
+        """Camera poses of the registered images in the recon frame, in units of the reconstruction.
+
+        They are those from the images alone (`evidence`) if the reconstruction has them, else its camera poses.
+        """
         evidence = self.reconstruction.evidence
         return self.reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
 
@@ -89,15 +92,19 @@ class Case:
 
     @property
     def systematic(self) -> Float[ndarray, "s s"]:
-        """Covariance of the used gripper poses' systematic errors if their size is 1 rad; 6 rows (m, rad) per pose.
+        """Covariance of the used gripper poses' systematic errors for an error size of 1 rad.
 
-        The size is the standard deviation of a joint's error or, for an unknown arm, of the gripper's rotation.
+        Each pose has six rows: translation (m), then rotation vector (rad), in base axes. The size is the standard
+        deviation of a joint's error or, for an unknown arm, of the gripper's rotation.
         """
         return of_poses(self.robot.systematic, self.used)
 
     @property
     def camera(self) -> CameraPrior:
-        """Intrinsics before the calibration, and their prior covariance."""
+        """Prior of the intrinsics before the calibration: mean (the reconstruction's intrinsics) and covariance.
+
+        The standard deviations depend on whether the intrinsics were given, estimated, or predicted by a network.
+        """
         given, found = self.capture.intrinsics, self.reconstruction.intrinsics
         if given is None and self.reconstruction.predicted_focal is not None:
             of_center = {name: ESTIMATED[name] for name in ("aspect", "cx", "cy")}
@@ -110,7 +117,10 @@ class Case:
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS."""
+        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS.
+
+        Their image indices count the used images, from 0.
+        """
         if self.chosen_tracks is not None:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
@@ -120,7 +130,8 @@ class Case:
     def free_focus(self) -> Float[ndarray, "e p"] | None:
         """Additional parameters that give each used image its own focal length; None if the option `focus` is "fixed".
 
-        Matrix (e,p): each column is a direction in the e parameters of the camera (hypotheses.Row).
+        Matrix (e,p): each of the p columns, one per used image, is a direction in the e parameters of the camera
+        (hypotheses.Row). The first column changes all focal lengths alike; the others are differences between images.
         """
         if self.options.focus == "fixed":
             return None
@@ -128,7 +139,7 @@ class Case:
 
     @property
     def scene_distance_m(self) -> float | None:
-        """Median depth of the scene points in the images (m); None where the images were not adjusted."""
+        """Median depth (m) of the observed points along the optical axis; None where the images were not adjusted."""
         if self.adjusted is None or self.hand_eye.source == "poses":
             return None
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
@@ -144,8 +155,9 @@ class Case:
     def is_adjustable(self) -> bool:
         """Whether bundle adjustment can refine the fit to camera poses.
 
-        It needs enough observations and images. Camera poses with a covariance (`evidence`) are not adjusted, nor are
-        cases with a known scale or height (`priors`), which the bundle adjustment does not model.
+        It needs MIN_OBSERVATIONS observations and MIN_IMAGES used images. Camera poses with a covariance (`evidence`)
+        are not adjusted. Cases with a known scale or height (`priors`) are not adjusted either, because the bundle
+        adjustment does not model these.
         """
         return (
             self.reconstruction.evidence is None
@@ -156,9 +168,10 @@ class Case:
 
     @property
     def shows_camera(self) -> bool:
-        """Whether effects on the camera can be tested: the case is adjustable, and its motions are observable.
+        """Whether effects on the camera, such as rolling shutter, can be tested.
 
-        Tracks from pointmaps are excluded, because the network used intrinsics of its own.
+        The case must be adjustable (`is_adjustable`), and its motions observable. Tracks from pointmaps are excluded,
+        because the network used intrinsics of its own.
         """
         return (
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
@@ -166,7 +179,10 @@ class Case:
 
     @property
     def is_open(self) -> bool:
-        """Whether the motions are observable and no known cause, such as static images, rejects the calibration."""
+        """Whether the motions are observable and no known cause, such as static images, rejects the calibration.
+
+        A known cause is a finding that explains others (`is_explained`).
+        """
         return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
 
     def after(
@@ -175,17 +191,22 @@ class Case:
         hand_eye: Calibration | None = None,
         adjusted: Solution | None = None,
     ) -> "Case":
-        """Return the case with the findings of a check added, and with a new calibration or adjustment if given."""
+        """Return the case with the findings of a check added, and with a new calibration or adjustment if given.
+
+        A finding's shift is also added to the covariance (`with_findings`). None for `hand_eye` or `adjusted` keeps the
+        case's own.
+        """
         found = with_findings(hand_eye or self.hand_eye, findings)
         fit = self.pose_fit if found.source == "images" else self.fit
         return replace(self, hand_eye=found, fit=fit, adjusted=adjusted or self.adjusted)
 
 
 def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
-    """Add findings to a calibration; the shift s of the calibration that a finding states adds s·sᵀ to the covariance.
+    """Return the calibration with `findings` added; the shift s of each finding adds s·sᵀ to the covariance.
 
-    A finding with a shift is given the severity "rejects" if the calibration is rejected already, or if its shift makes
-    the calibration too uncertain.
+    The shift is the change of the calibration that the finding states (`Finding.shift`, in COVARIANCE_ORDER). A finding
+    with a shift gets the severity "rejects" in two cases: the calibration is rejected already, or the shift makes it
+    too uncertain (hand_eye.MAX_STD).
     """
     named: list[Finding] = []
     for finding in findings:
@@ -202,7 +223,10 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """Return the observations in the images of the mask `used`; their image numbers count the used images only."""
+    """Return the observations in the used images; their image indices count the used images only, from 0.
+
+    `used` is a mask of the m registered images. All points are kept.
+    """
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])
@@ -211,8 +235,8 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
 def some_points(tracks: Tracks, most: int, most_points: int | None = None) -> Tracks:
     """Return the observations of all board corners, and of randomly chosen points up to `most` observations.
 
-    `most_points` limits the number of these points; points in WELL_SEEN or more images are then preferred. None: no
-    limit.
+    `most_points` limits the number of chosen points. Points in WELL_SEEN or more images are then preferred, and points
+    in one image are not chosen. None: no limit. Equal tracks give the same choice in every call.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))

@@ -22,11 +22,11 @@ ONE_AXIS = np.radians(6)
 
 
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the axis that all rotations of a planar motion share, and the camera's coordinate along it.
+    """Return the axis that all rotations of a planar motion share, the camera's coordinate along it, and its std.
 
-    The axis is a unit vector in the gripper frame; the coordinate (m) counts from the gripper's origin and is
-    followed by its standard deviation (m). `height` is the measured height (m) of the camera above the gripper's
-    origin.
+    The axis is a unit vector in the gripper frame, with its sign such that it points up in the base frame. The
+    coordinate (m) counts from the gripper's origin; the third number is its standard deviation (m). `height` (m) is the
+    measured height of the camera above the gripper's origin, which is returned as the coordinate.
 
     Raises InputError if the gripper does not rotate about one common axis.
     """
@@ -44,7 +44,10 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
 
 
 def check_known_length(capture: Capture, known_length: LengthInImage | None) -> None:
-    """Raise InputError if the image of `known_length` is not in the capture, or if a pixel lies outside the image."""
+    """Raise InputError if the image of `known_length` is not in the capture, or if a pixel lies outside the image.
+
+    None: no length is known, and nothing is checked.
+    """
     if known_length is None:
         return
     image, *ends, _ = known_length
@@ -65,7 +68,8 @@ def length_cue(
 ) -> tuple[float, float]:
     """Return the scale (metres per recon unit) from a known length between two pixels, and its relative 1σ error.
 
-    Raises InputError if the image is not registered or a pixel has no depth.
+    The distance of both pixels' surface points in the recon frame comes from the pointmaps (`surface_at`). Raises
+    InputError if the image is not registered or a pixel has no depth.
     """
     image, *ends, length_mm = known_length
     first, second = (
@@ -78,10 +82,11 @@ def length_cue(
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
 ) -> Float[ndarray, "3"]:
-    """Return the surface point (recon frame) at the pixel `x_px` of an image, from the pointmaps.
+    """Return the surface point (recon frame and unit) at the pixel `x_px` of an image, from the pointmaps.
 
-    Raises InputError if the image is not registered or the pixel has no depth; the message begins with `asked_by`, the
-    command-line option or file that states the pixel.
+    `image` is a name of the capture, `x_px` a pixel (x, y) of its distorted image; the nearest pixel of the pointmap is
+    read. Raises InputError if the image is not registered or the pixel has no depth. The message begins with
+    `asked_by`, the command-line option or file that states the pixel.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:

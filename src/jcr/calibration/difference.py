@@ -77,15 +77,16 @@ class _Reference(BaseModel):
 def compare(calibration: Comparable, other: Comparable) -> Difference:
     """Return the step from `calibration` to `other`, and a χ² test whether their covariances explain the step.
 
-    Each is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or
-    a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
+    The step is translation (m) and rotation vector (rad) along gripper axes. Each argument is a result, a Calibration,
+    a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or a 4×4 gripper_from_camera. Raises
+    InputError if one of them has no gripper_from_camera.
     """
     ours, others = (_stated(one, "the calibration") for one in (calibration, other))
     return difference(ours, others)
 
 
 def _stated(one: Comparable, name: str) -> StatedTransform:
-    """Return gripper_from_camera and covariance of an argument of `compare`.
+    """Return gripper_from_camera and covariance (None for a bare 4×4 transform) of `one`, an argument of `compare`.
 
     Raises InputError without a transform; `name` denotes the argument in the message.
     """
@@ -134,7 +135,8 @@ def read_hand_eye(path: Path) -> StatedTransform:
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
     """Return the step Δ from `ours` to `other` and its χ² = ΔᵀV⁻¹Δ, where V is the sum of both covariances.
 
-    V is the sum of the covariances Pₖ of all causes of error k; the share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ².
+    The step is translation (m), then rotation vector (rad), along gripper axes. V is the sum of the covariances Pₖ of
+    all causes of error k; the share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any covariance, only the step is set.
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
     parts, together = dict[str, Float[ndarray, "6 6"]](), np.zeros((6, 6))

@@ -64,10 +64,13 @@ def drift(
 ) -> Drift:
     """Estimate and test the motion of the camera on the gripper between a calibration and new images.
 
-    `calibrated` is the fit to the old poses. `old` holds base_from_gripper and recon_from_camera of the calibration.
-    `new` holds both for the k new images, and the covariances of their camera poses (steps of geometry.retract, recon
-    axes). `systematic` is the covariance of the systematic errors of old, then new gripper poses, if their size is
-    1 rad. `alpha` is the probability of a false alarm.
+    `calibrated` is the fit to the old poses. `old` holds base_from_gripper (m) and recon_from_camera of the n images of
+    the calibration. `new` holds both for the k new images, in the same base and recon frames, and the covariances of
+    their camera poses. These are covariances of steps (geometry.retract): translation in recon units, then rotation
+    vector (rad), in recon axes.
+
+    `systematic` (s,s), s = 6 (n + k), is the covariance of the systematic errors of old, then new gripper poses. Its
+    rows are m and rad in base axes, for an error size of 1 rad. `alpha` is the probability of a false alarm.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
     first, state = len(old[0]), calibrated.state
@@ -100,7 +103,9 @@ def drift(
 def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Test:
     """Return the test that gripper_from_camera (SLIP) or base_from_recon (BASE_MOVED) changed before image `first`.
 
-    The test contains the estimated change. The equations are linearized at each estimate until it converges.
+    `first` is the index of the first new image. The test contains the estimated change: translation (m) and rotation
+    vector (rad), in gripper axes (SLIP) or base axes (BASE_MOVED). The equations are linearized at each estimate until
+    it converges.
     """
     (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
     columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)
@@ -125,8 +130,8 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
     """Return translation (m) and rotation (rad) that a χ² test at level `alpha` detects with probability 0.9.
 
-    `covariance` is that of an estimated motion (translation in m, rotation in rad). The motions to detect have its
-    least certain direction.
+    `alpha` is the probability of a false alarm. `covariance` is that of an estimated motion: translation (m), then
+    rotation vector (rad). The motions to detect have its least certain direction.
     """
     length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]

@@ -66,24 +66,26 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
 ) -> Calibration:
     """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
 
-    Both are stacks (n,4,4), n ≥ 2, of poses at the same instants and in the same order: gripper poses in the base frame
-    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1
-    sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is the covariance
-    of steps of the camera poses (geometry.retract; recon axes) by their errors.
+    Both pose arguments are stacks (n,4,4), n ≥ 2, at the same instants and in the same order. Gripper poses are in the
+    base frame (m), camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses
+    (1 sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is the covariance of errors of
+    the camera poses, as steps (geometry.retract). Each pose has six rows: translation (unit of the camera poses), then
+    rotation vector (rad), in axes of their frame.
 
-    `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the
-    base: they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
+    `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES), and `joints` (n,dof) are its angles (rad), starting at the
+    base. They determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed
     from the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` (6n,6n) is
-    the covariance of these errors for a size of 1 rad; None: it is computed.
+    the covariance of these errors (m, rad; base axes) for a size of 1 rad; None: it is computed.
 
-    `scale` (metres per unit of the camera poses, 1 if these are metric) is known with the relative standard deviation
-    `scale_std`; None: the scale is estimated. `offset` is a known coordinate of the camera, for motions that do not
-    determine it: an axis in the gripper frame, the camera's position along it (m), and its standard deviation (m).
+    `scale` (metres per unit of the camera poses) is known with the relative standard deviation `scale_std`; 1 for
+    metric poses. None: the scale is estimated. `offset` is a known coordinate of the camera, for motions that do not
+    determine it. It holds an axis in the gripper frame, the camera's position along it (m), and its standard deviation
+    (m).
 
-    `camera_errors` are tested, and included if the poses show them, unless there is a `camera_covariance`:
-    "independent" ones are rotations about the scene or about the origin of the given frame, where a board is, and
-    translations along the optical axis; "in sequence", the poses may also have been found one after the other, as by
-    visual odometry or SLAM, with errors that add up. `names` are those of the poses, for the result's `images`.
+    `camera_errors` are tested, and included if the poses show them, unless there is a `camera_covariance`. The value
+    "independent" stands for translations along the optical axis, and rotations about the scene or about the origin of
+    the given frame, where a board is. The value "in sequence" adds errors that accumulate from pose to pose, as in
+    visual odometry or SLAM. `names` are those of the poses, for the result's `images`; None: "pose 0", "pose 1", ….
 
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
@@ -137,8 +139,10 @@ def _fit_distinct(
 ) -> tuple[Solution, Int[ndarray, " n"]]:
     """Return the robust fit to the images without duplicates, and for each image its index in that fit.
 
-    The fit sorts the images by their poses, so that the result does not depend on their order. Images with the same
-    pair of poses count once, because an error that occurs twice would look like agreement.
+    `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `covariance` is that of
+    the camera poses (6n,6n; None: exact), `systematic` that of the systematic robot errors; both as in
+    `solve_hand_eye`. The fit sorts the images by their poses, so that the result does not depend on their order. Images
+    with the same pair of poses count once, because an error that occurs twice would look like agreement.
     """
     n = len(gripper)
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
@@ -155,7 +159,8 @@ def _with_residuals(
 ) -> Calibration:
     """Return the calibration that `fit` gives, with residuals of all images, before `judged` adds its findings.
 
-    `distinct` holds the index of each image in the fit, which has no duplicates (_fit_distinct).
+    `gripper` (base_from_gripper) and `camera` (recon_from_camera) are the poses of all n images. `distinct` holds the
+    index of each image in the fit, which has no duplicates (_fit_distinct).
     """
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
@@ -193,7 +198,8 @@ def image_verdicts(
 ) -> tuple[ImageVerdict, ...]:
     """Return a record of each registered image: whether it is used, its residuals, and the reason if it is rejected.
 
-    `metres` (m) and `radians` (rad) are the sizes of each image's residual. `reprojection_px` is the median
+    All arguments have one entry per image; `reasons` of used images are ignored. `metres` (m) and `radians` (rad) are
+    the sizes of each image's residual: reported against predicted gripper pose. `reprojection_px` is the median
     reprojection error, NaN for an image without one; None: the images were not adjusted.
     """
     px = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
@@ -215,7 +221,11 @@ JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
 
 
 def judged(hand_eye: Calibration) -> Calibration:
-    """Return the calibration with findings on image count, robot noise and uncertainty derived again (kinds JUDGED)."""
+    """Return the calibration with findings on image count, robot noise and uncertainty derived again (kinds JUDGED).
+
+    They replace earlier findings of these kinds and follow from the numbers of the calibration alone; other findings
+    stay.
+    """
     rejecting = list(_rejecting(hand_eye))
     # A weakly observed direction explains an uncertainty that rejects, and is therefore named first, unless the poses
     # are wrong: those of a wrong convention may be near a degenerate motion.
@@ -230,7 +240,7 @@ def judged(hand_eye: Calibration) -> Calibration:
 
 
 def poses_agree(noise: RobotNoise) -> bool:
-    """Return whether the estimated robot errors are small enough, at most MAX_NOISE, for an accepted calibration."""
+    """Return whether the estimated robot errors per axis are at most MAX_NOISE, as an accepted calibration needs."""
     metres, radians = noise.together
     return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
 
@@ -283,7 +293,9 @@ def leave_one_out(
 ) -> LeaveOneOut | None:
     """Return the mean leave-one-out error from the residuals of u used images; None for fewer than four.
 
-    `residual` (u,6) is translation (m), then rotation vector (rad). `how` names the method of prediction.
+    `residual` (u,6) is translation (m), then rotation vector (rad), from an image's reported gripper pose to its
+    prediction by the other images. Their norms are averaged. `how` names the method of prediction in words;
+    `reprojection_px` is copied.
     """
     if len(residual) < 4:
         return None
@@ -294,8 +306,9 @@ def leave_one_out(
 def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None) -> Float[ndarray, "r r"]:
     """Return the covariance (6n,6n) of the systematic errors of n gripper poses for errors of 1 rad.
 
-    These are errors of the joint angles or, if `robot` is None, of the gripper's rotation. Raises InputError if the
-    poses do not fit the arm and its joint angles.
+    Each pose has six rows: translation (m), rotation vector (rad), base axes. The errors are those of the joint angles
+    or, if `robot` is None, of the gripper's rotation. `joints` (n,dof) are in rad; None: they are computed from the
+    poses. Raises InputError if the poses do not fit the arm and its joint angles.
     """
     if robot is None:
         if joints is not None:
@@ -311,7 +324,10 @@ def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | Non
 
 
 def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
-    """Return `values` as an array of floats; raise InputError, naming `name` and `shape`, unless they are numbers."""
+    """Return `values` as an array of floats of any shape; raise InputError unless they are numbers.
+
+    The message states `name`, the argument's name, and `shape`, the expected shape in words.
+    """
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -319,7 +335,10 @@ def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:
 
 
 def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
-    """Return `transforms` as an array (n,4,4); raise InputError, naming `name`, unless all are rigid."""
+    """Return `transforms` as an array (n,4,4) with exact rotations; raise InputError unless all are nearly rigid.
+
+    The message states `name`, the argument's name.
+    """
     stack = _numbers(transforms, name, "(n,4,4)")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")

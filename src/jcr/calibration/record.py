@@ -72,7 +72,7 @@ NAMES = {
 
 
 def as_json(finding: Finding) -> dict[str, Any]:
-    """Return a finding as JSON: its fields, and its text and remedy in words."""
+    """Return a finding as a JSON object: its fields, and its message (key `text`) and remedy in words."""
     return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
 
 
@@ -92,7 +92,10 @@ def derived(findings: Sequence[Finding]) -> dict[str, Any]:
 
 
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
-    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file."""
+    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file.
+
+    The values are of any type, because they are read from JSON.
+    """
     if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 
@@ -181,12 +184,12 @@ class Outcome:
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Pose of a camera on the gripper; raises InputError for a fixed one, RejectedError without a calibration."""
+        """Pose (m) of a camera on the gripper; raises InputError for a fixed one, RejectedError without calibration."""
         return self._require(self.on_gripper, "gripper")
 
     @property
     def base_from_camera(self) -> Float[ndarray, "4 4"]:
-        """Pose of a fixed camera; raises InputError for one on the gripper, RejectedError without a calibration."""
+        """Pose (m) of a fixed camera; raises InputError for one on the gripper, RejectedError without calibration."""
         return self._require(self.on_base, "base")
 
     def _require(self, matrix: Float[ndarray, "4 4"] | None, mount: Mount) -> Float[ndarray, "4 4"]:
@@ -209,12 +212,15 @@ class Outcome:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the calibration is accepted apart from the required accuracy, so that later stages can use it."""
+        """Whether no finding rejects, apart from a missed required accuracy, so that later stages can use the result."""
         return verdict_of(one for one in self.findings if one is not self.short) != "rejected"
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings in words, without a missed accuracy, the reason of a rejection, and warnings that follow from it."""
+        """Warnings in words, without a missed accuracy, the reason of a rejection, and warnings that follow from it.
+
+        Further findings that reject are included.
+        """
         first = self.short if self.converged else self.findings[0]
         said = without_consequences(self.findings)
         return [sentence(one) for one in said if one.severity != "informs" and one is not first]
@@ -225,7 +231,7 @@ class Outcome:
         return sum(image.used for image in self.images)
 
     def with_findings(self: AnyOutcome, *findings: Finding) -> AnyOutcome:
-        """Return the calibration with more findings, all of them sorted by `strongest_first`."""
+        """Return the calibration with more findings, all of them sorted by `strongest_first`; its covariance stays."""
         return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     def with_notes(self: AnyOutcome, *notes: str) -> AnyOutcome:
@@ -288,7 +294,12 @@ class Calibration(Outcome):
     @computed_field
     @property
     def robot_errors(self) -> dict[str, Any]:
-        """Systematic robot errors as JSON: size in degrees, part per axis that the fit leaves, joint offsets."""
+        """Systematic robot errors as JSON: `systematic_deg`, `translation_mm` and `rotation_deg`, and `joints`.
+
+        `systematic_deg` is their size (`RobotNoise.systematic`); `translation_mm` and `rotation_deg` are the part per
+        axis that the fit leaves. `joints` lists the offset and standard deviation of each joint (degrees); null for an
+        unknown arm.
+        """
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
@@ -320,7 +331,10 @@ class Calibration(Outcome):
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance of the translation (m), rotation vector (rad) and log scale, as in records.COVARIANCE_ORDER."""
+        """Covariance of the translation (m), rotation vector (rad) and log scale, as in records.COVARIANCE_ORDER.
+
+        Axes are those of the gripper, or of the base for a fixed camera.
+        """
         return self.uncertainty.covariance
 
     @property
@@ -342,7 +356,8 @@ class Calibration(Outcome):
     def on_fixed_camera(self) -> "Calibration":
         """Return the calibration of a fixed camera, with base_from_camera and gripper_from_object.
 
-        `self` must be made with gripper_from_base in place of base_from_gripper.
+        `self` must be calibrated from gripper_from_base in place of base_from_gripper; its gripper_from_camera is then
+        base_from_camera, and its base_from_recon is gripper_from_object.
         """
         transforms = {
             "on_gripper": None,
@@ -361,7 +376,8 @@ class Calibration(Outcome):
     def with_finding(self, finding: Finding) -> "Calibration":
         """Return the calibration with s·sᵀ added to its covariance, s being the shift that `finding` states.
 
-        The shift changes transform and scale and, if they were estimated, the intrinsics. The finding is not added.
+        The shift (COVARIANCE_ORDER) changes transform and scale and, if they were estimated, the intrinsics. The
+        finding is not added. Without a shift, the calibration is returned unchanged.
         """
         if finding.shift is None:
             return self
@@ -374,7 +390,8 @@ class Calibration(Outcome):
     ) -> "Calibration":
         """Return the calibration with a verdict on every image of the capture, and with the notes of reconstruction.
 
-        Images that were not registered are added as unused.
+        The images of `self` must be those that `reconstruction` registered; the others are added as unused. For given
+        camera poses, both arguments are the same PosePairs.
         """
         own = dict(zip(reconstruction.image_index.tolist(), self.images, strict=True))
         why = f"not registered by {reconstruction.backend}"
@@ -390,9 +407,10 @@ class Calibration(Outcome):
     ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
         """Return the base-frame coordinates (m) of points given by pixel and depth, and their covariances (m²).
 
-        `pixel` (…,2) are pixels of the distorted image, `depth_m` (…) the z coordinates in the camera frame. The
-        covariances include the errors of intrinsics, transform and reported gripper pose, but not those of `pixel` and
-        `depth_m`. Raises InputError for a fixed camera or without intrinsics.
+        `pixel` (…,2) are pixels (x, y) of the distorted image, `depth_m` (…) the z coordinates in the camera frame.
+        `base_from_gripper` (4,4) is the reported gripper pose of the image. The covariances include the errors of
+        intrinsics, transform and reported gripper pose, but not those of `pixel` and `depth_m`. Raises InputError for a
+        fixed camera or without intrinsics.
         """
         x = self.gripper_from_camera
         if self.intrinsics is None:
@@ -469,7 +487,8 @@ def failed_calibration(
 ) -> FailedCalibration:
     """Return the result for a capture that could not be reconstructed; `findings` are the reasons.
 
-    `backend` is the name of the last back end, `timings_s` the seconds of each stage.
+    `backend` is the name of the last back end, `timings_s` the seconds of each stage by name. `attempts` are the
+    reconstructions that were tried.
     """
     unregistered = (ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images)
     return FailedCalibration(

@@ -47,10 +47,13 @@ def better_poses(
 ) -> Float[ndarray, "c 4 4"]:
     """Return `count` gripper poses to add that reduce the predicted uncertainty most, best first.
 
-    `base_from_gripper` and `robot` are the poses of the capture and the prior of their errors. The candidates are
-    random poses (`candidate_poses`) in the box `reach` (min, max; m, base frame), drawn with `seed`.
+    The uncertainty is that of a point at the scene distance (`total_uncertainty`). `base_from_gripper` and `robot` are
+    the poses of the capture and the prior of their errors. The candidates are random poses (`candidate_poses`) with
+    gripper positions in the box `reach` (rows min, max; m, base frame), drawn with `seed`. `reach` None: the box of the
+    capture's positions, enlarged by a quarter.
+
     `is_likely` returns a mask of the poses whose images are likely to register; other candidates are used only if the
-    mask is empty.
+    mask is empty. None: all candidates are used.
     """
     now, x = base_from_gripper, assumptions.gripper_from_camera
     if count == 0:
@@ -75,7 +78,10 @@ def better_poses(
 def predictions(
     assumptions: Assumptions, base_from_gripper: Poses, robot: RobotErrorPrior, added: Float[ndarray, "c 4 4"]
 ) -> Callable[[int], Uncertainty]:
-    """Return a function that predicts the calibration's uncertainty with the first k of the `added` poses, given k."""
+    """Return a function that predicts the calibration's uncertainty with the first k of the `added` poses, given k.
+
+    `base_from_gripper` and `robot` are the present gripper poses and the prior of their errors.
+    """
 
     def predicted(count: int) -> Uncertainty:
         """Return the predicted uncertainty with the first `count` added poses."""
@@ -95,8 +101,9 @@ def next_poses(
     """Return records of the added poses, each with the uncertainty expected once this and all earlier ones are added.
 
     `names` are the images of the poses in `base_from_gripper`; `predicted` is the function that `predictions` returns.
-    Given the `reported` uncertainty of the calibration, the expected one is that times the predicted ratio, because
-    images and robot may differ from the assumptions of the prediction.
+    With the `reported` uncertainty of the calibration, the expected one is `reported` times the predicted ratio of
+    after to before. The reason is that images and robot may differ from the assumptions of the prediction. None: the
+    predicted uncertainty is used as it is.
     """
     found = []
     for count, pose in enumerate(added, start=1):
@@ -121,7 +128,10 @@ def next_poses(
 
 
 def assumptions_of(case: Case) -> Assumptions:
-    """Return the assumptions of predictions: new images and gripper poses are like the used ones of the case."""
+    """Return the assumptions of predictions: new images and gripper poses are like the used ones of the case.
+
+    If the case's images were not adjusted, camera poses are assumed to be given and exact (`Assumptions.camera` None).
+    """
     used, metric_std = case.base_from_gripper[case.used], case.reconstruction.metric_std
     assumptions = assumptions_of_poses(case.hand_eye, used, metric_std)
     if case.adjusted is None or (distance := case.scene_distance_m) is None:
@@ -145,10 +155,10 @@ def assumptions_of_poses(
 
 
 def reached(uncertainty: Uncertainty, at: Where) -> tuple[float, float]:
-    """Return the bounds (mm, degrees) on 95 % of the errors that `at` selects.
+    """Return the bounds on 95 % of the translation errors (mm) and rotation errors (degrees) that `at` selects.
 
-    "seen": a point seen by the camera; "camera": the camera's pose; "scene": mapped points, or a seen point if the
-    uncertainty has no scene.
+    The value "seen" selects a point seen by the camera, "camera" the camera's pose. The value "scene" selects mapped
+    points, or a seen point if the uncertainty has no scene.
     """
     covariance, scene, seen = uncertainty.covariance, uncertainty.scene, uncertainty.seen
     if at == "camera":
@@ -171,8 +181,9 @@ def advised(
 ) -> Calibration:
     """Return the calibration with its point uncertainty, the required accuracy, and the gripper poses to add.
 
-    Poses are proposed if the required accuracy is not reached or `next_poses` requests them. `gripper` and `robot` are
-    those of the registered images. `scene` is None for a calibration from camera poses.
+    Poses are proposed if the required accuracy is not reached, if `options.next_poses` requests them, or if the
+    calibration is rejected. A missed accuracy is also added as a finding. `gripper` (base_from_gripper) and `robot`,
+    the prior of its errors, are those of the registered images. `scene` is None for a calibration from camera poses.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
     x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty

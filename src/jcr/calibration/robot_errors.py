@@ -33,15 +33,15 @@ class RobotErrorPrior:
     """Finding that the poses do not fit the arm that the capture names; None if they fit or no arm is named."""
 
     def of(self, poses: Int[ndarray, " m"]) -> "RobotErrorPrior":
-        """Return the prior of the errors of some poses, given by their indices."""
+        """Return the prior of the errors of some poses, given by their indices, in the order of the indices."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
     def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
         """Return the covariance of the systematic errors (size 1 rad) of this prior's poses, then of `added` poses.
 
-        `base_from_gripper` are the poses of this prior. Inverse kinematics of an added pose starts at the joint angles
-        of the nearest of these poses.
+        Each pose has six rows: translation (m), rotation vector (rad), base axes. `base_from_gripper` are the poses of
+        this prior. Inverse kinematics of an added pose starts at the joint angles of the nearest of these poses.
         """
         if len(added) == 0:
             return self.systematic
@@ -56,9 +56,9 @@ def robot_errors(
 ) -> RobotErrorPrior:
     """Return the prior covariance of systematic errors of a capture's gripper poses, then of a `later` capture's.
 
-    Raises InputError if the poses do not fit the arm of the option `robot`, and for any arm if all poses are too long
-    by one factor for their joint angles (LengthError). An arm that only the capture names and that the poses do not fit
-    is not used.
+    Raises InputError if the poses do not fit the arm of the option `robot`. Raises LengthError for any arm if all poses
+    are too long by one factor for their joint angles. An arm that only the capture names and that the poses do not fit
+    is not used; `unused` of the result is then a finding.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:
@@ -78,8 +78,9 @@ def robot_errors(
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
     """Return the prior covariance of systematic errors of gripper poses, for an arm or (None) an unknown robot.
 
-    `joints` are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the poses do not
-    fit the arm and the angles.
+    The covariance is that for an error size of 1 rad (`RobotErrorPrior.systematic`). `gripper` holds base_from_gripper
+    (m). `joints` (n,dof) are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the
+    poses do not fit the arm and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))
@@ -98,6 +99,9 @@ def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the part of a covariance of poses (6 rows and columns per pose) for the poses of these indices."""
+    """Return the part of a covariance of poses for the poses of these indices, in their order.
+
+    Both matrices have six rows and columns per pose.
+    """
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

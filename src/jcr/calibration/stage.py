@@ -108,8 +108,8 @@ def fit_poses(
 ) -> Case:
     """Fit the hand-eye transform to camera poses; known scale, length and height are priors of the fit.
 
-    `robot` is the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two
-    registered images.
+    A known length is a prior only if a height is given too, or if the fit without the length is rejected. `robot` is
+    the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two registered images.
     """
     evidence, rows = reconstruction.evidence, reconstruction.image_index
     if len(rows) < 2:
@@ -158,8 +158,9 @@ def fit_poses(
 def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
     """Calibrate from given pairs of gripper and camera poses, without images.
 
-    For metric camera poses, an estimated scale other than 1 shows a wrong marker size; if the motions do not determine
-    the scale, it is assumed to be 1.
+    For metric camera poses, an estimated scale other than 1 shows a wrong marker size. If the motions do not determine
+    the scale, it is assumed to be 1. Raises InputError for invalid options, and for poses that do not fit the option
+    `robot`.
     """
     check_options(options := options or CalibrateOptions())
     gripper = pairs.base_from_gripper
@@ -177,7 +178,8 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
     """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention.
 
-    `robot` is the error prior of the gripper poses of `pairs`.
+    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`, which
+    needs images.
     """
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
@@ -213,6 +215,6 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
 
 
 def is_one(hand_eye: Calibration) -> bool:
-    """Return whether |log scale| is below METRIC_STD or below three of its standard deviations."""
+    """Return whether the scale counts as 1: |log scale| is below METRIC_STD or below three standard deviations."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

@@ -52,7 +52,7 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """Return the summary for the terminal: verdict, transform, accuracy and warnings, in at most `most` - 2 lines.
 
-    For a rejected calibration, cause and remedy replace transform and accuracy.
+    The caller adds the two other lines. For a rejected calibration, cause and remedy replace transform and accuracy.
     """
     limit = ""
     if (required := content.requirement) is not None:
@@ -113,7 +113,8 @@ def _result(content: Calibration) -> list[str]:
 def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[str]:
     """Return the lines with cause and remedy of a rejection, then the warnings; at most `most` lines.
 
-    The text `proposed` (images to add) replaces the remedy of a missed accuracy if more images are that remedy.
+    `findings` are sorted (`strongest_first`). The text `proposed` (images to add) replaces the remedy of a missed
+    accuracy if more images are that remedy. If lines are left out, the last line states their number.
     """
 
     def advice(finding: Finding) -> str:
@@ -231,9 +232,10 @@ def _board(board: BoardFound) -> dict[str, str]:
 
 
 def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Float[ndarray, "7 7"]) -> str:
-    """Return the least certain direction of the translation, e.g. "along the optical axis: ±4.0 mm".
+    """Return the least certain direction of the translation, e.g. "along the optical axis: ±4.0 mm" (1σ).
 
-    `covariance` is that of the calibration, in COVARIANCE_ORDER.
+    `covariance` is that of the calibration, in COVARIANCE_ORDER along gripper axes. A camera axis is named if it is
+    within 30° of the direction, else the direction is stated in gripper axes.
     """
     variance, vectors = np.linalg.eigh(covariance[:3, :3])
     direction, std_mm = vectors[:, 2], 1e3 * float(np.sqrt(variance[2]))
@@ -248,7 +250,7 @@ def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Floa
 
 
 def seen_in_words(seen: SeenAndCorners) -> str:
-    """Return a sentence with the point uncertainty across the ray, along the ray, and in a corner of the image."""
+    """Return a sentence with the point uncertainty (95 %, mm) across the ray, along the ray, and in an image corner."""
     return (
         f"point uncertainty: {significant(seen.lateral_95_mm)} mm across the ray and "
         f"{significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a corner of the "
@@ -259,7 +261,8 @@ def seen_in_words(seen: SeenAndCorners) -> str:
 def given_in_words(given: WithGivenIntrinsics) -> str:
     """Return a sentence with the distance between one point's positions by the given and the estimated intrinsics.
 
-    Each set of intrinsics is used with its own transform.
+    Each set of intrinsics is used with its own transform. The sentence also states the point uncertainty (95 %, mm)
+    with the given ones.
     """
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "

@@ -55,13 +55,16 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Return a finding about `images`; `known` sets its fields, from joints to intrinsics_shift, and its details."""
+        """Return a finding about `images`; `known` sets fields with numbers and, under all other names, its details.
+
+        These fields are those in NUMBERS: `joints`, `value`, `std`, `p`, `shift` and `intrinsics_shift`.
+        """
         sizes = {name: known.pop(name) for name in NUMBERS if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Part s·sᵀ of the calibration's covariance due to the shift s, in COVARIANCE_ORDER."""
+        """Part s·sᵀ of the calibration's covariance due to the shift s, in COVARIANCE_ORDER; zero without a shift."""
         shift = np.zeros(7) if self.shift is None else np.array(self.shift)
         return np.outer(shift, shift)
 
@@ -120,7 +123,10 @@ class Quantities(dict[str, Any]):
 
     @staticmethod
     def of(finding: Finding) -> "Quantities":
-        """Return the values that the templates of a finding's message and remedy use, by name."""
+        """Return the values that the templates of a finding's message and remedy use, by name.
+
+        Each number is also given in mm (m times 1000), degrees and percent, under names such as `mm` or `std_percent`.
+        """
         named = Quantities(images=_Images(finding.images), concerns=_Text(finding.concerns))
         for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
             if isinstance(one, str):
@@ -151,7 +157,7 @@ class Quantities(dict[str, Any]):
 
 
 def joined(words: Iterable[str]) -> str:
-    """Return the words as an enumeration: "a, b and c"."""
+    """Return the words as an enumeration: "a, b and c"; at least one word is needed."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
 
@@ -167,7 +173,7 @@ def remedy(finding: Finding) -> str:
 
 
 def unobservable(finding: Finding) -> str:
-    """Return in words the direction of a finding of kind UNOBSERVABLE, which is unobservable or nearly so."""
+    """Return the direction of a finding of kind UNOBSERVABLE in words, with "nearly unobservable" before a weak one."""
     return "{nearly:nearly unobservable: |}{direction}".format_map(Quantities.of(finding))
 
 
@@ -212,7 +218,8 @@ def is_lasting(finding: Finding) -> bool:
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings by severity; within a severity those on images, then those that explain others, then the rest.
 
-    Of the rest, gripper poses that contradict the images come first: they leave nothing to conclude from the motions.
+    Findings on images are those of the group "images", such as blur. Of the rest, gripper poses that contradict the
+    images come first: they leave nothing to conclude from the motions.
     """
 
     def place(finding: Finding) -> tuple[int, bool, bool, bool]:
@@ -225,12 +232,18 @@ def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def is_explained(findings: Sequence[Finding]) -> bool:
-    """Test whether the first of sorted findings rejects and explains others; more images do not help then."""
+    """Test whether the first of the findings, sorted by `strongest_first`, rejects and explains others.
+
+    More images do not help then.
+    """
     return bool(findings) and findings[0].severity == "rejects" and is_cause(findings[0])
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return sorted findings; if the first one rejects, the findings that it explains are left out."""
+    """Return sorted findings; if the first one rejects, the findings that it explains are left out.
+
+    `findings` must be sorted by `strongest_first`.
+    """
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings

@@ -31,7 +31,7 @@ class Requirement:
 
     @property
     def met(self) -> bool:
-        """Whether the reached accuracy is at least the required one."""
+        """Whether both reached bounds are at most the required ones."""
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
 
     @property

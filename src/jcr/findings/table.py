@@ -116,7 +116,7 @@ class FindingKind(StrEnum):
     row: KindRow
 
     def __new__(cls, name: str, row: KindRow) -> "FindingKind":
-        """Make a member from its name and its row of the table."""
+        """Make a member from its name and its row of the table; the name becomes the member's value."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.row = row

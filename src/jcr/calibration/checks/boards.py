@@ -32,7 +32,11 @@ to 250 mm have up to 3.6 mm."""
 
 
 def check_boards(case: Case) -> Case:
-    """Return the case with findings on boards: not found, moved, stretched, bent, or of a size that was estimated."""
+    """Return the case with findings on boards: not found, moved, stretched, bent, or of a size that was estimated.
+
+    If a board was adjusted, its record is set too (`Calibration.board`). A case without the option --board is
+    unchanged.
+    """
     boards = case.reconstruction.tracks.boards
     if boards is None:
         return case
@@ -63,8 +67,9 @@ def check_boards(case: Case) -> Case:
 def check_board_shapes(case: Case) -> Case:
     """Return the case without the corners of boards that moved, and without the prior on the shape of stretched ones.
 
-    The corners of a moved board are left out in the fewer images before or after the motion (`Boards.elsewhere`). The
-    images are then adjusted again. `check_boards` reports both errors.
+    A board moved if its position in the scene differs between images (`images_of_motion`). Its corners are left out in
+    the smaller group of images, which `Boards.elsewhere` then lists. A board is stretched if its print has different
+    scales along its two sides. The images are then adjusted again. `check_boards` reports both errors.
     """
     for _ in range(MOST_MOTIONS):
         tracks, adjusted = case.reconstruction.tracks, case.adjusted
@@ -87,7 +92,11 @@ def check_board_shapes(case: Case) -> Case:
 
 
 def _adjusted_again(case: Case, tracks: Tracks) -> Case:
-    """Return the case with other tracks after bundle adjustment; findings of the checks before stay."""
+    """Return the case after bundle adjustment with other tracks, starting from the fit to camera poses.
+
+    `tracks` replace those of the reconstruction; their image indices count the registered images. Findings of earlier
+    checks are kept.
+    """
     made = replace(case.reconstruction, tracks=tracks)
     changed = replace(
         case, reconstruction=made, hand_eye=case.pose_fit, fit=None, chosen_tracks=None, adjusted=None
@@ -98,11 +107,13 @@ def _adjusted_again(case: Case, tracks: Tracks) -> Case:
 
 
 def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:
-    """Return the adjusted images in which a board is at another place than in more images; empty if none moved.
+    """Return the indices of images in which a board is at another place than in more images; empty if none moved.
 
-    Each image gives the motion δ of a board's body that fits its corners best. Under the alternative hypothesis, δ
-    differs between the images before and after one image, or between one image and all others. An F test compares
-    this difference with the scatter of δ within both groups, which includes the errors of the camera poses.
+    The indices count the adjusted images. Each image gives the motion δ of a board (translation, rotation vector) that
+    fits its corners best. Under the alternative hypothesis, δ differs between the images before and after one image, or
+    between one image and all others. An F test compares this difference with the scatter of δ within both groups, which
+    includes the errors of the camera poses. If several boards or tests are significant, only the most significant one
+    counts.
     """
     observations, shapes = adjusted.problem.observations, adjusted.problem.boards
     assert observations is not None and shapes is not None
@@ -135,9 +146,10 @@ def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:
 
 
 def _misfit(information: Float[ndarray, "n 6 6"], pull: Float[ndarray, "n 6"]) -> float:
-    """Return the weighted squared scatter (px²) of n motions about their mean, which is fitted.
+    """Return the sum of squared deviations (px²) of n motions from their mean, both weighted by `information`.
 
-    `information` is the inverse covariance A of each motion δ, `pull` is A δ.
+    Each motion δ is a translation, then a rotation vector. `information` (n,6,6) is its inverse covariance A for a
+    pixel noise of 1 px, `pull` (n,6) is A δ.
     """
     own = sum(float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0]) for a, b in zip(information, pull, strict=True))
     a, b = information.sum(0), pull.sum(0)
@@ -145,9 +157,10 @@ def _misfit(information: Float[ndarray, "n 6 6"], pull: Float[ndarray, "n 6"]) -
 
 
 def stretch_of(adjusted: Solution) -> tuple[float, float]:
-    """Return the largest relative excess of a board's first side over its second, and its standard deviation.
+    """Return the relative stretch of a board's x axis over its y axis, and its standard deviation (0.001: 0.1 %).
 
-    Both are 0 if no board is adjusted.
+    Of several boards, the one with the largest absolute stretch counts. Both numbers are 0 if no board is adjusted, or
+    if none has enough corners to estimate its stretch.
     """
     shapes, columns = adjusted.problem.boards, adjusted.problem.columns.boards
     if shapes is None or not (ways := np.isin(shapes.shape_std, (STRETCH_STD, STRETCHED_STD))).any():
@@ -158,7 +171,10 @@ def stretch_of(adjusted: Solution) -> tuple[float, float]:
 
 
 def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
-    """Return the record of the adjusted boards: size, residuals, flatness, and positions in the base frame."""
+    """Return the record of the adjusted boards: size, residuals, flatness, and positions in the base frame.
+
+    `adjusted` must contain boards; `boards` states their name and printed size. BoardFound defines units and terms.
+    """
     problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
     assert shapes is not None and problem.observations is not None
     size, by_unknown = size_of_boards(adjusted)

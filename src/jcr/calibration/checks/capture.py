@@ -42,8 +42,8 @@ def check_registered(case: Case) -> Case:
     """Return the case with a finding if only the motions of all images, not those of the used ones, are observable.
 
     The remedy is then a better reconstruction and not other motions. If the poses of all registered images would be
-    observable but few of them agree, the used images agree by chance; their unobservable directions are not reported.
-    Nothing is concluded from gripper poses that contradict the images.
+    observable but few of them agree, the used images agree by chance. The findings on their unobservable directions are
+    then removed instead. Nothing is concluded from gripper poses that contradict the images.
     """
     hand_eye, capture = case.hand_eye, case.capture
     unseen = hand_eye.observability.findings
@@ -69,7 +69,8 @@ def check_pieces(case: Case) -> Case:
     """Return the case with a finding if the reconstruction is in pieces: groups of images that contradict each other.
 
     With the hand-eye transform of the largest group, each image gives a value of base_from_recon. The values agree
-    within a piece; wrong gripper poses give scattered values instead.
+    within a piece; wrong gripper poses give scattered values instead. Values agree if the gripper poses that they
+    predict differ by at most SAME. Accepted calibrations are not tested.
     """
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
@@ -97,7 +98,10 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Return the case with findings on an unused arm model, images rotated on reading, and the back end's warnings."""
+    """Return the case with findings on an arm model that does not fit, images rotated on reading, and back-end warnings.
+
+    An arm model that the gripper poses do not fit is not used (`RobotErrorPrior.unused`).
+    """
     first = (case.robot.unused, how_rotated(case.capture))
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
@@ -134,7 +138,11 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 
 
 def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the fraction of an image's features that have three or more (TWINS) similar features elsewhere in it."""
+    """Return the fraction of an image's SIFT features that have three or more (TWINS) similar features elsewhere in it.
+
+    Features are similar if their descriptors differ by less than FARTHEST / 2; "elsewhere" means farther than APART_PX.
+    The image (RGB) is first reduced to a long side of TWINS_AT. The result is 0 with fewer than MIN_TWINS features.
+    """
     height, width = image.shape[:2]
     shrunk = min(1.0, TWINS_AT / max(height, width))
     x_px, descriptors = detect(grey_of(image, (round(shrunk * width), round(shrunk * height))))
@@ -146,7 +154,10 @@ def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return the findings of the images of a rejected calibration: repetitive or many blurred images now reject."""
+    """Return the findings on a rejected calibration's images, of which some now have the severity "rejects".
+
+    These are repetitive texture, and blur of more than a fraction MANY of the images.
+    """
     return tuple(
         replace(one, severity="rejects")
         if one.kind is FindingKind.REPETITIVE

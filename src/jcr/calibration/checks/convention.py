@@ -69,7 +69,7 @@ class PoseConvention:
 
     @property
     def agrees(self) -> bool:
-        """Whether the error is small enough for an accepted calibration."""
+        """Whether both estimated robot errors per axis are at most MAX_NOISE, the limit for an accepted calibration."""
         small = self.translation_mm <= 1e3 * MAX_NOISE[0], self.rotation_deg <= np.degrees(MAX_NOISE[1])
         return all(map(bool, small))
 
@@ -111,9 +111,12 @@ def better_reading(
 ) -> tuple[PoseConvention, PoseConvention] | None:
     """Return the pose convention that fits much better than the given one, then the given one; None if none does.
 
-    `rows` are the gripper poses of the m camera poses; None: all, one each. `by_name` holds the gripper poses that the
-    images have if they are sorted by name, as numbers (key True) or as text (key False). `solved` is a fit of the given
-    poses to the camera poses alone; None: it is computed.
+    Its `misfit` must be below that of the given poses divided by BETTER, its errors acceptable (`agrees`), and most
+    images (MIN_SHARE) in agreement. None is also returned if the given poses fit already (FITS).
+
+    `rows` holds the index of the gripper pose of each of the m camera poses; None: both arrays have the same order and
+    length. `by_name` holds the gripper poses that the images have if they are sorted by name, as numbers (key True) or
+    as text (key False). `solved` is a fit of the given poses to the camera poses alone; None: it is computed.
     """
     rows = np.arange(len(base_from_gripper)) if rows is None else rows
     n = len(rows)
@@ -143,7 +146,8 @@ def _better_adjusted(
     """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
 
     Camera poses from images without given intrinsics are too poor to select a convention, before the images are
-    adjusted. The candidates are the ADJUSTED best ones by their closed form, if it fits better than the given poses'.
+    adjusted. Only the ADJUSTED candidates with the smallest closed-form error are adjusted, if it is below that of the
+    given poses. `by_name` is that of `better_reading`.
     """
     rows = case.reconstruction.image_index
     given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
@@ -199,20 +203,28 @@ def convention_finding(
 def _solved(
     candidate: _Candidate, recon_from_camera: Poses, solved: Calibration | None = None
 ) -> PoseConvention:
-    """Return a candidate convention with the misfit of a calibration, which is `solved` or, if None, computed."""
+    """Return the record of a candidate convention, with the misfit of its hand-eye fit to the camera poses.
+
+    `recon_from_camera` are the camera poses of all registered images. `solved` is that fit; None: it is computed.
+    """
     name, remedy, base_from_gripper, image = candidate
     fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], camera_errors="none")
     return _reading(name, remedy, fit)
 
 
 def _reading(name: str, remedy: str, fit: Calibration) -> PoseConvention:
-    """Return the record of a convention with the misfit of its calibration."""
+    """Return the record of a convention: name, remedy in words, and robot errors of its calibration `fit`."""
     metres, radians = fit.robot_noise.together
     return PoseConvention(name, remedy, 1e3 * metres, float(np.degrees(radians)), int(fit.inliers.sum()))
 
 
 def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> list[_Candidate]:
-    """Return the candidates whose angles between poses fit those of the camera poses: usual ones, then the nearest."""
+    """Return the candidates whose rotation angles between poses agree best with those of the camera poses.
+
+    The measure is the 60 % quantile of the angle differences over all image pairs. Candidates up to twice the smallest
+    value, plus SAME_ANGLE, are returned, at most SOLVED. Usual mistakes come first (the first USUAL candidates), then
+    the others by this measure.
+    """
     camera_angle, gaps = _angles(recon_from_camera), []
     for _, _, gripper, image in candidates:
         gap = np.abs(_angles(gripper) - camera_angle[np.ix_(image, image)])
@@ -226,7 +238,8 @@ def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> li
 def _rough_error(candidate: _Candidate, recon_from_camera: Poses) -> float:
     """Return the misfit (m) of a candidate convention in a closed-form calibration from the images that agree best.
 
-    It is infinite if the scale is negative, as for mirrored poses. A fit takes 100 times as long.
+    The misfit is the rms error of these images (`least_trimmed`), with angles (rad) multiplied by ARM. It is infinite
+    if the scale is negative, as for mirrored poses. A fit takes 100 times as long.
     """
     _, _, base_from_gripper, image = candidate
     camera = recon_from_camera[image]
@@ -245,8 +258,8 @@ def _candidates(
 ) -> Iterator[_Candidate]:
     """Yield the given poses, then candidates that each correct one assumed mistake; usual mistakes come first.
 
-    `every_pose` are all gripper poses of the capture, `rows` those of the m camera poses. `by_name` holds all gripper
-    poses in the orders of the image names, as in `better_reading`.
+    `every_pose` are all gripper poses of the capture; `rows` are the indices of those that belong to the m camera
+    poses. `by_name` holds all gripper poses in the orders of the image names, as in `better_reading`.
     """
     base_from_gripper, every = every_pose[rows], np.arange(len(rows))
     yield ("they are given", "", base_from_gripper, every)

@@ -127,8 +127,9 @@ OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
 def check_effects(case: Case) -> Case:
     """Return the case with findings on effects that the model lacks, such as rolling shutter, camera slip or arm sag.
 
-    With adjusted images, the calibration then includes the effects as parameters. A fit to camera poses is tested only
-    for effects that depend on the image order.
+    With adjusted images, the calibration then includes the effects as parameters. Only the findings are added if the
+    tests also use consecutive rejected images (`with_rejected_runs`). A fit to camera poses is tested only for effects
+    that depend on the image order.
     """
     if not case.is_open:
         return case
@@ -158,7 +159,11 @@ def check_effects(case: Case) -> Case:
 
 
 def of_case(case: Case) -> Adjustment:
-    """Return the case's adjustment in the form that the tests of effects need; many points are reduced to a subset."""
+    """Return the case's adjustment in the form that the tests of effects need (hypotheses.Adjustment).
+
+    With MIN_IMAGES or more used images, a case is adjusted again with a random subset of its points if it has more than
+    MOST_POINTS, or too many observations for MOST_BYTES of memory.
+    """
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
     if len(case.used) >= MIN_IMAGES and is_many:
@@ -187,7 +192,8 @@ def effects_of_fit(
     """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
     Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
-    `known` are keyword arguments of `pose_problem`, such as the covariance of the camera poses.
+    `known` are further keyword arguments of `pose_problem`: `camera_covariance`, `error_covariance`, `noise_floor`,
+    `priors`.
     """
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
@@ -205,7 +211,7 @@ def effects_of_fit(
 
 
 def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
-    """Return the mask of the used images, extended by rejected images whose neighbour is rejected too."""
+    """Return the mask of the used images, extended by rejected images next to another rejected image in image order."""
     rejected = np.pad(~used, 1)
     return used | rejected[:-2] | rejected[2:]
 
@@ -213,9 +219,11 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 def effects(
     model: Adjustment, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
 ) -> tuple[Adjustment, tuple[Finding, ...]]:
-    """Return the adjustment with at most `at_most` confirmed effects on one camera and its arm, and their findings.
+    """Return the adjustment with the confirmed effects on its camera and arm, and one finding for each effect.
 
-    Effects of the kinds `passed` are not tested.
+    Each round adds the most significant effect on the camera or on the poses; of two, the one that explains the other.
+    The rounds end if no effect is significant or `at_most` are found. Effects of the kinds `passed`, and of kinds that
+    `model` includes already, are not tested.
     """
     findings, passed = list[Finding](), {*passed, *(row.kind for row in model.rows)}
     while len(findings) < at_most:
@@ -239,9 +247,10 @@ def effects(
 
 
 def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
-    """Return the most significant effect on the camera, or else on the poses, and its finding; None without one.
+    """Return Wald's test of the most significant effect that is confirmed, and its finding; None without one.
 
-    Kinds in `passed` are not tested. There is no effect if the best estimate is implausibly large, or if poses and
+    `of_camera` True tests effects on the camera, False effects on the reported poses. Kinds in `passed` are not tested.
+    There is no effect if the best estimate is implausibly large (`Policy.largest`). There is none either if poses and
     images contradict each other even with the effect estimated: they then have another fault. A motion counts only if
     it is more significant in the true order of the images than in nearly all random orders.
     """
@@ -267,10 +276,14 @@ def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -
 
 
 def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> list[Row]:
-    """Return the rows to confirm, of the camera or else of the poses, the smallest p-value of the score test first.
+    """Return the possible effects to confirm, the smallest p-value of the score test first; one per kind of effect.
 
-    The score test finds every effect on the camera, except given intrinsics that are wrong, because the model includes
-    their errors; these are compared with the adjusted ones. Effects on the poses are found by the confirmation alone.
+    `of_camera` True selects effects on the camera, False effects on the reported poses. At most CONFIRMED_AT_MOST are
+    returned. Kinds in `passed` are left out.
+
+    An effect on the camera must be significant in the score test. Given intrinsics that are wrong are compared with the
+    adjusted ones instead, because the model includes their errors. Effects on the poses are only ranked by the score
+    test.
     """
     if of_camera and model.camera is not None:
         passed = {*passed, *(FOCUS if FOCUS & {*passed} else ())}
@@ -291,7 +304,10 @@ def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bo
 
 
 def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
-    """Return the logarithm of the largest significant p-value of a kind of effect; given intrinsics have another one."""
+    """Return the natural logarithm of the largest p-value at which an effect of this kind is significant.
+
+    It is that of `Policy.alpha`, or of ALPHA_IF_GIVEN for wrong intrinsics that were given.
+    """
     is_given = kind is FindingKind.INTRINSICS and model.is_given
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
 
@@ -299,7 +315,8 @@ def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
 def _has_simpler_cause(test: Test, tests: Sequence[Test]) -> bool:
     """Return whether `test` is one focal length per image, and a simpler effect of `tests` explains nearly as much.
 
-    The simpler effect is a focal length that follows the distance or changes once.
+    The simpler effect is a focal length that follows the distance or changes once. It must explain a fraction
+    NEARLY_ALL of the squared focal-length differences.
     """
     if test.row.kind is not FindingKind.FOCUS_BY_IMAGE:
         return False
@@ -311,7 +328,9 @@ def _has_simpler_cause(test: Test, tests: Sequence[Test]) -> bool:
 def _explains(model: Adjustment, of_poses: Test, of_camera: Test, passed: Collection[FindingKind]) -> bool:
     """Return True if the effect on the poses is the cause of the misfit, False if the effect on the camera is.
 
-    Both are significant; each is tested again with the other one estimated.
+    Both are significant; each is tested again with the other one estimated. The cause is the effect that stays
+    significant; if both or neither does, it is the one with the smaller p-value. Effects on the poses of the kinds
+    `passed` are not tested.
     """
     assert of_camera.after is not None
     left = _best(of_camera.after, passed, False)
@@ -322,9 +341,10 @@ def _explains(model: Adjustment, of_poses: Test, of_camera: Test, passed: Collec
 
 
 def log_p_of_given(model: Adjustment) -> float:
-    """Return the logarithm of the p-value of Wald's test that the given focal lengths and principal point are exact.
+    """Return the natural log of the p-value of Wald's test that the given focal lengths and principal point are exact.
 
-    It is 0 (p = 1) for differences below OFF (1 to 1.5 % of the focal length), and without given intrinsics.
+    The statistic is compared with an F distribution. The result is 0 (p = 1) without given intrinsics. It is also 0 if
+    fx, fy, cx and cy all differ by at most OFF (1 to 1.5 % of the focal length).
     """
     assert model.camera is not None
     given = model.solution.problem.cameras[model.camera].intrinsics
@@ -338,8 +358,9 @@ def log_p_of_given(model: Adjustment) -> float:
 def finding_of(test: Test, model: Adjustment) -> Finding | None:
     """Return the finding of a significant effect, which `test` found in `model`; None if it is small.
 
-    A small effect moves the camera by less than half a standard deviation (MATERIAL), or is small in pixels. Given
-    intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
+    A small effect changes the camera's pose by less than half a standard deviation (MATERIAL) along each axis. An
+    effect on the images is also small below `Policy.least_px`, or below SURE standard deviations if each image has a
+    parameter. Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
     row, kind, after, std, estimate = test.row, test.row.kind, test.after, model.std, test.estimate
     policy, severity, images = POLICIES[kind], "warns", ()
@@ -387,7 +408,12 @@ def finding_of(test: Test, model: Adjustment) -> Finding | None:
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:
-    """Return the fields of a finding for the size, standard deviation and axis of a strain, a lean or a sag."""
+    """Return the fields of a finding for the size of an effect of the arm: keyword arguments of `Finding.of`.
+
+    They are `value` and its standard deviation `std`. A strain is a relative length error, a lean is in rad per metre
+    of reach, and a sag is in rad. Strain and sag also have a unit axis `x`, `y`, `z` in the `frame` "base" or
+    "gripper".
+    """
     estimate, covariance = test.estimate, test.covariance
     if test.row.kind is FindingKind.BASE_LEANS:
         return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
@@ -406,10 +432,11 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
 
 
 def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
-    """Return the fields of a finding for the size of an effect on the camera, and its standard deviation.
+    """Return the keyword arguments of `Finding.of` for the size of an effect on the camera, and its standard deviation.
 
-    The size is the rms of the effect's parameters; for a thin prism it is the largest displacement of a point (px); for
-    wrong intrinsics each parameter is stated. `after` is the adjustment with the effect.
+    The size `value` is the rms of the effect's parameters: px, or a relative change of the focal length. A single
+    focal-length parameter keeps its sign. For a thin prism the size is the largest displacement of a point (px). For
+    wrong intrinsics each parameter is stated instead. `after` is the adjustment with the effect.
     """
     row, value, std = test.row, test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0.0))
     problem = after.solution.problem
@@ -431,7 +458,8 @@ def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
 def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]:
     """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
-    `stds` holds the standard deviation of each tested parameter, in the units of `rows_of`.
+    `after` is the adjustment with the effect. `stds` holds the standard deviation of each tested parameter
+    (`tested_intrinsics`). Those of fx and fy are relative, those of cx and cy are in image widths.
     """
     assert after.camera is not None
     camera, shown = after.solution.problem.cameras[after.camera].intrinsics, list[str]()
@@ -459,8 +487,9 @@ def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]
 def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Case:
     """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
-    The effects were found with a subset of the points, and are now estimated from all points that memory permits.
-    Camera effects that then change the calibration by at most half a standard deviation (MATERIAL) are dropped.
+    `model` includes the effects, which were found with a subset of the points. They are now estimated from all points
+    that memory permits. Camera effects are dropped if the calibration then changes by at most half a standard deviation
+    (MATERIAL) on each axis.
     """
     free = model.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
@@ -485,10 +514,11 @@ def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Ca
 
 
 def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int, int]) -> Finding:
-    """Return the finding of a tiny difference of focal lengths, which the calibration includes, as a remark.
+    """Return a finding of a tiny difference of focal lengths with the severity "informs"; other findings unchanged.
 
-    Hundreds of images show differences that no user needs to correct: in the corner of the image by less than TINY_PX,
-    with a change `moved` of the calibration (m, rad) by less than TINY of the accuracy that grasping needs.
+    Hundreds of images show differences that no user needs to correct. They are tiny if they displace the corner of the
+    image by less than TINY_PX and change the calibration by less than TINY times LARGE_MOTION. `moved` is that change
+    of gripper_from_camera, translation (m) and rotation vector (rad); `image_size` is width and height (px).
     """
     metres, radians = np.linalg.norm(moved.reshape(2, 3), axis=1) / LARGE_MOTION
     corner_px = float(np.hypot(*image_size)) / 2 * abs(found.value or 0.0)
@@ -501,9 +531,10 @@ def with_effects(
 ) -> tuple[Solution | None, tuple[Finding, ...]]:
     """Return an adjustment with the effects on camera and arm as parameters, and the findings with remaining shifts.
 
-    The result is the effective hand-eye transform, which predicts best from reported gripper poses. Its difference from
-    the transform for the true poses, and the possible error of the scale, are the remaining shifts. A thin prism
-    becomes part of the intrinsics. Return None as adjustment if there is no effect on camera or arm.
+    `model` includes the effects that `findings` report. The adjusted X is the effective hand-eye transform, which
+    predicts best from reported gripper poses. A finding's remaining shift is the difference from the transform for the
+    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. Return None as
+    adjustment if there is no effect on camera or arm.
     """
     strains = [row for row in model.rows if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):
@@ -539,14 +570,15 @@ def with_effects(
 
 
 def as_adopted(found: Finding) -> Finding:
-    """Return the finding of an effect that the calibration includes: its shift is removed."""
+    """Return the finding of an effect that the calibration includes: its shifts (also of the intrinsics) are removed."""
     return replace(found, shift=None, intrinsics_shift=None)
 
 
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
     """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    `columns` (s,b) are the b confirmed error patterns of the poses, one standard deviation each.
+    The first seven unknowns are in COVARIANCE_ORDER. `columns` (s,b) are the b confirmed error patterns of the poses,
+    one standard deviation each; s = 6 per pose (m, rad; base axes).
     """
     straight = replace(solution.equations, confirmed=columns @ columns.T)
     return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step

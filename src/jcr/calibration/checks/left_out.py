@@ -21,7 +21,8 @@ which the other pose belongs to the image."""
 def check_pairing(case: Case) -> Case:
     """Return the case with findings on unused images whose gripper poses are exchanged, if those of used images agree.
 
-    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted.
+    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted. Images
+    with a merely wrong pose give no finding here.
     """
     kinds = {one.kind for one in case.hand_eye.findings}
     disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
@@ -36,9 +37,10 @@ def check_pairing(case: Case) -> Case:
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
     """Return findings about unused images whose reported gripper poses are exchanged, or contradicted by the image.
 
-    Unused images are registered by their features alone; camera pose and hand-eye transform then give the true gripper
-    pose. Poses are exchanged if two or more images show poses that are reported for other unused images. Images that
-    cannot be registered give no finding.
+    Unused images without a camera pose in `made` are registered by their features alone. Camera pose and hand-eye
+    transform then give the true gripper pose. A reported pose is contradicted if it differs from the true one by more
+    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images. Images
+    that cannot be registered give no finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
     used = set(made.image_index[hand_eye.inliers].tolist())

@@ -73,7 +73,12 @@ class Length:
 
 
 def check_lengths(case: Case) -> Case:
-    """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict."""
+    """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
+
+    A known length comes from a board, the option known_length, a depth camera or a network; the robot's positions count
+    as another length. Two of them contradict if they differ by more than SIGMAS standard deviations and by more than
+    LEAST. The comparison is recorded in `Calibration.lengths`.
+    """
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
 
@@ -120,7 +125,10 @@ def check_lengths(case: Case) -> Case:
 
 
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with `depth_check` set, and the log ratio of the robot's length to each known length."""
+    """Return the calibration with `depth_check` set, and a Length for each known length of the case.
+
+    `Length.off` is the logarithm of the length by the robot's positions over the stated length.
+    """
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
@@ -148,8 +156,9 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
 def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: Calibration) -> Finding:
     """Return the finding that two of the `lengths` contradict each other; a length by the robot must be `one`.
 
-    A board that contradicts the robot by up to MISPRINTED, with no other length near the board's, was printed or stated
-    at a wrong size: the result is that of the robot alone.
+    The finding rejects only if both lengths are exact (EXACT) and one is the robot's. A board that contradicts the
+    robot by up to MISPRINTED, with no other length near the board's, was printed or stated at a wrong size. The finding
+    then warns, because the result is that of the robot alone.
     """
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
@@ -184,7 +193,8 @@ def _fused(
 ) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale.
 
-    `fault` is a covariance (COVARIANCE_ORDER) that is added to the calibration's covariance.
+    `hand_eye` is the calibration without these priors, whose findings and checks are kept. `fault` is a covariance
+    (COVARIANCE_ORDER) that is added to the calibration's covariance.
     """
     adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
     assert adjusted is not None
@@ -213,7 +223,8 @@ def _fused(
 def check_predicted_focal(case: Case) -> Case:
     """Return the case with a finding if a network's focal length contradicts the given one.
 
-    The difference is added to the covariance of the intrinsics.
+    They contradict if they differ by more than OF_NETWORK standard deviations. The finding adds the difference to the
+    covariance of the intrinsics (`Finding.intrinsics_shift`).
     """
     given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
     if given is None or predicted is None:
@@ -234,7 +245,8 @@ def check_predicted_focal(case: Case) -> Case:
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
     """Return scale error and noise of the depth images, measured by the robot; None if too few features have a depth.
 
-    Raises InputError if a depth image cannot be read.
+    Measured depths are compared with the depths of reconstructed features, which `hand_eye.scale` converts to metres.
+    None is also returned without depth images. Raises InputError if a depth image cannot be read.
     """
     if capture.depths is None:
         return None
@@ -275,7 +287,11 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
 def _depths(
     capture: Capture, reconstruction: Reconstruction, scale: float
 ) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
-    """Return measured depths (m), reconstructed depths (m), and image indices of the k features that have both."""
+    """Return measured depths (m), reconstructed depths (m), and image indices of the k features that have both.
+
+    Depths are z coordinates in the camera frame; `scale` is in metres per unit of the reconstruction. The measured one
+    is that of the nearest pixel; features at depth edges are left out. Image indices count the registered images.
+    """
     tracks, depths = reconstruction.tracks, list(capture.depths or [])
     parts = [np.zeros((3, 0))]
     for k, row in enumerate(reconstruction.image_index):
