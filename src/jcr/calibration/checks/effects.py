@@ -161,8 +161,8 @@ def check_effects(case: Case) -> Case:
 def of_case(case: Case) -> Adjustment:
     """Return the case's adjustment in the form that the tests of effects need (hypotheses.Adjustment).
 
-    With MIN_IMAGES or more used images, a case is adjusted again with a random subset of its points if it has more than
-    MOST_POINTS, or too many observations for MOST_BYTES of memory.
+    A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
+    a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
     """
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
