@@ -62,7 +62,7 @@ def agreement(i, compared, others, a, b, centre, k, width, tolerance):
 
 @compiled
 @no_type_check
-def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tolerance):
+def colours_agree(i, asked, inverse_depth, colors, others, a, b, k, tolerance):
     """Count for each pixel of image i the images that show its point in the same colour, in another, or see through it.
 
     The result (3,h,w) has the three counts in this order. `asked` (h,w) is the inverse depth 1/z to test at each pixel,
@@ -70,7 +70,7 @@ def colours_agree(i, asked, inverse_depth, colors, others, a, b, centre, k, tole
     their RGB colours (0 to 1). Both are read at the nearest pixel. An image sees through the point if its matched depth
     is more than 1 % behind. An image whose matched depth is more than 1 % in front is not counted; one without depth is
     taken to see the point. Colours are the same if their Euclidean distance is below `tolerance`. `others` are the
-    indices of the images to compare; their projections `a`, `b` and `k` are as in `agreement`. `centre` is not used.
+    indices of the images to compare; their projections `a`, `b` and `k` are as in `agreement`.
     """
     h, w = asked.shape
     half, most = np.float32(0.5), np.float32(tolerance * tolerance)
