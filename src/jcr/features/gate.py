@@ -84,9 +84,10 @@ class Gate:
 
 
 def agreeing_motions(pair: Pair, angle: float, systematic: float) -> list[tuple[CameraMotion, float]]:
-    """Return the motions of an image pair that rotate by the gripper's `angle` (rad), each with its tolerance (rad).
+    """Return the motions of an image pair that rotate by about `angle` (rad), each with its tolerance (rad).
 
-    `systematic` is the share of the angle by which camera and gripper may differ systematically.
+    `angle` is that of the gripper's motion. The tolerance is SIGMAS standard deviations of the difference of both
+    angles. `systematic` is the share of the angle by which camera and gripper may differ systematically.
     """
     found = []
     for one in pair.motions:
@@ -102,11 +103,11 @@ def classify_pairs(
     systematic: float = SYSTEMATIC,
     known: RotationOfX | None = None,
 ) -> Gate:
-    """Classify image pairs by whether their camera rotation agrees with the gripper's `motion[i, j]`, i_from_j.
+    """Classify image pairs by whether their camera rotation agrees with the gripper's motion.
 
-    Pairs pass first by rotation angle alone, which may differ by the share `systematic`. The hand-eye rotation R_X is
-    estimated from these. Every possible motion of every pair is then judged by its whole rotation. `known` is an R_X
-    from a larger set of pairs, used where these pairs do not determine it.
+    `motion[i, j]` is the gripper's i_from_j. Pairs pass first by rotation angle alone, which may differ by the share
+    `systematic`. The hand-eye rotation R_X is estimated from these. Every possible motion of every pair is then judged
+    by its whole rotation. `known` is an R_X from a larger set of pairs, used where these pairs do not determine it.
     """
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     undecided, passing, judged = [], [], []
@@ -143,7 +144,8 @@ def _common_rotation(
 ) -> RotationOfX | None:
     """Return the hand-eye rotation R_X; None if fewer than LEAST_PAIRS image pairs agree on it or it is uncertain.
 
-    `passing` lists image pairs, each with a camera motion and its tolerance (rad); `motion[i, j]` is gripper i_from_j.
+    Uncertain means a standard deviation above SURE_STD along any axis. `passing` lists image pairs, each with a camera
+    motion and its tolerance (rad); `motion[i, j]` is the gripper's i_from_j.
     """
     keys = [key for key, _, _ in passing]
     if len(set(keys)) < LEAST_PAIRS:
@@ -167,7 +169,7 @@ def rotation_of_x(
 
     Each hypothesis comes from two image pairs, as in RANSAC; the best one is refined on all pairs that agree with it.
     `tolerance` (rad) is the largest disagreement of a correct pair. Returns None if no three pairs about two axes
-    agree.
+    agree, or if they have less than LEAST_INFORMATION about R_X.
     """
     axis_a, axis_b = sine_axis(gripper), sine_axis(camera)
     first, second = np.triu_indices(len(gripper), 1)
@@ -217,9 +219,10 @@ def _residuals(
     camera: Float[ndarray, "p 3 3"],
     scale: Float[ndarray, " p"],
 ) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 3"]]:
-    """Return rotation vectors (rad) from X camera Xᵀ to the gripper's rotations, and their derivatives by a step of X.
+    """Return for each of p pairs the rotation vector (rad) from X B Xᵀ to A, and its derivative by a step of X.
 
-    Both are multiplied by the `scale` of each pair, the root of its weight.
+    A and B are the rotations of `gripper` and `camera`, and X is `x`. A step w changes X to exp(w) X. Both results are
+    multiplied by the `scale` of each pair, the root of its weight.
     """
     # A step w of X changes X camera Xᵀ to exp(w) X camera Xᵀ exp(-w).
     back = np.swapaxes(x @ camera @ x.T, 1, 2)
@@ -229,7 +232,10 @@ def _residuals(
 def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
 ) -> Float[ndarray, "..."]:
-    """Return the angle (rad) between gripper · X and X · camera, for each rotation X in `x` (rows) and each pair."""
+    """Return the angle (rad) between gripper · X and X · camera, for each rotation X in `x` and each of p pairs.
+
+    The shape is (p,) for one X (3,3), and (h,p) for X of shape (h,1,3,3).
+    """
     trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
@@ -237,8 +243,9 @@ def _gap(
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     """Return the angle (rad) by which to rotate each image about its viewing axis, so that all have one upright side.
 
-    The angle is the twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski
-    2015). The largest group of images with one orientation is rotated least.
+    A positive angle rotates the image from its x axis towards its y axis, clockwise on the screen. The angle is the
+    twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015). The largest
+    group of images with one orientation is rotated least.
     """
     mean = base_from_camera[:, :, 2].sum(0)
     z = mean / max(float(np.linalg.norm(mean)), 1e-12)
@@ -253,7 +260,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
 
 
 def by_quarters(roll: float) -> float:
-    """Return an angle in [0, 2π) rad, rounded to a multiple of 90° if this is within UPRIGHT_ENOUGH, else to 1°."""
+    """Return an angle (rad) rounded to a multiple of 90° if this is within UPRIGHT_ENOUGH, else to 1°; in [0, 2π)."""
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)

@@ -60,7 +60,10 @@ class Features(Protocol):
         ...
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return for each pair the rows of matching keypoints; its images are first rotated by `rolls` (rad)."""
+        """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
+
+        The two images are first rotated by `rolls` (rad), clockwise on the screen.
+        """
         ...
 
 
@@ -111,9 +114,10 @@ class Matcher:
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], repeats: Bool[ndarray, "n n"]
     ) -> Geometries:
-        """Return the two-view geometries of those `pairs` that match; images are first rotated by `rolls` (rad).
+        """Return the two-view geometries of those of the p `pairs` that match.
 
-        `repeats` marks pairs of images between which the gripper did not move.
+        The two images of a pair are first rotated by `rolls` (rad), clockwise on the screen. `repeats` marks pairs of
+        images between which the gripper did not move.
         """
         new = [k for k, key in enumerate(pairs) if self.features.needs_upright or key not in self.raw]
         some = [pairs[k] for k in new]
@@ -126,10 +130,11 @@ class Matcher:
     def verified(
         self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]], moved: bool
     ) -> pycolmap.TwoViewGeometry | None:
-        """Return the two-view geometry of the matches `rows` of image pair `key`; None where too few matches agree.
+        """Return the two-view geometry of the matches of image pair `key`; None with fewer than MIN_INLIERS inliers.
 
-        If the gripper `moved`, matches that keep their pixel are discarded. Matches in the cells of `self.still` are
-        always discarded. The result is cached.
+        `rows` has a match in each row: the rows of its keypoints in the first and in the second image. `x_px` are the
+        keypoints of each image (`Matcher.x_px`). If the gripper `moved`, matches that keep their pixel are discarded.
+        Matches in the cells of `self.still` are always discarded. The result is cached.
         """
         if moved:
             x_i, x_j = (x_px[image][own] for image, own in zip(key, rows.T, strict=True))
@@ -152,7 +157,7 @@ class Matcher:
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
 
-        The rays and intrinsics are those of `view`.
+        The rays and intrinsics are those of `view`; `geometry` is the result of `verified`.
         """
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
@@ -184,9 +189,11 @@ def estimate_geometry(
     seed: int,
     known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
-    """Return the two-view geometry of the matches `rows` of image pair `key`; None for fewer than MIN_INLIERS inliers.
+    """Return the two-view geometry of the matches of image pair `key`; None for fewer than MIN_INLIERS inliers.
 
-    `known` is true if the intrinsics of `camera` are given, false if they are a guess.
+    `rows` has a match in each row: the rows of its keypoints in the first and in the second image. `x_px` has the
+    keypoints of each image in pixels of the images of `camera`. `known` is true if the intrinsics of `camera` are
+    given, false if they are a guess. `seed` is that of RANSAC.
     """
     if len(rows) < MIN_INLIERS:
         return None
@@ -207,7 +214,11 @@ def estimate_geometry(
 def matrices(
     found: pycolmap.TwoViewGeometry, intrinsics: Intrinsics
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
-    """Return a geometry's essential matrix and homography, from rays of image i to image j; None if COLMAP has none."""
+    """Return a geometry's essential matrix and homography, from rays of image i to image j; None if COLMAP has none.
+
+    They apply to rays (x/z, y/z, 1): x_jᵀ E x_i = 0, and x_j is proportional to H x_i. `found` is in pixels of images
+    with `intrinsics`.
+    """
     k = intrinsics.matrix + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     essential, homography = found.E, found.H
     if essential is None and found.F is not None:
@@ -223,8 +234,10 @@ def still_cells(
 ) -> Bool[ndarray, "r c"]:
     """Return a mask of the image cells with matches that keep their pixel in many pairs although the gripper moves.
 
-    Such cells show the gripper's own fingers, a logo, or text drawn into the images. `raw` are the matches of each
-    pair, `moving` the pairs between which the gripper moved, and `size` is width and height, px.
+    Such cells show the gripper's own fingers, a logo, or text drawn into the images. The cells have sides of CELL_PX,
+    and many means LEAST_PAIRS and the share LEAST_SHARE. `x_px` are the keypoints of each image, and `raw` the matches
+    of each pair as rows of keypoints. `moving` are the pairs between which the gripper moved, and `size` is width and
+    height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)
@@ -243,10 +256,10 @@ def still_cells(
 
 
 def hidden(x_px: Float[ndarray, "k 2"], still: Bool[ndarray, "r c"]) -> Bool[ndarray, " k"]:
-    """Test for each keypoint whether it lies in a cell of the image that `still` marks (cells that never move)."""
+    """Test for each keypoint whether it lies in a cell that the mask `still` (`still_cells`) marks."""
     return still[tuple(_cells(x_px, still.shape).T)]
 
 
 def _cells(x_px: Float[ndarray, "k 2"], shape: tuple[int, int]) -> Int[ndarray, "k 2"]:
-    """Return the row and column of the cell of each keypoint, for a grid of `shape` rows and columns."""
+    """Return the row and column of the cell (side CELL_PX) of each keypoint, for a grid of `shape` rows and columns."""
     return np.clip((x_px // CELL_PX).astype(int), 0, [shape[1] - 1, shape[0] - 1])[:, ::-1]

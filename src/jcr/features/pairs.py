@@ -35,24 +35,31 @@ POINTS_OF_PAIR = 60
 
 
 def all_pairs(n: int) -> list[Key]:
-    """Return every pair of n images."""
+    """Return every pair (i, j) of n images, i < j."""
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """Return the pairs of each image with its `neighbours` nearest viewpoints; `motion[i, j]` is gripper i_from_j."""
+    """Return the pairs of each image with one image of each of its `neighbours` nearest viewpoints.
+
+    The distance is the length of the gripper's motion (geometry.motion_length). `motion[i, j]` is the gripper's
+    i_from_j.
+    """
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
 def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
-    """Test for each pair of images whether the gripper moved less than SAME_VIEWPOINT; `motion` is gripper i_from_j."""
+    """Test for each pair of images whether the gripper's motion is below SAME_VIEWPOINT; `motion[i, j]` is i_from_j."""
     metres, radians = SAME_VIEWPOINT
     way = np.linalg.norm(motion[..., :3, 3], axis=-1)
     return (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
 
 
 def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return for each image the row of the first image of the same viewpoint; `motion[i, j]` is gripper i_from_j."""
+    """Return for each image the row of the first image of the same viewpoint (SAME_VIEWPOINT).
+
+    `motion[i, j]` is the gripper's i_from_j.
+    """
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -63,8 +70,9 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
 def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
-    The shared scene is measured by the points of the pairs in `found` that the gripper confirms. It is unknown without
-    a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is gripper i_from_j.
+    Each image has up to PARTNERS viewpoints. The shared scene is measured by the points of the pairs in `found` that
+    the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
+    gripper's i_from_j.
     """
     x = hand_eye_of_pairs(found, motion)
     if x is None:
@@ -91,9 +99,9 @@ def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarra
 def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
     """Return gripper_from_camera = (R_X, t_X) from the confirmed image pairs; None while R_X is unknown.
 
-    The gripper's motion of a pair is (R_A, t_A), `motion[i, j]`. The camera's translation is known up to its length;
-    R_X rotates its direction to d. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X and needs neither the
-    scale nor a map.
+    The gripper's motion of a pair is (R_A, t_A), `motion[i, j]` (i_from_j, m). The camera's translation is known up to
+    its length; R_X rotates its direction to d. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X and needs
+    neither the scale nor a map. A prior of standard deviation PRIOR_STD_M draws t_X to 0.
     """
     if found.of_x is None or not found.confirmed:
         return None
@@ -116,7 +124,10 @@ def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[n
 def _scene_points(
     view: ImageGeometry, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
 ) -> Float[ndarray, "p 3"]:
-    """Return the points (m) triangulated from confirmed pairs with parallax, in the gripper frame of image 0."""
+    """Return the points (m) triangulated from confirmed pairs with parallax, in the gripper frame of image 0.
+
+    `first_from_camera` are the camera poses in this frame. Parallax is an angle of more than 1° between the two rays.
+    """
     kept = [np.zeros((0, 3))]
     for pair in found.confirmed:
         rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
@@ -134,8 +145,9 @@ def _scene_points(
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:
     """Return pairs of each image with one image of each of the `count` other viewpoints with the highest finite `score`.
 
-    `viewpoint` is the viewpoint of each image. Images of one viewpoint are paired with different images of another one,
-    so that all images are connected and their noise averages.
+    `viewpoint` is the viewpoint of each image (`viewpoints`), and `score[i, j]` belongs to images i and j. Images of
+    one viewpoint are paired with different images of another one, so that all images are connected and their noise
+    averages.
     """
     repeat = np.array([(viewpoint[:row] == of).sum() for row, of in enumerate(viewpoint)])
     pairs = set()

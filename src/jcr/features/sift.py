@@ -38,7 +38,10 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
 
 
 def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
-    """Return keypoints (px; pixel centres are whole numbers) and unit descriptors of an image."""
+    """Return keypoints (x, y in px; pixel centres are whole numbers) and unit descriptors (RootSIFT) of a grey image.
+
+    The arrays are empty if nothing is found.
+    """
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -54,7 +57,8 @@ def matches(
 ) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
     """Return the matches of two images as rows of `first` and of `second` (unit descriptors).
 
-    Matches are mutual nearest neighbours that are nearer than FARTHEST and pass the ratio test.
+    Matches are mutual nearest neighbours that are nearer than FARTHEST and pass the ratio test (RATIO). There are none
+    if an image has fewer than two descriptors.
     """
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
@@ -83,7 +87,7 @@ class SiftFeatures:
         threads: int,
         report: Progress,
     ) -> None:
-        """Find the features of all images, resized to `size` (width, height), in `threads` threads."""
+        """Find the features of all images (RGB), resized to `size` (width, height), in `threads` threads."""
         self._size = size
         with ThreadPoolExecutor(threads) as pool:
             found = pool.map(lambda image: detect(grey_of(image, size)), images)
@@ -94,7 +98,7 @@ class SiftFeatures:
         """Descriptors of these keypoints, of unit length."""
 
     def add(self, image: UInt8[ndarray, "h w 3"]) -> None:
-        """Find the features of one more image."""
+        """Find the features of one more image (RGB) and append them as the last row."""
         x_px, descriptors = detect(grey_of(image, self._size))
         self.x_px.append(x_px)
         self.descriptors.append(descriptors)
@@ -104,7 +108,10 @@ class SiftFeatures:
         del self.x_px[row], self.descriptors[row]
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return for each pair the rows of its matching keypoints; SIFT does not use the rotations `rolls`."""
+        """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
+
+        SIFT does not use the rotations `rolls`.
+        """
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

@@ -96,7 +96,11 @@ class _Search:
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
-        """Match pairs with their two images rotated by angles (rad); keep the better geometry of each pair."""
+        """Match pairs with their two images rotated by angles (rad); keep the better geometry of each pair.
+
+        `rotations` has the angles of the first and of the second image, clockwise on the screen. Rotations that were
+        tried before are left out.
+        """
         todo = {}
         for key, both in rotations.items():
             if not self.matcher.features.needs_upright:
@@ -118,7 +122,8 @@ class _Search:
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs with the second image rotated by 0, 90, 180 and 270° until the hand-eye rotation is known.
 
-        Returns the pairs, classified by the gripper; `found` is the classification before.
+        At most GUESSED_AT_MOST pairs are matched. Returns the pairs, classified by the gripper; `found` is the
+        classification before.
         """
         for start in range(0, min(len(pairs), GUESSED_AT_MOST), GUESSED_AT_ONCE):
             for quarter in range(4):
@@ -132,7 +137,8 @@ class _Search:
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
         """Match pairs with each image rotated by its angle `upright` (rad); classify all pairs by the gripper's motion.
 
-        `found` is the classification before, whose hand-eye rotation is used if the pairs do not determine one.
+        The angles are those of `gate.rolls`. `found` is the classification before, whose hand-eye rotation is used if
+        the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return classify_pairs(
@@ -140,7 +146,10 @@ class _Search:
         )
 
     def hide_still_parts(self) -> None:
-        """Find the cells of the image that stay while the gripper moves; verify all matches without these cells."""
+        """Find the cells of the image that stay while the gripper moves; verify all matches without these cells.
+
+        Pairs with too few other matches are removed.
+        """
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
@@ -181,7 +190,8 @@ class _Search:
     def _intrinsics_by_robot(self) -> Intrinsics | None:
         """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
 
-        Returns None where too few pairs agree on a focal length.
+        They are those of images at the size of matching. Returns None where too few pairs agree on a focal length
+        (LEAST_SUPPORT).
         """
         size = self.view.intrinsics.width, self.view.intrinsics.height
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
@@ -221,8 +231,8 @@ def match_with_robot(
     """Match pairs of images and return those that the gripper poses do not contradict.
 
     `intrinsics` are at the size in which images are matched; they are an initial estimate unless the matcher's are
-    known. If the hand-eye rotation cannot be found from the pairs, the pairs are not checked against the robot poses,
-    which may be of another convention.
+    known. `names` are the images' names for messages. If the hand-eye rotation cannot be found from the pairs, the
+    pairs are not checked against the robot poses, which may be of another convention.
     """
     report("matching", 0.0)
     n, features = len(base_from_gripper), matcher.features
@@ -277,6 +287,7 @@ def _pairs_to_map(
     """Return the two-view geometries that are to be mapped, and notes and warnings for the user about the other pairs.
 
     To be mapped are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
+    Pairs too uncertain to be judged are mapped only if the intrinsics are unknown.
     """
     notes, warnings = tuple[str, ...](), tuple[str, ...]()
     stale = _contradicted_by_all(found, search.motion)
@@ -299,7 +310,11 @@ def _pairs_to_map(
 
 
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
-    """Return the rows of images with a wrong gripper pose: their pairs contradict it and agree on one correction."""
+    """Return the rows of images with a wrong gripper pose: their pairs contradict it and agree on one correction.
+
+    An image needs three such pairs or more, whose corrections differ by less than 3° in the median. `motion[i, j]` is
+    the gripper's i_from_j.
+    """
     assert found.of_x is not None
     x = found.of_x.rotation
     confirmed = {row for pair in found.confirmed for row in pair.key}

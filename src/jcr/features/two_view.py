@@ -36,7 +36,10 @@ class CameraMotion:
     """Robust standard deviation of the matches' Sampson distances, px."""
 
     def angle_std(self) -> float:
-        """Return the standard deviation, rad, of the angle by which the motion rotates."""
+        """Return the standard deviation, rad, of the angle by which the motion rotates.
+
+        Without a rotation, and so without an axis, it is the root of the mean variance over the three axes.
+        """
         covariance = self.covariance[:3, :3]
         if np.trace(self.rotation) > 2.999999:  # without rotation the axis is undefined
             return float(np.sqrt(np.trace(covariance) / 3))
@@ -54,7 +57,8 @@ def camera_motions(
 ) -> list[CameraMotion]:
     """Return the motions that may explain matched rays (x/z, y/z) of cameras i and j, best first; empty without one.
 
-    The matrices map rays of image i to image j, each None if not found. `focal_px` converts residuals to px.
+    The best has the smallest Sampson distances. The matrices map rays of image i to image j, each None if not found.
+    `focal_px` converts residuals to px.
     """
     found: list[CameraMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
@@ -74,9 +78,9 @@ def starting_motions(
 ) -> list[tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]]:
     """Return rotations i_from_j and unit directions from camera i to j that an essential matrix or a homography allows.
 
-    Both matrices map rays (x/z, y/z) of image i to image j. An essential matrix gives the one decomposition of four
-    that has most points in front of both cameras. A homography gives those whose plane lies in front of camera i at
-    nearly every match.
+    The directions are in the frame of camera i. Both matrices map rays (x/z, y/z) of image i to image j. An essential
+    matrix gives the one decomposition of four that has most points in front of both cameras. A homography gives those
+    whose plane lies in front of camera i at nearly every match.
     """
     found = []
     if essential is not None:
@@ -101,7 +105,8 @@ def sampson_px(
 ) -> Float[ndarray, " m"]:
     """Return the signed Sampson distance (px) of each match from the epipolar geometry of a camera motion.
 
-    `rotation` is i_from_j, and `direction` points from camera i to camera j in the frame of i; rays are x/z, y/z.
+    `rotation` is i_from_j, and `direction` points from camera i to camera j in the frame of i. Rays are x/z, y/z; the
+    distance in rays is multiplied by `focal_px`.
     """
     essential = skew(direction) @ rotation  # x_i · E x_j = 0
     h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
@@ -118,7 +123,8 @@ def _by_step(
 ) -> Float[ndarray, "m 5"]:
     """Return the derivatives of `sampson_px` by a step of the motion, one column per component.
 
-    Columns 0 to 2 are a rotation vector in axes of camera i, columns 3 and 4 two components across the direction.
+    Columns 0 to 2 are a rotation vector w in axes of camera i, which changes the rotation R to exp(w) R. Columns 3 and
+    4 are components of the direction along the two vectors of `_sideways`.
     """
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
     essential = of_direction @ rotation
@@ -138,7 +144,10 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return the norm of the gradient of x_i · E x_j by both rays for m matches; line_i is E x_j, line_j is Eᵀ x_i."""
+    """Return for m matches the norm of the gradient of x_i · E x_j by x and y of both rays.
+
+    The rows of `line_i` are E x_j, and those of `line_j` are Eᵀ x_i.
+    """
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
@@ -151,8 +160,8 @@ def _least_squares_motion(
 ) -> CameraMotion | None:
     """Return a camera motion refined to least Sampson distances, with covariance; None for fewer than eight matches.
 
-    Rotation (i_from_j) and direction (i to j) have five parameters. The loss is Cauchy, whose scale is estimated
-    alternately.
+    The initial `rotation` (i_from_j) and `direction` (i to j, in the frame of i) have five parameters. The loss is
+    Cauchy, whose scale is estimated alternately. Rays are x/z, y/z; `focal_px` converts distances to px.
     """
     if len(ray_i) < 8:
         return None

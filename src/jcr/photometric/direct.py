@@ -78,8 +78,8 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
     Known intrinsics are kept; otherwise a focal length is estimated. The recon frame is the first camera's, and its
     unit is only roughly the metre. `evidence` holds the covariance of the cameras. Raises InputError with fewer than
-    three images, and RejectedError where another hand-eye transform fits as well, or where the views agree on too few
-    points.
+    three images. Raises RejectedError where another hand-eye transform fits as well, or where the views agree on less
+    than the share LEAST_AGREED of the points.
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
@@ -129,9 +129,10 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 
 
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """Return a factor per image that makes all images equally bright; all are 1 where brightness hardly differs.
+    """Return a factor per image that makes all images equally bright; all are 1 if no |log factor| exceeds LEAST_GAIN.
 
-    The brightness of two images is compared at the points of one that the other shows in nearly the same colour.
+    The brightness of two images is compared at points of one that the other shows within twice BEFORE_GAINS.sigma. The
+    logs of the factors have mean 0.
     """
     factor, dark, images = np.ones(level.count), 10 * FAINT, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):
@@ -156,11 +157,11 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
 def images_that_fit(
     level: Level, cameras: Cameras, intrinsics_known: bool
 ) -> tuple[Int[ndarray, " m"], Cameras]:
-    """Return the rows of the images that fit together, and their cameras, which are aligned by these images alone.
+    """Return the rows of the images that fit together, and their cameras, moved as one to fit these images alone.
 
-    The measure is the share of the points of other images that an image shows in the same colour. An image with a far
-    lower share than the median, even with a free camera, has a wrong pose or shows another scene. Raises RejectedError
-    where fewer than three images are left.
+    The measure is the share of the points of other images that an image shows in the same colour. An image with less
+    than LEAST_SHARE of the median share, even with a free camera, has a wrong pose or shows another scene. Raises
+    RejectedError where fewer than three images are left.
     """
     rows = np.arange(level.count)
     while True:
@@ -181,7 +182,10 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Undistort images (RGB, 0 to 255) and reduce them to the height (px) of each stage; return the levels by height."""
+    """Undistort images (RGB, 0 to 255) and reduce them to the height of each stage; return the levels by height in px.
+
+    `intrinsics` are those of the images as given, with distortion.
+    """
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
@@ -194,9 +198,10 @@ def camera_covariance(
 ) -> Float[ndarray, "r r"]:
     """Return the covariance (6n,6n) of the camera poses' steps (records.CameraEvidence), in the first camera's axes.
 
-    Residuals within one region of the scene are correlated. So the inverse normal matrix is scaled by the measured
-    scatter of the regions' gradients: one factor, because there are too few regions for a full sandwich estimate. The
-    columns of `directions` are the free steps.
+    Each camera has six rows, translation (m) and rotation (rad). Residuals within one region of the scene are
+    correlated. So the inverse normal matrix is scaled by the measured scatter of the regions' gradients. It is one
+    factor, because there are too few regions for a full sandwich estimate. `sigma` is the colour difference of the
+    robust cost (`equations`). The columns of `directions` are the free steps (`free_directions`).
     """
     system = equations(level, cameras, points, sigma, tied=False)
     inverse_normal = np.linalg.inv(directions.T @ system.normal @ directions)
@@ -211,7 +216,11 @@ def camera_covariance(
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, intrinsics: Intrinsics) -> Tracks:
-    """Return tracks of the points: a pixel in the point's host image, and one in each image that shows its colour."""
+    """Return tracks of the points: a pixel in the point's host image, and one in each image that shows its colour.
+
+    An image shows the colour if it differs by less than `sigma` (RGB, 0 to 1). Pixels are those of images with
+    `intrinsics`, and points are in the first camera's frame, m.
+    """
     _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
     image, point = np.nonzero(shown)

@@ -49,7 +49,7 @@ class Level:
         return len(self.color) // self.grid.height
 
     def rows(self, which: Int[ndarray, " m"]) -> "Level":
-        """Return the level with only the images of the rows `which`."""
+        """Return the level with only the m images whose numbers, counted from 0, are in `which`, in this order."""
         color, by_u, by_v = (
             x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
             for x in (self.color, self.by_u, self.by_v)
@@ -57,7 +57,7 @@ class Level:
         return Level(color, by_u, by_v, self.grid)
 
     def times(self, factor: Float[ndarray, " n"]) -> "Level":
-        """Return the level with the brightness of each image multiplied by its factor."""
+        """Return the level with the colours of each image multiplied by its factor."""
         of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
         return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
@@ -102,12 +102,15 @@ class PhotometricEquations:
     depth_information: Float[ndarray, " k"]
 
     def depth_step(self, step: Float[ndarray, " p"]) -> Float[ndarray, " k"]:
-        """Return the step of each point's log depth, given the step of the camera parameters."""
+        """Return the step of each point's log depth, given the step of the p camera parameters."""
         return -(self.depth_gradient + self.by_depth @ step) / self.depth_information
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """Return the images (RGB, 0 to 1), with intrinsics `grid`, reduced to `height` pixels and blurred, as a level."""
+    """Return a level: the images (RGB, 0 to 1) reduced to `height` pixels and blurred (BLUR_PX).
+
+    `grid` are the intrinsics of the images before the reduction.
+    """
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:
@@ -120,7 +123,11 @@ def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: in
 
 
 def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
-    """Return row of the image and pixel (u, v) of k strong edges: one per block of pixels, `per_image` per image."""
+    """Return image row and pixel (u, v) of k strong edges, at most `per_image` in each image.
+
+    Each is the pixel of the largest change of colour in a square block. The blocks with the largest changes are taken;
+    changes below FAINT per pixel are left out.
+    """
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
     change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
@@ -149,9 +156,10 @@ def search_depths(
 ) -> tuple[Points, float]:
     """Return points at the given pixels with the best of the tried `depths`, and the mean of the points' costs.
 
-    `host` is the image row of each pixel; `depths` (m) has one row per trial and one column per image. The cost of a
-    point is the mean of r²/(r² + sigma²) over the images with the smallest colour difference r; it is 1 where fewer
-    than two images see the point. Points with a cost below `least` are marked as agreed.
+    `host` is the image row of each pixel; `depths` (z in the host's camera frame, m) has one row per trial and one
+    column per image. The cost of a point is the mean of r²/(r² + sigma²) over the share SEEN_BY of the images with the
+    smallest colour difference r. It is 1 where fewer than two images see the point. Points with a cost below `least`
+    are marked as agreed.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)
@@ -173,7 +181,10 @@ def search_depths(
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
-    """Return for each image and point the squared difference of the image's colour at u, v and the point's colour."""
+    """Return for each image and point the squared colour difference, summed over RGB (0 to 1).
+
+    The colour of image n at the pixel u[n, k], v[n, k], by bilinear interpolation, is compared with that of point k.
+    """
     difference = sample(level.color, level, u, v) - points.color
     return np.einsum("nkc,nkc->nk", difference, difference)
 
@@ -192,9 +203,10 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
 def in_view(
     level: Level, cameras: Cameras, points: Points
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
-    """Return per image and point: the point in the camera frame, its pixel u and v, and whether the image shows it.
+    """Return per image and point: the point in the camera frame (m), its pixel u and v, and whether the image shows it.
 
-    A host image does not count as seeing its own points.
+    The image shows a point in front of the camera and inside the image; occlusion is not tested. A host image does not
+    count as seeing its own points.
     """
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
@@ -211,7 +223,11 @@ def in_view(
 def sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation."""
+    """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation.
+
+    `stack` has the images of `level`, or their derivatives, one below the other. Pixels outside the image take the
+    colour of the nearest border pixel.
+    """
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -220,7 +236,7 @@ def sample(
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
     """Return the mean robust cost, 0 to 1, of the agreed points over all images that see them.
 
-    The cost of a colour difference r is r²/(r² + sigma²).
+    The cost of a colour difference r (RGB, 0 to 1) is r²/(r² + sigma²).
     """
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
@@ -233,7 +249,8 @@ def equations(
 ) -> PhotometricEquations:
     """Return the normal equations for twists (translation, rotation in camera axes) and the log focal length.
 
-    A twist ξ changes a pose T to T·exp(ξ). There is one twist for all cameras if `tied`, otherwise one for each camera.
+    A twist ξ changes a pose T to T·exp(ξ). There is one twist for all cameras if `tied` (p = 7), otherwise one for each
+    camera (p = 6n + 1). The cost is that of `energy`, with its scale `sigma`.
     """
     n, k = level.count, len(points.host)
     p = 7 if tied else 6 * n + 1
@@ -277,7 +294,9 @@ def _linearised(
     """Yield per chunk of points: their slice, the weighted residuals, and four arrays of weighted derivatives.
 
     The derivatives are by the twist of the viewing camera, the twist of the point's host camera, the log focal length
-    and the log depth. Residuals and derivatives are arrays (images, points, 3 colours, …).
+    and the log depth. Residuals and derivatives are arrays (images, points, 3 colours); those by a twist have a last
+    axis of 6. The weight is the root of the Geman-McClure weight of scale `sigma`; it is 0 where an image does not show
+    an agreed point.
     """
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)

@@ -46,8 +46,9 @@ def search(
 ) -> Cameras:
     """Return the cameras (gripper poses times one hand-eye transform) for which the images agree best in colour.
 
-    `levels` are the images by their height in pixels. Raises RejectedError where a different hand-eye transform fits as
-    well, or where the images have no edges.
+    `levels` are the images by their height in pixels (those of SIZES); the focal length changes unless the intrinsics
+    are known. Raises RejectedError where a different hand-eye transform fits as well, or where the images have no
+    edges.
     """
     if not len(strong_edges(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
@@ -91,7 +92,8 @@ def search(
 def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
     """Return t initial gripper_from_camera, without translation, by which all cameras look at one place.
 
-    They are rotations about the common viewing direction, and tilts of it.
+    They have the common viewing direction or one of TILTS directions that are tilted from it by TILT_DEG. Each
+    direction has ROTATIONS rotations about it.
     """
     # Directions distributed evenly over the sphere (Fibonacci spiral).
     k = np.arange(600) + 0.5
@@ -114,7 +116,10 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
 
 
 def _distinct(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
-    """Return (cost, cameras) of the best of each group of nearly equal results, best first."""
+    """Return (cost, cameras) of the best of each group of nearly equal results, best first.
+
+    Two results are nearly equal if the poses of their first cameras differ by less than SAME_M and SAME_DEG.
+    """
     kept: list[tuple[float, Cameras]] = []
     for cost, cameras in sorted(found, key=lambda each: each[0]):
         gaps = [inverse(cameras.base_from_camera[0]) @ other.base_from_camera[0] for _, other in kept]

@@ -53,9 +53,10 @@ def reconstruct_any_view(
 ) -> Reconstruction:
     """Reconstruct a capture by a network that predicts all images at once, and refine it by matches.
 
-    `load` returns the network of a folder of weights on a device. The unit is that of the prediction. Pixels whose point
-    or confidence is not finite, or whose point lies behind the camera, get confidence 0. Raises InputError for weights
-    that are missing or damaged.
+    `load` returns the network of a folder of weights on a torch device. `backend` is the name in the result and in
+    messages. The unit is that of the prediction. Pixels whose point or confidence is not finite, or whose point lies
+    behind the camera, get confidence 0. Raises InputError for weights that are missing or damaged, and for a prediction
+    without usable depth or cameras.
     """
     report = progress or silent
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
@@ -91,9 +92,10 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
-    """Return the entry `name` of a network's outputs (`answer`) as float32 of this shape.
+    """Return the entry `name` of a network's outputs as a float32 array of this shape.
 
-    Raises InputError, naming the `model`, if it is absent or of another size.
+    `answer` is a mapping from names to tensors. Raises InputError, naming the `model`, if the entry is absent or has
+    another number of elements.
     """
     tensor = answer.get(name) if hasattr(answer, "get") else None
     if not isinstance(tensor, torch.Tensor) or tensor.numel() != np.prod(shape):

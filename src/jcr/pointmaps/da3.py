@@ -76,7 +76,11 @@ def build(name: str) -> nn.Module:
 
 
 def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
-    """Return the pointmaps and camera poses of all images, predicted in one pass."""
+    """Return the pointmaps and camera poses of all images, predicted in one pass.
+
+    `network` is Depth Anything 3 with its weights. The images are resized so that their long edge has about `long_edge`
+    px (`grid_of`). Frame and unit are arbitrary.
+    """
     grid = grid_of(views.size, long_edge)
     colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
     device = next(network.parameters()).device.type
@@ -101,7 +105,10 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Return the network's grid for an image size: long edge `long_edge`, edges rounded to multiples of the patch."""
+    """Return the network's grid for an image of `size` (width, height), px.
+
+    The long edge is resized to `long_edge` px, and both edges are rounded to multiples of PATCH.
+    """
     edges = (round(edge * long_edge / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))
@@ -110,7 +117,10 @@ def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
 def resized_for_grid(
     image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int
 ) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize an image to `long_edge` and then to the grid, with the interpolation of Depth Anything 3 for each step."""
+    """Resize an image (RGB) to a long edge of `long_edge` px, and then to the size of `grid`.
+
+    Each step is bicubic if it enlarges an edge and otherwise averages over areas, as in Depth Anything 3.
+    """
     height, width = image.shape[:2]
     scale = long_edge / max(width, height)
     for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):

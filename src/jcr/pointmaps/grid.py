@@ -42,7 +42,7 @@ class ImageGrid:
 
     @classmethod
     def uncropped(cls, original_size: tuple[int, int], size: tuple[int, int]) -> "ImageGrid":
-        """Return the grid of the whole image resized to `size`."""
+        """Return the grid of the whole image resized to `size`; both sizes are (width, height), px."""
         return cls(original_size, size, (0, 0), size)
 
     @property
@@ -51,7 +51,7 @@ class ImageGrid:
         return np.array(self.resized_size) / np.array(self.original_size)
 
     def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Return the pixels on the grid that correspond to pixels (...,2) of the original, undistorted image."""
+        """Return the pixels (x, y) on the grid that correspond to pixels (...,2) of the original, undistorted image."""
         return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
 
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
@@ -72,9 +72,9 @@ def image_grid(
 ) -> ImageGrid:
     """Return the resize and crop that DUSt3R applies to an image of `original_size` (width, height).
 
-    With `long_edge` 512, the long edge becomes 512 and both edges are cropped around the centre to multiples of the
-    patch. A square image is cropped to 4:3 unless `keep_square`, because DUSt3R was not trained on squares. With 224,
-    the short edge becomes 224, then a square is cropped.
+    With `long_edge` 512, the long edge becomes 512 px and both edges are cropped around the centre to multiples of
+    `patch`, px. A square image is cropped to 4:3 unless `keep_square`, because DUSt3R was not trained on squares. With
+    224, the short edge becomes 224, then a square is cropped.
     """
     width, height = original_size
     longest = max(width, height)
@@ -109,7 +109,7 @@ class PreparedImages:
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
     def grid_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Return the pixels on the grid that correspond to pixels (...,2) of the capture's distorted images."""
+        """Return the pixels (x, y) on the grid that correspond to pixels (...,2) of the capture's distorted images."""
         camera = self.intrinsics_of_capture
         if self.pinhole is not None and camera is not None and is_distorted(camera):
             x_px = project(self.pinhole, unproject(camera, x_px))
@@ -121,7 +121,8 @@ def prepare_images(
 ) -> PreparedImages:
     """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
 
-    `grid_of` gives the resize and crop for the size of an image. Raises InputError for an image that cannot be read.
+    `grid_of` returns the resize and crop for an image's width and height. Raises InputError for an image that cannot be
+    read.
     """
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics
@@ -140,10 +141,10 @@ def prepare_images(
 def read_colors(
     capture: Capture, grid: ImageGrid, intrinsics: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
-    """Read the images of a capture, resized and cropped to `grid`.
+    """Read the images of a capture (RGB), resized and cropped to `grid`.
 
-    If `intrinsics` have distortion, the images are undistorted to those of `pinhole` first. Raises InputError for an
-    image that cannot be read.
+    `intrinsics` are those of the capture's images. If they have distortion and `pinhole` is given, the images are first
+    undistorted to those of `pinhole`. Raises InputError for an image that cannot be read.
     """
     width, height = grid.size
     colors = np.empty((len(capture), height, width, 3), np.uint8)

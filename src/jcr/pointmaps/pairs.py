@@ -90,7 +90,7 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
-    """Return checked pairwise predictions from the arrays of a file, named `source` in messages.
+    """Return checked pairwise predictions from the arrays of a file (by name, see ARRAYS), named `source` in messages.
 
     Raises InputError for arrays that are missing or inconsistent.
     """
@@ -123,7 +123,8 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: str) -> None:
     """Check that arrays exist, are finite and have the `shapes`, such as "N H W 3" with equal sizes for equal letters.
 
-    Raises InputError for the first wrong array, and for a confidence below 0.
+    `shapes` maps the names of the required arrays to their shapes; `source` is the file named in messages. Raises
+    InputError for the first wrong array, and for a confidence below 0 (arrays named conf…).
     """
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
@@ -148,9 +149,10 @@ def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: 
 def camera_of_arrays(
     arrays: dict[str, ndarray], size: tuple[int, int], source: str
 ) -> tuple[Intrinsics | None, ImageGrid | None]:
-    """Return the intrinsics and the crop (`grid`) from the arrays of a file, for pointmaps of `size` (width, height).
+    """Return the intrinsics and the crop from the arrays `intrinsics` and `grid` of a file; each is None if absent.
 
-    Each is None if absent. Raises InputError for wrong ones.
+    `size` is width and height of the pointmaps. `intrinsics` has fx, fy, cx, cy of their pixels. The rows of `grid` are
+    original size, resized size, crop corner and `size`, each x, y. Raises InputError for wrong ones.
     """
     intrinsics = grid = None
     if "intrinsics" in arrays:
@@ -168,11 +170,14 @@ def camera_of_arrays(
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
-    """Return all ordered pairs of `count` images: first (i, j) with i > j, then each reversed, as DUSt3R has them."""
+    """Return all ordered pairs of `count` images, as rows of images: first (i, j) with i > j, then each reversed.
+
+    DUSt3R has the same order.
+    """
     return window_pairs(count, count)
 
 
 def window_pairs(count: int, size: int) -> Int[ndarray, "e 2"]:
-    """Return the pairs of images at most `size` apart in the capture's order: (i, j) with i > j, then each reversed."""
+    """Return the pairs of images whose rows differ by at most `size`: first (i, j) with i > j, then each reversed."""
     edges = np.argwhere(np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool))
     return np.concatenate([edges, edges[:, ::-1]])

@@ -40,16 +40,20 @@ class PosedPointmaps:
     warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
-        """Return the pointmaps with each point moved, at constant z, to its pixel's ray by the grid's `pinhole`."""
+        """Return the pointmaps with each point moved, at constant z, to its pixel's ray by the grid's `pinhole`.
+
+        Points with confidence 0 become 0.
+        """
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
 
 def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
-    """Fit pinhole intrinsics of the grid to all points and pixels; return them with the median residual in px.
+    """Fit pinhole intrinsics of the grid to about SAMPLES pixels and their points; return them with the median residual.
 
-    The model u = fx · x/z + cx is linear in the unknowns, and residuals are weighted robustly (Geman-McClure). The
-    residual is infinite where half of the points lie behind their camera.
+    The residual is in px. The model u = fx · x/z + cx is linear in the unknowns, and residuals are weighted robustly
+    (Geman-McClure). The residual is infinite where half of the points lie behind their camera, or fewer than 100 lie in
+    front; the intrinsics are then a guess. It is infinite, too, for a focal length that is not positive.
     """
     confidence = maps.confidence
     height, width = confidence.shape[1:]
@@ -80,7 +84,9 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
 def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
     """Return the covariance (6n,6n) of n camera poses relative to the first, from errors published for a network.
 
-    Every camera has an independent error; the first camera's error also moves all others relative to it.
+    Each camera has six rows: translation (recon units) and rotation (rad) in recon axes; those of the first are 0.
+    Every camera has an independent error (PREDICTED_STD); the first camera's error also moves all others relative to
+    it.
     """
     poses = maps.recon_from_camera
     count = len(poses)

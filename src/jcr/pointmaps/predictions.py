@@ -27,7 +27,8 @@ wrong."""
 def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
     """Return camera poses, pointmaps and tracks from the predictions in an npz file.
 
-    Raises InputError for a file that is missing, damaged, or does not fit the capture.
+    The file has pairwise pointmaps (pairs.ARRAYS), or camera poses and pointmaps in one frame (POINTMAPS). Raises
+    InputError for a file that is missing, damaged, or does not fit the capture.
     """
     arrays, source = read_arrays(path), str(path)
     if "edges" in arrays:
@@ -56,9 +57,10 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
 def _posed_pointmaps(
     arrays: dict[str, ndarray], order: Int[ndarray, " m"], grid: ImageGrid, source: str
 ) -> PosedPointmaps:
-    """Return the pointmaps of a file, with its images in the given order, on the pixel grid `grid`.
+    """Return the pointmaps of a file's `arrays` (POINTMAPS), on the pixel grid `grid`.
 
-    Raises InputError where most points are not projected to their pixels.
+    `order` has the file's rows of the images in the order of the result; `source` is the file named in messages. Raises
+    InputError where the median distance of the points' projections from their pixels is above LARGEST_MISFIT.
     """
     poses = arrays["recon_from_camera"].astype(np.float64)
     poses = np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order])
@@ -114,8 +116,10 @@ def _images(
 ) -> PreparedImages:
     """Return the capture's images on the pixel grid of a file with `arrays`, in ascending order of their `rows`.
 
-    Intrinsics in the file are those of undistorted images, as in predictions made by this package. Without them, the
-    pixels are taken to be those of the capture's images, and a known distortion cannot be accounted for.
+    `rows` has the capture's row of each image of the file, and `size` is width and height of the pointmaps. Intrinsics
+    in the file are those of undistorted images, as in predictions made by this package. Without them, the pixels are
+    taken to be those of the capture's images, and a known distortion cannot be accounted for. Raises InputError where
+    the sizes do not fit.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)

@@ -40,9 +40,9 @@ def align_pairs(
     progress: Progress | None = None,
     pixels: int = PIXELS,
 ) -> PosedPointmaps:
-    """Return pointmaps and camera poses in one frame, from pairwise pointmaps by global alignment.
+    """Return pointmaps and camera poses in the first image's camera frame, from pairwise pointmaps by global alignment.
 
-    The focal length is estimated from the pointmaps, even if the intrinsics are known: with another focal length the
+    The focal length is estimated from the pointmaps, even if the intrinsics are known. With another focal length, the
     pointmaps do not fit each other, and the cameras move. `pixels` is the number of pixels used per image.
     """
     alignment = global_align(replace(predictions, intrinsics=images.intrinsics), pixels, progress)
@@ -68,7 +68,9 @@ def reconstruct_pointmaps(
 ) -> Reconstruction:
     """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps and matches.
 
-    `images` has colours on the grid of `maps`. Raises InputError where the points fit no pinhole camera.
+    `images` has colours on the grid of `maps`; `backend` is the name in the result. If the images have too few matches
+    (`refine`), the predicted cameras are kept, and their covariance is in `evidence`. Raises InputError where the
+    points fit no pinhole camera.
     """
     report = progress or silent
     rows = np.arange(len(capture)) if image_index is None else image_index
@@ -123,9 +125,9 @@ def refine(
 ) -> tuple[Reconstruction, PosedPointmaps] | None:
     """Adjust the predicted cameras to matches of SIFT, or else of learned features, and the depth maps to the points.
 
-    Returns the reconstruction from the matches and the adjusted pointmaps, both in the unit of the prediction; None
-    where an image has too few matches. `pinhole` belongs to the undistorted images and is the initial estimate of
-    unknown intrinsics.
+    `capture` has the images of `maps`, in the same order. Returns the reconstruction from the matches and the adjusted
+    pointmaps, both in the unit of the prediction. Returns None where an image has fewer than LEAST_MATCHES
+    observations. `pinhole` belongs to the undistorted images and is the initial estimate of unknown intrinsics.
     """
     given = images.intrinsics_of_capture
     kinds: tuple[FeatureName, ...] = ("sift", "xfeat") if xfeat_is_installed() else ("sift",)
@@ -160,10 +162,11 @@ def _depth_changes(
 ) -> tuple[Float[ndarray, "n 6"], float]:
     """Fit a smooth correction of each image's depth map to the points; return its coefficients (n,6) and a unit.
 
-    The log of the correction factor is quadratic in the image, with coefficients in the order of `_basis`. The unit is
-    that of the reconstruction `made`, in units of the prediction. `x_px` are the pixels of the tracks on the pointmaps'
-    grid. The fit is robust, with a prior on all coefficients but the constant, so that five points in a corner do not
-    change the depth elsewhere.
+    The correction factor multiplies the z of `maps`, read at the nearest pixel. Its log is quadratic in the image, with
+    coefficients in the order of `_basis`; they are 0 for an image without points. The unit is that of the
+    reconstruction `made`, in units of the prediction. `x_px` are the pixels of the k observations in `made.tracks` on
+    the pointmaps' grid. The fit is robust. A prior on all coefficients but the constant (BEND_STD) keeps five points in
+    a corner from changing the depth elsewhere.
     """
     tracks, size = made.tracks, maps.grid.size
     camera_from_recon = inverse(made.recon_from_camera)[tracks.image]

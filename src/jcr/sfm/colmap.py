@@ -88,8 +88,9 @@ def reconstruct_colmap(
 ) -> Reconstruction:
     """Reconstruct camera poses and tracks of a capture; frame and unit are arbitrary, and a seed fixes every bit.
 
-    The gripper poses check the matches (`features.stage`). Known intrinsics are held, unknown ones are estimated.
-    Raises RejectedError when fewer than three images register, with their number, the likely reason and a remedy.
+    The gripper poses check the matches (`features.stage`). The images are reduced to a long side of `working_size_px`.
+    Known intrinsics are held, unknown ones are estimated. Raises RejectedError when fewer than three images register,
+    with their number, the likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
@@ -117,9 +118,11 @@ def reconstruct_near_cameras(
     features: FeatureName,
     report: Progress = silent,
 ) -> Reconstruction | None:
-    """Return cameras and tracks adjusted from predicted poses of all images; None where an image has too few points.
+    """Return cameras and tracks adjusted from predicted poses of all images, by matches of the images.
 
-    `intrinsics` are held if `known`, and otherwise are the initial estimate. The images are matched with `features`.
+    The result is None where an image has too few points (missing_images.LEAST_POINTS). `recon_from_camera` are the
+    predicted poses of the capture's images. `intrinsics` are held if `known`, and otherwise are the initial estimate.
+    The images are matched with `features`.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
     with matched_database(capture, images, intrinsics, known, features, 0, report) as (database, camera):
@@ -141,8 +144,9 @@ def matched_database(
 ) -> Iterator[tuple[Path, pycolmap.Camera]]:
     """Match a capture's images; yield the path of a COLMAP database of the verified matches, and its camera.
 
+    `images` are those of the capture, in its order. The camera is for images of the working size (`working_cameras`).
     The database exists, and COLMAP's log is silent, within the context. `intrinsics` are given if `known`, else an
-    initial estimate.
+    initial estimate. `seed` is that of RANSAC.
     """
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         (camera,) = working_cameras([intrinsics], known)
@@ -161,8 +165,9 @@ def _adjusted(
 ) -> Reconstruction:
     """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
-    All cameras and points are adjusted before and after. Random points beyond _MOST_OBSERVATIONS are deleted first.
-    `like` are the intrinsics at the images' size, held if `known`.
+    All cameras and points are adjusted before and after; `model` is changed. Points beyond _MOST_OBSERVATIONS, chosen
+    at random by `seed`, are deleted first. `images` are all images by row. `like` are the intrinsics at the images'
+    size, held if `known`.
     """
     if model.compute_num_observations() > _MOST_OBSERVATIONS:
         order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -221,10 +226,11 @@ def map_images(
 ) -> tuple[MatchedPairs, pycolmap.Reconstruction | None]:
     """Match the images and map the verified pairs by COLMAP's mapper; return the matches and the model.
 
-    The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size. The mapper
-    tries the initial `cameras` in turn, after intrinsics estimated from the gripper's angles if there are any. A model
-    `begun` is continued with the images that it lacks. Images that the mapper leaves out are added near cameras
-    predicted from the gripper poses.
+    The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size, `cameras`
+    COLMAP's initial cameras at the working size, and `names` the images' names for messages. The mapper tries the
+    cameras in turn, after intrinsics estimated from the gripper's angles if there are any. A model `begun` is continued
+    with the images that it lacks. Images that the mapper leaves out are added near cameras predicted from the gripper
+    poses.
     """
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
     found = match_with_robot(matcher, base_from_gripper, working, names, report)
@@ -256,7 +262,8 @@ def matcher_of(
 ) -> Matcher:
     """Return a matcher of the images by SIFT or XFeat (`features`); SIFT keypoints are found now, XFeat's later.
 
-    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`.
+    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`. `seed` is
+    that of RANSAC.
     """
     if features != "xfeat":
         give_back()
@@ -273,7 +280,7 @@ def matcher_of(
 
 
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
-    """Return the matches of randomly chosen features, so that at most _MOST_MATCHED keypoints remain.
+    """Return the matches of features chosen at random by `seed`, so that at most _MOST_MATCHED keypoints remain.
 
     A feature is a set of keypoints that matches connect; either all its matches are kept or none. `images` is the
     number of images.
@@ -305,8 +312,9 @@ def _map_incrementally(
 ) -> pycolmap.Reconstruction | None:
     """Map the images once with each initial camera; return the model with most images, or None if there is none.
 
-    COLMAP's thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with
-    the images that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
+    `matcher` gives the number of images, the seed, and whether the intrinsics are known. COLMAP's thresholds are
+    relaxed if the model lacks more than half of the images. A model `begun` is continued with the images that it lacks.
+    The progress is the share of images in the model; it falls when another camera is tried.
     """
     n_images, folder, pipeline = len(matcher.x_px), database.parent, pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
@@ -363,7 +371,10 @@ def _map_incrementally(
 def _not_registered(
     matcher: Matcher, matched: MatchedPairs, model: pycolmap.Reconstruction | None
 ) -> RejectedError:
-    """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy."""
+    """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy.
+
+    `matched` are the pairs that were mapped, and `model` is the largest model, None if there is none.
+    """
     x_px, pairs = matcher.x_px, len(matched.geometries)
     features = int(np.median([len(x) for x in x_px]))
     if features < _FEW_FEATURES:

@@ -21,7 +21,9 @@ def reconstruct_given(
 ) -> Reconstruction:
     """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
-    Raises InputError when the model contains fewer than three, RejectedError when too few points can be triangulated.
+    Images are identified by their names. The points are those of the model, or with fewer than MIN_POINTS are
+    triangulated from SIFT matches. Raises InputError when the model contains fewer than three of the images,
+    RejectedError when too few points can be triangulated.
     """
     report = progress or silent
     names, recon_from_camera = colmap.read_registered_cameras(cameras)

@@ -54,7 +54,8 @@ class LiveMap:
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
-        Images that are no longer in the capture are removed, and the map then begins anew.
+        Images that are no longer in the capture are removed, and the map then begins anew. With FEW images or fewer,
+        every update begins anew.
         """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
@@ -83,7 +84,7 @@ class LiveMap:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
 
     def _rows(self) -> list[int]:
-        """Return the rows of the images that the model has registered, counted in the order of the matcher."""
+        """Return the rows of the registered images, counted in the order of the matcher; empty with fewer than two."""
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:

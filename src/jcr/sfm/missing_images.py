@@ -53,9 +53,10 @@ def nearer_to_robot(
 ) -> pycolmap.Reconstruction:
     """Return a map near the cameras that the gripper poses predict, if it agrees with them much better than `model`.
 
-    The mapper goes astray if its first two images show one plane, whose matches have two solutions, or if objects moved
-    while the images were taken. `x` is a rough estimate of gripper_from_camera; matches that contradict the predicted
-    cameras are left out.
+    Otherwise `model` is returned. It is kept, too, if its rms distance from the gripper poses, over the images that fit
+    best, is below CONTRADICTED (m). Much better means an rms distance smaller by the factor BETTER. The mapper goes
+    astray if its first two images show one plane (two solutions), or if objects moved while the images were taken. `x`
+    is a rough estimate of gripper_from_camera; matches that contradict the predicted cameras are left out.
     """
     rows = rows_of(model)
     error = least_trimmed(base_from_gripper[rows], poses_of(model, rows))[1]
@@ -76,10 +77,11 @@ def with_missing_images(
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
 ) -> pycolmap.Reconstruction:
-    """Return the model with those missing images whose predicted camera poses are confirmed by enough points.
+    """Return the model with those missing images whose predicted camera poses are confirmed by LEAST_POINTS points.
 
     The poses are predicted from the gripper poses by the hand-eye transform of the images in the model.
-    `base_from_gripper` has a row per image of the matcher.
+    `base_from_gripper` has a row per image of the matcher. `model` itself is returned if it has fewer than LEAST_MAPPED
+    images, or if no image can be added.
     """
     rows = rows_of(model)
     poses = poses_of(model, rows)
@@ -101,7 +103,10 @@ def with_missing_images(
 
 
 def _complete_images(model: pycolmap.Reconstruction, images: set[int], matcher: Matcher) -> None:
-    """Match the images of these numbers with the points near their cameras, and adjust all cameras and points."""
+    """Match the images with COLMAP ids `images` with points near their cameras; adjust all cameras and points.
+
+    `model` is changed. Observations with a reprojection error above LARGEST_PX are removed.
+    """
     filters = pycolmap.ObservationManager(model)
     for radius_px in RADII_PX:
         for image_id in sorted(images):
@@ -118,10 +123,11 @@ def model_near_cameras(
     known: bool,
     mapped: Container[int] | None = None,
 ) -> pycolmap.Reconstruction:
-    """Return COLMAP's model, adjusted to all verified matches of the database from predicted camera poses by image row.
+    """Return COLMAP's model, adjusted to all verified matches of the database from predicted camera poses.
 
-    The intrinsics of `camera` are held if `known`. Images with fewer than LEAST_POINTS points are removed. Only points
-    that an image of the rows `mapped` sees are counted, or all points if `mapped` is None.
+    `recon_from_camera` has the predicted poses by image row. The intrinsics of `camera` are held if `known`. Images
+    with fewer than LEAST_POINTS points are removed. Only points that an image of the rows `mapped` sees are counted, or
+    all points if `mapped` is None.
     """
     model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
     for largest_px, refinements, scale_px in PASSES:
@@ -145,7 +151,11 @@ def model_near_cameras(
 
 
 def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, radius_px: float) -> None:
-    """Add observations to an image: unused keypoints within `radius_px` of a projected point of similar descriptor."""
+    """Add observations to the image with COLMAP id `image_id`: unused keypoints near a projected point.
+
+    A keypoint within `radius_px` (working size) is added if its descriptor is the nearest one to the point's mean
+    descriptor. Its distance must be below the features' `farthest` and below RATIO times that of the second nearest.
+    """
     image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
     free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)

@@ -28,7 +28,7 @@ ENOUGH = 1e-6
 
 
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
-    """Return COLMAP's camera with these intrinsics.
+    """Return COLMAP's camera with these intrinsics, for images of their size.
 
     If the intrinsics are not `known`, the camera's model is RADIAL with their focal length and no distortion; COLMAP
     then refines the focal length and two coefficients.
@@ -63,7 +63,7 @@ def working_cameras(
 
 
 def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Intrinsics:
-    """Return the intrinsics of COLMAP's `camera` for images of the size of `like`; if `known`, return `like` itself."""
+    """Return the intrinsics of COLMAP's `camera`, scaled to images of the size of `like`; `like` itself if `known`."""
     if known:
         return like
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
@@ -75,7 +75,10 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Int
 def write_database(
     folder: Path, camera: pycolmap.Camera, x_px: Sequence[Float[ndarray, "_ 2"]], geometries: Geometries
 ) -> Path:
-    """Write a COLMAP database of images of one camera, their keypoints (px) and verified matches; return its path."""
+    """Write `database.db` for COLMAP to `folder`: images of one camera, keypoints and verified matches; return its path.
+
+    `x_px` has the keypoints (x, y) of each image, in pixels of the images of `camera`.
+    """
     with closing(pycolmap.Database.open(folder / "database.db")) as db:
         db.write_camera(camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -94,7 +97,7 @@ def write_database(
 
 
 def rows_of(model: pycolmap.Reconstruction) -> list[int]:
-    """Return the rows of the images that a model has registered, ascending."""
+    """Return the rows of the images that a model has registered (COLMAP's ids minus 1), ascending."""
     return sorted(image_id - 1 for image_id in model.reg_image_ids())
 
 
@@ -160,10 +163,10 @@ def triangulated_model(
     largest_px: float = 4.0,
     refinements: int = 5,
 ) -> pycolmap.Reconstruction:
-    """Return a model of images (by row) with fixed poses, and points triangulated from all matches of the database.
+    """Return a model with fixed poses, and points triangulated from all matches of the database.
 
-    Points with a reprojection error above `largest_px` are removed, in at most `refinements` rounds. The same input
-    gives the same bits.
+    `recon_from_camera` has the poses by image row; other images are left out. Points with a reprojection error above
+    `largest_px` are removed, in at most `refinements` rounds. The same input gives the same bits.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -191,8 +194,9 @@ def adjust_robustly(
 ) -> None:
     """Adjust all cameras and points of a model, which is changed, under a Cauchy loss of scale `scale_px`.
 
-    `enough` is the relative change of the cost that ends the adjustment. In COLMAP's plain least squares mismatches
-    distort the result; the loss halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
+    The intrinsics are adjusted, too, unless `fix_intrinsics`. `enough` is the relative change of the cost that ends the
+    adjustment. In COLMAP's plain least squares mismatches distort the result; the loss halves the error of the camera
+    centres (0.20 to 0.11 mm rms over 12 simulated views).
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False

@@ -49,7 +49,7 @@ class KnownImages:
         camera: Intrinsics,
         recon_from_camera: Float[ndarray, "m 4 4"],
     ) -> "KnownImages":
-        """Find the features of m images of one camera, whose poses and intrinsics (`camera`) are known."""
+        """Find the features of m images (RGB) of one camera, whose poses and intrinsics (`camera`) are known."""
         return cls(camera, recon_from_camera, tuple(features(image, camera) for image in images))
 
 
@@ -72,9 +72,10 @@ def register(
     older: Sequence[UInt8[ndarray, "h w 3"]],
     new: Sequence[UInt8[ndarray, "h w 3"]],
 ) -> list[CameraPose | int]:
-    """Return for each new image its camera pose in the recon frame, or the number of points that agree if too few.
+    """Return for each new image its camera pose in the recon frame; if it fails, the number of points that agree.
 
-    `older` are the images of the reconstruction's rows, in their order. All images are of one camera.
+    It fails with fewer than MIN_POINTS. `older` are the images of the reconstruction's rows, in their order. All images
+    are of one camera.
     """
     camera = reconstruction.intrinsics
     known = KnownImages.of(older, camera, reconstruction.recon_from_camera)
@@ -83,7 +84,7 @@ def register(
 
 
 def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> ImageFeatures:
-    """Return the SIFT features of an image with these intrinsics; large images are reduced to WORKING_SIZE_PX first."""
+    """Return an image's SIFT features, in its own pixels; an image larger than WORKING_SIZE_PX is reduced first."""
     scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
     size = round(intrinsics.width * scale), round(intrinsics.height * scale)
     found, descriptors = detect(grey_of(image, size))
@@ -100,11 +101,12 @@ def registrations(
     focals: Sequence[Literal["given", "free"]] = ("given",),
     gate_px: float = GATE_PX,
 ) -> list[tuple[Registration | None, int]]:
-    """Return for each of `focals` a new image's registration, None if too few points agree, and their number.
+    """Return for each of `focals` a new image's registration and the number of points that agree on its pose.
 
-    Matches of the image with the known images are triangulated from the known images; the pose is the one on which most
-    points agree. The focal length of the new image's intrinsics (`camera`) is held (`given`) or estimated (`free`).
-    `gate_px` is the largest reprojection error of an inlier, and MIN_POINTS the least number of inliers.
+    The registration is None if fewer than MIN_POINTS agree. Matches of the image with the known images are triangulated
+    from the known images; the pose is the one on which most points agree. The focal length of the new image's
+    intrinsics (`camera`) is held (`given`) or estimated (`free`). `gate_px` is the largest reprojection error (px) of a
+    point that agrees.
     """
     new = features(image, camera)
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]
@@ -160,8 +162,9 @@ def triangulated_features(
 ) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"], Bool[ndarray, " n"]]:
     """Return each of `n` features' point, its covariance per rad² of ray variance, and whether two rays agree on it.
 
-    Observation c is the ray `seen[c]` (x/z, y/z) of image `row[c]` to the feature `feature[c]`. Rays that miss their
-    point by more than `gate` (rad) are mismatches. Points are in the recon frame.
+    Observation c is the ray `seen[c]` (x/z, y/z) of image `row[c]` to the feature `feature[c]`. Points and covariances
+    are in the recon frame and unit. Rays that miss their point by more than `gate`, in x/z and y/z, are mismatches. Two
+    rays agree only if the angle between them is above MIN_PARALLAX.
     """
     rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
     direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])

@@ -55,9 +55,9 @@ def align_tracks(
 ) -> Tracks:
     """Return the tracks with observations aligned to one reference observation per track by least-squares matching.
 
-    The result has standard deviations. `greys` are the images in the order of the cameras. Images, tracks and
-    `intrinsics` are of one size. The reference is the observation that shows the surface at the median scale, and keeps
-    its pixel.
+    The result has standard deviations in px (`std_px`). `greys` are the images in the order of the cameras. Images,
+    tracks and `intrinsics` are of one size. The reference is the observation that shows the surface at the median
+    scale, and keeps its pixel.
     """
     order = np.lexsort((tracks.image, tracks.point))
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
@@ -121,8 +121,10 @@ def _warps(
     """Return affine part A and bend B of the warp of each observation, from the image of its reference observation.
 
     An offset (u, v) px from the reference's keypoint becomes A·(u, v) + B·(u², uv, v²) px in the observation's image.
-    Both come from central differences; B is due to perspective and distortion. Both are 0 where the plane is seen at a
-    grazing angle or from behind; such observations are not aligned.
+    Observation k is the pixel `x_px[k]` of point `x_in_recon[k]` in the image `image[k]`; its reference is row
+    `of_reference[k]`. The plane around the point has the normal `facing[k]` (recon axes, any length). Both A and B come
+    from central differences; B is due to perspective and distortion. Both are 0 where the plane is seen at a grazing
+    angle or from behind; such observations are not aligned.
     """
     recon_from_reference = recon_from_camera[image[of_reference]]
     camera_from_recon = inverse(recon_from_camera)[image]
@@ -153,11 +155,12 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
 @compiled
 @no_type_check
 def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
-    """Align all observations except the references: update `warp` (pixels, affine parts, bends) and `variance_px`.
+    """Align all observations except the references: update `warp` and `variance_px` (k) in place.
 
+    `warp` has the pixels (k,2), affine parts (k,2,2) and bends (k,2,3) of the k observations; the bends do not change.
     `image` and `keypoint_px` are the image (row of `greys`) and the initial pixel of each observation; `most_px` is the
     largest shift. `ends` are the first observations of the tracks and the end of the last track; `reference` is the
-    reference observation of each track. The variance (px²) of an observation that could not be aligned stays infinite.
+    reference observation of each track. The variance (px²) of an observation that could not be aligned does not change.
     """
     offsets, window = _window(_RADIUS)
     wide, _ = _window(_RADIUS + 1)
@@ -199,7 +202,10 @@ def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, mo
 @compiled
 @no_type_check
 def _window(radius):
-    """Return the offsets (n,2), x and y in px, of the pixels of a patch, row by row, and their weights of sum 1."""
+    """Return the offsets (n,2), x and y in px, of the pixels of a patch, row by row, and their weights of sum 1.
+
+    The patch has 2 · radius + 1 pixels on each side; the weights (n) are Gaussian, with standard deviation _WINDOW px.
+    """
     side = 2 * radius + 1
     index = np.arange(side * side)
     offsets = np.stack((index % side - radius, index // side - radius), axis=1).astype(np.float64)
@@ -210,11 +216,11 @@ def _window(radius):
 @compiled
 @no_type_check
 def _patch(grey, x_px, affine, bend, offsets, patch):
-    """Write to `patch` the grey at each of the `offsets`, warped about x_px; return whether the image contains all.
+    """Write to `patch` (n) the grey at the `offsets` (n,2), warped about `x_px`; return whether the image contains all.
 
-    The warp is that of `_warps`, with `affine` (2,2) and `bend` (2,3). The grey is that of a cubic B-spline whose
-    coefficients are the pixels, which blurs by 0.58 px. Without this blur, interpolation would smooth differently on
-    pixels and between them, which biases positions.
+    The warp of `_warps`, with `affine` (2,2) and `bend` (2,3), leads to pixels of the image `grey` around the pixel
+    `x_px`. The grey is that of a cubic B-spline whose coefficients are the pixels, which blurs by 0.58 px. Without this
+    blur, interpolation would smooth differently on pixels and between them, which biases positions.
     """
     for k in range(len(offsets)):
         u = offsets[k, 0]
@@ -243,11 +249,13 @@ def _patch(grey, x_px, affine, bend, offsets, patch):
 @compiled
 @no_type_check
 def _template(around, offsets, window, template, pull):
-    """Write the reference patch minus its mean to `template`, and the gain matrix of the unknowns to `pull` (n,8).
+    """Write the reference patch minus its mean to `template` (n), and the gain matrix of the unknowns to `pull` (n,8).
 
-    Row k of `pull` is the change of the eight unknowns (shift, gain, offset, affine part) per grey level of difference
-    at pixel k. Returns the standard deviation of the patch. Where the texture does not determine the unknowns, `pull`
-    is very large, and the resulting variance rejects the patch.
+    `around` has the greys of the patch, row by row, with one more pixel on every side. `offsets` and `window` are its
+    pixels and their weights (`_window`). Row k of `pull` is the change of the eight unknowns per grey level of
+    difference at pixel k. The unknowns are shift x and y, gain, offset, and the affine part row by row. Returns the
+    standard deviation of the patch. Where the texture does not determine the unknowns, `pull` is very large, and the
+    resulting variance rejects the patch.
     """
     side = 2 * _RADIUS + 3
     mean = 0.0
@@ -279,10 +287,13 @@ def _template(around, offsets, window, template, pull):
 @compiled
 @no_type_check
 def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
-    """Align one patch to the template by Gauss-Newton: update `x_px` (its centre) and `affine`; return the correlation.
+    """Align one patch to the template by Gauss-Newton: update `x_px` (2) and `affine` (2,2); return the correlation.
 
-    The result is -1 without convergence, or if the patch moves more than `most_px` from `keypoint_px`. `template`,
-    `pull` and `deviation` come from `_template`: a step is the sum over the patch of (grey − template)·pull.
+    The correlation is that of patch and template, weighted by `window`. The result is -1 without convergence, if the
+    patch leaves the image `grey`, or if its centre `x_px` moves more than `most_px` from `keypoint_px`. `bend` is the
+    fixed part of the warp (`_warps`), `offsets` and `window` come from `_window`, and `patch` (n) is overwritten.
+    `template`, `pull` and `deviation` come from `_template`: a step is the sum over the patch of (grey −
+    template)·pull.
     """
     step = np.empty(_FREE)
     for _ in range(_STEPS):

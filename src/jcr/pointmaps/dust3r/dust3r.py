@@ -60,10 +60,10 @@ def reconstruct_dust3r(
 
 
 def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
-    """Return the pairs of images to predict, in both orders: all pairs of up to FEW_IMAGES images.
+    """Return the pairs of images (rows) to predict, in both orders: all pairs of up to FEW_IMAGES images.
 
-    With more images, these are the pairs of near viewpoints, and of successive images, which connect separate groups of
-    viewpoints.
+    With more images, these are the pairs of near viewpoints (`near_pairs`), and of images next to each other in the
+    capture. The latter connect separate groups of viewpoints.
     """
     count = len(base_from_gripper)
     if count <= FEW_IMAGES:
@@ -82,8 +82,9 @@ def predict_pairs(
 ) -> tuple[PairPredictions, tuple[str, ...]]:
     """Predict the pointmaps of the ordered image pairs `edges`; return them with notes for the user.
 
-    The encoder runs once per image, and the decoder once per pair. The batch is halved when CUDA runs out of memory;
-    InputError is raised when one pair does not fit.
+    A row of `edges` has the first and the second image of a pair, as rows of `images`; `names` are the names of the
+    images. The encoder runs once per image, and the decoder once per pair. The batch is halved when CUDA runs out of
+    memory; InputError is raised when one pair does not fit.
     """
     report = progress or silent
     features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
@@ -131,9 +132,10 @@ def _in_batches(
     sizes: list[int],
     report: Callable[[float], None],
 ) -> None:
-    """Call `work` on the row numbers below `count`, in batches of the last size in `sizes`.
+    """Call `work` on batches of the integers 0 to `count` − 1; the batch size is the last number in `sizes`.
 
-    When memory runs out, half of this size is appended to `sizes`, and the batch is repeated.
+    When CUDA runs out of memory, half of this size is appended to `sizes`, and the batch is repeated. Raises InputError
+    if a batch of one does not fit. `report` receives the finished fraction, 0 to 1, after each batch.
     """
     done = 0
     while done < count:
@@ -155,7 +157,7 @@ def _in_batches(
 
 
 def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
-    """Load a network from a folder, or from a .safetensors file next to its config.json.
+    """Load a network from a folder, or from a .safetensors file next to its config.json, onto a torch device.
 
     The licence is printed on stderr. Raises InputError for files that are missing, damaged or of another network.
     """
@@ -189,7 +191,10 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit."""
+    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit.
+
+    `config` is the content of config.json, `state` contains the tensors by name, and `path` is named in messages.
+    """
     mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
     config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")
@@ -213,5 +218,5 @@ def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> D
 
 
 def _line(error: BaseException) -> str:
-    """Return the first sentence of an error's message, on one line."""
+    """Return the first sentence of an error's message, on one line; the name of its type if the message is empty."""
     return " ".join(str(error).split()).split(". ")[0][:160] or type(error).__name__

@@ -115,11 +115,18 @@ class Dust3r(nn.Module):
     def forward(
         self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Return the pointmaps of image pairs in [-1, 1]; height and width are multiples of 16, portrait included."""
+        """Return the pointmaps of both images of each pair, in the first camera's frame.
+
+        Colours are RGB, scaled to [-1, 1]. Height and width are multiples of 16, else ValueError is raised; portrait
+        images are accepted.
+        """
         return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
-        """Return the encoder tokens of images in [-1, 1]; each image is encoded once for all its pairs."""
+        """Return the encoder tokens of images (RGB, -1 to 1); each image is encoded once for all its pairs.
+
+        Raises ValueError unless height and width are multiples of 16.
+        """
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
                 f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
@@ -134,7 +141,10 @@ class Dust3r(nn.Module):
             return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
-        """Return the pointmaps of both images in the first camera's frame; swapped arguments give other predictions."""
+        """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame.
+
+        Swapped arguments give other predictions.
+        """
         with self._autocast(features1.tokens):
             rotary1, rotary2 = (
                 rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
@@ -164,9 +174,11 @@ class Dust3r(nn.Module):
 
 
 def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: torch.device) -> Rotary:
-    """Return cosines and sines of the angle position · base^(−2k/D) of each position on the grid and frequency k.
+    """Return cosines and sines (RoPE, Su et al. 2021) of the angle p · base^(−2k/D), shape (2, n, 2, D/2).
 
-    D = head_dim/2 (RoPE, Su et al. 2021).
+    The axes are cosine and sine; the n tokens, row by row; the coordinate p (row, then column) of the token; the
+    frequency k. `grid` is rows and columns of tokens. `head_dim` is the number of channels of an attention head, and D
+    = head_dim/2.
     """
     position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
     exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)
@@ -175,7 +187,10 @@ def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: 
 
 
 def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b heads n d"]:
-    """Return queries or keys rotated by their positions: the first half of the channels by y, the second half by x."""
+    """Return queries or keys x rotated by their positions: the first half of the channels by y, the second half by x.
+
+    The axes of x are batch, attention head, token and channel. `rotary` comes from `rotary_embedding`.
+    """
     # Each half of the channels holds pairs (a, b), all a before all b: a cos - b sin and b cos + a sin. Whole rows
     # and a small matrix are several times as quick as slices of a few channels.
     cos, sin = rotary.to(x.dtype).repeat_interleave(2, -2).flatten(-2)
@@ -193,7 +208,7 @@ class PatchEmbed(nn.Module):
         self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
-        """Return the tokens of images."""
+        """Return one token for each 16x16 patch of images (b,3,h,w), row by row, as an array (b,n,c)."""
         return self.proj(images).flatten(2).mT
 
 
@@ -207,7 +222,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
-        """Return the self-attention of the tokens x, whose position embeddings are `rotary`."""
+        """Return the self-attention of the tokens x (b,n,c); `rotary` are their positions (`rotary_embedding`)."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         out = F.scaled_dot_product_attention(rotate(q, rotary), rotate(k, rotary), v)
         return self.proj(out.transpose(1, 2).flatten(2))
@@ -222,7 +237,10 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the cross-attention of tokens x to tokens y; `rotary_*` are their position embeddings."""
+        """Return the attention of tokens x to tokens y of the other image, with the shape of x.
+
+        `rotary_x` and `rotary_y` are the position embeddings of the tokens (`rotary_embedding`).
+        """
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
@@ -240,7 +258,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(int(dim * ratio), dim)
 
     def forward(self, x: Tokens) -> Tokens:
-        """Return the output of the perceptron for each token."""
+        """Return the output of the perceptron for each token, with the shape of x (b,n,c)."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -254,7 +272,7 @@ class EncoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
-        """Return the tokens after the block; `rotary` are their position embeddings."""
+        """Return the tokens x (b,n,c) after self-attention and perceptron; `rotary` are their position embeddings."""
         x = x + self.attn(self.norm1(x), rotary)
         return x + self.mlp(self.norm2(x))
 
@@ -270,14 +288,17 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the tokens x after the block, which attends to the other image's tokens y."""
+        """Return the tokens x after self-attention, cross-attention to the other image's tokens y, and perceptron.
+
+        `rotary_x` and `rotary_y` are the position embeddings of the tokens.
+        """
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
 
 
 def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
-    """Return points and confidence from a head's four channels x, y, z, c.
+    """Return points (b,h,w,3) and confidence (b,h,w) from the four raw channels x, y, z, c of a head.
 
     The vector (x, y, z) of length d is scaled to the length exp(d) − 1; the confidence is 1 + exp(c).
     """
@@ -294,7 +315,10 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmap of an image from the tokens after each layer; `grid` is rows and columns of tokens."""
+        """Return the pointmaps of images from the tokens (b,n,c) in the last entry of `layers`.
+
+        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
+        """
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -309,7 +333,10 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmap of an image from the tokens after each layer; `grid` is rows and columns of tokens."""
+        """Return the pointmaps of images from the tokens (b,n,c) in four entries of `layers`.
+
+        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
+        """
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
@@ -335,7 +362,10 @@ class Dpt(nn.Module):
         )
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
-        """Return the four raw outputs of each pixel from the token grids of four layers."""
+        """Return the four raw outputs of each pixel (x, y, z, c of `pointmap`) from the token grids of four layers.
+
+        The grids have shape (b, channels, rows, columns), from the earliest layer to the last.
+        """
         x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -353,7 +383,10 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
     def forward(self, levels: list[Tensor]) -> FeatureMap:
-        """Return the fused feature map, at twice the resolution of the finest one."""
+        """Return the fused feature map, at twice the resolution of the finest one.
+
+        `levels` are four feature maps (b,c,h,w), finest first, each with about half the resolution of the one before.
+        """
         level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
@@ -374,7 +407,7 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(width, width, 1)
 
     def forward(self, x: FeatureMap) -> Float[Tensor, "b c 2*h 2*w"]:
-        """Return the refined map at twice the resolution."""
+        """Return the refined map at twice the resolution, by bilinear interpolation."""
         # A 1x1 convolution commutes with bilinear upsampling; before it, it costs a quarter.
         x = self.out_conv(self.resConfUnit2(x))
         return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)

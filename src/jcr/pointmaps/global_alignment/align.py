@@ -73,8 +73,8 @@ def global_align(
 
     `pixels` is the number of pixels used per image. The focal length is estimated from the pointmaps. The principal
     point and the ratio fy / fx are those of the predictions' intrinsics; without intrinsics they are the image's middle
-    and 1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and too few pixels.
-    Raises RejectedError where the pointmaps do not determine the cameras.
+    and 1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and fewer than
+    LEAST_PIXELS pixels. Raises RejectedError where the pointmaps do not determine the cameras.
     """
     predictions = pairs if isinstance(pairs, PairPredictions) else read_pairs(Path(pairs))
     if pixels < LEAST_PIXELS:
@@ -94,7 +94,10 @@ def global_align(
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the result of the alignment with the depth of every pixel, not only of those used to solve it."""
+    """Return the result of the alignment with depth and confidence of every pixel, not only of those used to solve it.
+
+    The poses, focal length and pair scales of `solution` do not change.
+    """
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

@@ -88,7 +88,11 @@ class ImageEquations:
 
 
 def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
-    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image."""
+    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image.
+
+    A first stage with COARSE_PIXELS pixels gives the initial estimate. Raises RejectedError where the pointmaps do not
+    determine the unknowns.
+    """
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
@@ -109,10 +113,10 @@ def gauss_newton(
 ) -> AlignmentSolution:
     """Solve for cameras, focal length, pair scales and depths by iteratively reweighted least squares.
 
-    Each round estimates the weights, and at its end `pair_spread`, the standard deviations of the pairs' errors. The
-    rounds end when a round changes no camera, focal length or pair scale by more than `tolerance` (rad, or relative).
-    The first camera and the product of the pair scales are fixed. Raises RejectedError where the pointmaps do not
-    determine the unknowns.
+    `state` is the initial estimate. Each round estimates the weights, and at its end `pair_spread`, the standard
+    deviations of the pairs' errors (translation in recon units, rotation in rad). The rounds end when no entry of a
+    camera pose, log focal length or log pair scale changes by more than `tolerance`. The first camera and the product
+    of the pair scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
     """
     at: Iterate = (state, _residuals(images, state))
     noise, equations, settled = list[ResidualSpread](), list[ImageEquations](), False
@@ -147,7 +151,7 @@ def gauss_newton(
 
 
 def _residuals(images: list[ImageObservations], state: AlignmentState) -> list[Residuals]:
-    """Return the residuals of each image at a state."""
+    """Return the residuals of each image at the poses, focal length, pair scales, pair errors and depths of `state`."""
     return [
         depth_residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
     ]
@@ -159,10 +163,11 @@ def _least_squares(
     noise: list[ResidualSpread],
     pair_spread: Float[ndarray, "6"],
 ) -> tuple[Iterate, list[ImageEquations]]:
-    """Minimise the weighted squares of residuals and pairs' errors; return state, residuals and last equations.
+    """Minimise the weighted squares of residuals and pairs' errors; return the result and the last equations.
 
-    The weights are those at `begin`. `noise` is the spread of each image's residuals, and `pair_spread` that of the
-    pairs' errors.
+    The result is the state with its residuals, and there is one ImageEquations per image. The weights are those at
+    `begin`. `noise` is the spread of each image's residuals. `pair_spread` has the standard deviations of the pairs'
+    errors (three of translation, three of rotation). Raises RejectedError where the equations are singular.
     """
     latest: list[ImageEquations] = []
     weights = [residual_weights(*of) for of in zip(images, begin[1], noise, strict=True)]
@@ -203,7 +208,8 @@ def _normal_equations(
 ) -> tuple[Float[ndarray, "q q"], Float[ndarray, " q"]]:
     """Return matrix and gradient of the equations of all images, without the rows of the first camera, which is fixed.
 
-    The q unknowns are the steps of the other cameras (six each), the log focal length and the log pair scales.
+    The q unknowns are the steps of the other cameras (six each), the log focal length and the log pair scales. A
+    camera's step is its translation, then its rotation vector, in recon axes.
     """
     hessian = np.sum([e.selection.T @ (e.selection.T @ e.hessian).T for e in equations], axis=0)
     gradient = np.sum([e.selection.T @ e.gradient for e in equations], axis=0)
@@ -222,7 +228,8 @@ def _after_step(
 ) -> AlignmentState:
     """Return the state after `step`: six numbers per camera, the log focal length and the log pair scales.
 
-    Depths and pair errors follow from it.
+    A camera's six numbers are translation and rotation vector in recon axes (geometry.retract). The steps of depths and
+    pair errors follow from `step` by the image's `equations`.
     """
     log_depth, pair_error = [], state.pair_error.copy()
     for o, before, e in zip(images, state.log_depth, equations, strict=True):
@@ -253,6 +260,7 @@ def image_equations(
 ) -> ImageEquations:
     """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their `weights`.
 
+    `weights` has those across and along the line of sight; `pair_spread` the standard deviations of the pairs' errors.
     A modelled point lies at distance |x| along the unit vector x̂. If it moves by v, the weighted squares of the
     residuals' changes sum to vᵀ (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights
     of the residuals across and along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
@@ -305,10 +313,11 @@ def _eliminated(
     state: AlignmentState,
     pair_spread: Float[ndarray, "6"],
 ) -> dict[str, ndarray]:
-    """Return the fields of ImageEquations after elimination of the pairs' errors: equations, gains and variances.
+    """Return the fields of ImageEquations, by name, that follow from the elimination of the pairs' errors.
 
-    The twists of the second views come first in the rows and columns of `hessian`. `pair_spread` are the prior standard
-    deviations of the errors.
+    They are `hessian`, `gradient`, `gain`, `offset`, `axes` and `error_variance`. The c rows of `hessian` and
+    `gradient` are six per second view (twists), then the log pair scales and the log focal length. `pair_spread` are
+    the prior standard deviations of the errors (translation, rotation).
     """
     n, count = o.second_count, 6 * o.second_count
     axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))
@@ -330,7 +339,11 @@ def _eliminated(
 
 
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
-    """Return the matrix that maps a step of all unknowns to a step of the c unknowns of one image's ImageEquations."""
+    """Return the matrix that maps a step of all unknowns to a step of the c unknowns of one image's ImageEquations.
+
+    A step of all unknowns has six numbers per camera, the log focal length and the log pair scales, as in
+    `_after_step`.
+    """
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)
     twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)

@@ -14,8 +14,9 @@ from jcr.pointmaps.global_alignment.residuals import AlignmentState
 def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -> AlignmentState:
     """Return an initial estimate of all unknowns, accurate to a few per cent.
 
-    Depths come from the pairs that have the image first, cameras from the pairs that agree best. `edges` are the images
-    (first, second) of each pair. Raises RejectedError where no first view has points in front of its camera.
+    Depths come from the pairs that have the image first, and cameras from a spanning tree of the pairs that agree best.
+    `edges` are the images (first, second) of each pair. Raises RejectedError where no first view has points in front of
+    its camera.
     """
     # The median of pixel radius / tangent of the angle off the optical axis, of pointmaps in their own camera's frame.
     ratios = []
@@ -53,10 +54,12 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
 
 
 def _own_depth(o: ImageObservations, focal: float) -> tuple[Float[ndarray, " m"], Float[ndarray, " f"]]:
-    """Return an image's m pixel depths, in a unit of the image, and the log scales of the f pairs that have it first.
+    """Return an image's m pixel depths (z) in a unit of the image, and log scales of the f pairs that have it first.
 
-    The depth is the median over these pairs. Without such a pair, it comes from the second view with most inliers, by
-    the pose of the image's camera in the frame of this view (resection).
+    A log scale is the log of the pair's depths minus that of the image's depths. The depth is the median over these
+    pairs, and `focal` is fx in px. Without such a pair, the log scales are empty, and the depth comes from the second
+    view with most inliers. The image's camera is then located in the frame of this view (resection); if this fails for
+    every view, all depths are 1.
     """
     if len(o.pair) > o.second_count:
         forward = np.maximum(o.direction[o.second_count :, 2], 1e-6).astype(np.float64)
@@ -83,8 +86,10 @@ def _similarities(
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"], Float[ndarray, " n"]]:
     """Register an image's own points to the pointmaps of its n pairs as second image (Umeyama 1991, robust).
 
-    Returns per pair first_from_second, the log ratio of the second image's unit to the first's, and the median residual
-    relative to the distance of the points. `depth` is that of the image's pixels, and `unit` the log unit of each pair.
+    Returns three arrays with an entry per pair: first_from_second in the first image's unit; the log ratio of the
+    second image's unit to the first's; the median residual relative to the distance of the points. `focal` is fx in px,
+    and `depth` the z of the image's m pixels in its unit. `unit` is for each pair the log scale of `_own_depth`, that
+    of its first image.
     """
     n = o.second_count
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth
@@ -103,11 +108,12 @@ def _similarities(
 def _contradiction(
     edges: Int[ndarray, "e 2"], first_from_second: Float[ndarray, "e 3 3"], images: int
 ) -> Float[ndarray, " e"]:
-    """Return for each pair the angle (rad) between its rotation and its composition over a third image.
+    """Return for each pair the disagreement of its rotation with the product of two pairs over a third image.
 
-    It detects a pair whose two pointmaps fit each other but not the scene. The result is the first quartile over the
-    third images, because with a third of the pairs wrong, most compositions around a correct pair are wrong, too. It is
-    0 without a third image.
+    The disagreement of rotations that differ by the angle θ is 2 sin(θ/2), about θ in rad. It detects a pair whose two
+    pointmaps fit each other but not the scene. The result is the first quartile over the third images. With a third of
+    the pairs wrong, most products around a correct pair are wrong, too. The result is 0 without a third image. `edges`
+    are the images (first, second) of each pair, and `images` is the number of images.
     """
     rotation = np.full((images, images, 3, 3), np.nan)
     first, second = edges.T
@@ -129,7 +135,9 @@ def _chain(
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, " n"]]:
     """Return recon_from_camera and log unit of each image, chained from image 0 along the minimum spanning tree (Prim).
 
-    `log_ratio` is the log of the second image's unit over the first's, and `cost` the weight of each pair in the tree.
+    Frame and unit of recon are those of image 0. `edges` are the images (first, second) of each pair, and
+    `first_from_second` has translations in the first image's unit. `log_ratio` is the log of the second image's unit
+    over the first's, and `cost` the weight of each pair in the tree.
     """
     count = int(edges.max()) + 1
     recon_from_camera, log_scale = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count)

@@ -32,7 +32,8 @@ class AlignmentProblem:
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
         """Return the problem of aligning these predictions.
 
-        Without intrinsics, the principal point is the middle of the grid, and fy / fx is 1.
+        Without intrinsics, the principal point is the middle of the grid, and fy / fx is 1. Confidences count as those
+        of DUSt3R (`weigh`) if any is above 1.
         """
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
@@ -41,14 +42,15 @@ class AlignmentProblem:
         return cls(predictions, middle, given.fy / given.fx if given else 1.0, largest > 1.0)
 
     def weigh(self, confidence: Float[ndarray, "*k"]) -> Float[ndarray, "*k"]:
-        """Return the weights of confidences C: log C, at least 0, for DUSt3R's confidences, otherwise C itself."""
+        """Return the weights of confidences C: log C, at least 0, if `log_weight` (DUSt3R), otherwise C itself."""
         return np.log(np.maximum(confidence, 1.0)) if self.log_weight else confidence
 
     def observe_all(self, count: int) -> "list[ImageObservations]":
-        """Return the pointmaps of all pairs at the most confident pixel of each of about `count` equal cells per image.
+        """Return for each image the pointmaps of all its pairs at the most confident pixels.
 
-        Equal cells cover the whole field of view, which a ranking by confidence alone would not. Cells without a
-        confident pixel (sky) are left out. Raises InputError for an image without any confidence.
+        One pixel is taken from each of about `count` equal cells of the image. Equal cells cover the whole field of
+        view, which a ranking by confidence alone would not. Cells without a confident pixel (sky) are left out (POOR).
+        Raises InputError for an image without any confidence.
         """
         predictions = self.predictions
         height, width = predictions.conf.shape[1:]
@@ -103,7 +105,10 @@ class ImageObservations:
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-    """Return the pointmaps of all pairs that contain `image`, at its `pixels` (flat indices)."""
+    """Return the pointmaps of all pairs that contain `image`, at its `pixels`.
+
+    A pixel is given by its index row · width + column on the pointmaps' grid.
+    """
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))

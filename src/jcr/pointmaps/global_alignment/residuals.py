@@ -72,7 +72,12 @@ class Residuals:
 def depth_residuals(
     o: ImageObservations, state: AlignmentState, log_depth: Float[ndarray, " m"]
 ) -> Residuals:
-    """Return the residuals of one image's points in all pointmaps that contain the image, for given log depths."""
+    """Return the residuals of one image's m points in the k pointmaps that contain the image, for given log depths.
+
+    `log_depth` is the log of the points' z in the image's camera frame, recon units; the depths in `state` are not
+    used. The residual across is the part of the predicted direction that is perpendicular to the modelled one, in recon
+    axes. The residual along is modelled minus predicted log distance.
+    """
     camera, observer = state.recon_from_camera[o.image], state.recon_from_camera[o.observer]
     error = state.pair_error[o.pair]
     error[o.second_count :] = 0
@@ -103,7 +108,11 @@ def depth_residuals(
 
 
 def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray, "k m"]:
-    """Return the Geman-McClure weight, in (0, 1], of each point in each pointmap; `noise` is the residuals' spread."""
+    """Return the Geman-McClure weight, in (0, 1], of each of m points in each of k pointmaps.
+
+    The weight is (1 + u/ROBUST_WIDTH²)^−2. Here u is the sum of the squared residuals across and along the line of
+    sight, each over its variance in `noise`.
+    """
     u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
     return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
 
@@ -111,9 +120,10 @@ def geman_mcclure_weights(r: Residuals, noise: ResidualSpread) -> Float[ndarray,
 def residual_weights(
     o: ImageObservations, r: Residuals, noise: ResidualSpread
 ) -> tuple[Float[ndarray, "k m"], Float[ndarray, "k m"]]:
-    """Return the weights of the squares of the residuals across and along the line of sight, for least squares.
+    """Return two arrays: the least-squares weights of the squared residuals across and along the line of sight.
 
-    Confidences are scaled to mean 1, so that the weights are the information of the pointmaps.
+    A weight is the confidence, scaled to mean 1, times the Geman-McClure weight, over the variance and its inflation in
+    `noise`. So the weights are the information of the pointmaps.
     """
     robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
     across, along = (
@@ -129,9 +139,9 @@ def residual_weights(
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[ResidualSpread]:
     """Estimate the spread of the residuals (`misfit`) of every pointmap of each image.
 
-    Pointmaps are of two kinds: of the first image of a pair, or of the second. The standard deviations are the
-    pointmap's own, but at least a third of the median of its kind, so that no pair dominates by a lucky fit. The
-    inflations are the median of the kind.
+    Pointmaps are of two kinds: of the first image of a pair, or of the second. The standard deviations come from the
+    median of the pointmap's own residuals. They are at least a third of the median of the kind, so that no pair
+    dominates by a lucky fit. The inflations are the median of the kind.
     """
     own = []
     for o, r in zip(images, misfit, strict=True):
@@ -155,8 +165,9 @@ def _inflation(
 ) -> Float[ndarray, " k"]:
     """Return the variance of the mean residuals of coarse cells, over their variance if residuals were independent.
 
-    The result (design effect) is at least 1, for each of k pointmaps. `parts` are the c components of the residuals,
-    and `weight` their weights.
+    The result (design effect) is at least 1, for each of k pointmaps. `parts` are the c components of the residuals at
+    m pixels, and `weight` their weights. `o` gives the cell of each pixel; the image has CELL_SIDE cells along each
+    side.
     """
     total = np.maximum(weight.sum(axis=1), 1e-12)
     cell_total = weight @ o.cell
@@ -169,7 +180,10 @@ def _inflation(
 
 
 def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray, " m"]:
-    """Return each pixel's median depth over the pointmaps in the image's own frame, or over all if there is none."""
+    """Return each pixel's median depth over the pointmaps in the image's own frame, or over all if there is none.
+
+    The depth is z in the image's camera frame, recon units, at least 1e-6. Pointmaps are scaled and placed by `state`.
+    """
     n, camera = o.second_count, state.recon_from_camera[o.image]
     scale = np.exp(o.log_range + state.log_pair_scale[o.pair].astype(np.float32)[:, None])
     if n < len(o.pair):
@@ -184,9 +198,11 @@ def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray,
 def fitted_depth(
     o: ImageObservations, state: AlignmentState, noise: ResidualSpread
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Estimate the depth (recon units) of the m observed pixels by Gauss-Newton with fixed cameras.
+    """Estimate the depth (z in the image's camera frame, recon units) of the m observed pixels with fixed cameras.
 
-    The pointmaps count as independent, weighted by confidence, agreement and noise. Returns depths and mean weights.
+    The method is Gauss-Newton. The pointmaps count as independent, weighted by confidence, Geman-McClure weight and
+    `noise`. Returns the depths and each pixel's weight. This weight is confidence times Geman-McClure weight, averaged
+    over the pointmaps by their inverse variance along the line of sight.
     """
     log_depth, weight = np.log(initial_depth(o, state)), o.weight
     for _ in range(DEPTH_ITERATIONS):
