@@ -12,7 +12,7 @@ from jcr.calibration.case import Case
 from jcr.calibration.options import GRASPING, MOST_POSES, CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
-from jcr.estimation.point_uncertainty import seen_points, within_95
+from jcr.estimation.point_uncertainty import seen_points, valid_radius_px, within_95
 from jcr.estimation.prediction import (
     Assumptions,
     PredictedCamera,
@@ -190,6 +190,10 @@ def advised(
     seen = seen_points(x, uncertainty, hand_eye.intrinsics, assumptions.distance_m)
     uncertainty = replace(uncertainty, seen=seen, scene=scene)
     required = _required(uncertainty, options)
+    if required.at == "seen" and uncertainty.joint is not None and hand_eye.intrinsics is not None:
+        bound_m, distance_m = 1e-3 * required.translation_mm, assumptions.distance_m
+        valid_px = valid_radius_px(x, uncertainty, hand_eye.intrinsics, distance_m, bound_m)
+        required = replace(required, valid_px=valid_px)
     # More images reduce neither the error of wrong intrinsics nor that of robot errors that depend on the reach.
     lasting = [
         one.covariance

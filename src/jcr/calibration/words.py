@@ -91,7 +91,9 @@ def _result(content: Calibration) -> list[str]:
         bound = f"{significant(required.reached_mm)} mm, {significant(required.reached_deg)}° (95 %)"
         accuracy = f"{place}: {bound}"
         if at == "seen" and (corner := uncertainty.corner) is not None:
-            accuracy += f" at the image centre; {significant(corner.within_95_mm)} mm in the corner"
+            radius, most = required.valid_px, f"{required.translation_mm:g} mm"
+            far = "" if radius is None else f"{most} up to {radius:.0f} px from it, "
+            accuracy += f" at the image centre; {far}{significant(corner.within_95_mm)} mm in the corner"
     tested = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
     used = [LENGTHS[one.name] for one in content.lengths if one.used and one.name != "network"]
     sources = joined(["the robot", *used]) if used else "the robot alone"

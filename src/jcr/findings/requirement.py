@@ -28,6 +28,9 @@ class Requirement:
     if no reasonable number suffices."""
     at: Where = "camera"
     """Quantity to which the required and reached bounds refer."""
+    valid_px: float | None = None
+    """Radius (px) around the image centre within which the position of a point meets the required bound; None: in the
+    whole image, or the intrinsics were not estimated."""
 
     @property
     def met(self) -> bool:

@@ -90,10 +90,12 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
         )
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
         degrees = significant(seen.corners.rotation_95_deg)
+        radius = None if required is None else required.valid_px
+        limit = "" if radius is None else f"; the limit is met up to {radius:.0f} px from the image centre"
         yield (
             "Point in the image corner",
             f"{significant(seen.corners.within_95_mm)} mm",
-            f"{degrees}°; 95 %",
+            f"{degrees}°; 95 %{limit}",
             True,
         )
     elif uncertainty is not None:
