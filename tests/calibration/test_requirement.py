@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,8 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     given, _ = pairs(12, 12)
     reached = calibrate_pose_pairs(given).requirement
     assert reached is not None and reached.met and reached.more_images == 0
+    in_corners = replace(calibrate_pose_pairs(given), requirement=replace(reached, valid_px=300.0))
+    assert "° not met in the corners). " in summary(in_corners).splitlines()[0]
     asked = CalibrateOptions(require=(0.75 * reached.reached_mm, 10.0))
     hand_eye = calibrate_pose_pairs(given, asked)
     required = hand_eye.requirement

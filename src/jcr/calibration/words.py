@@ -56,7 +56,8 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """
     limit = ""
     if (required := content.requirement) is not None:
-        unmet = "" if required.met else " not met"
+        in_corners = "" if required.valid_px is None else " not met in the corners"
+        unmet = in_corners if required.met else " not met"
         limit = f" (limit {required.translation_mm:g} mm, {required.rotation_deg:g}°{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {len(content.images)} images"
