@@ -38,8 +38,8 @@ def added_camera(
 ) -> CellCamera:
     """Return a fixed camera with images copied to `folder`; raise InputError if the files cannot be of one camera.
 
-    `intrinsics` is a JSON file with the intrinsics as in capture.json, at the top level or under "intrinsics". `taken`
-    are the names of the other cameras.
+    `files` are image files. `intrinsics` is a JSON file with the intrinsics as in capture.json, at the top level or
+    under "intrinsics". `taken` are the names of the other cameras.
     """
     if not re.fullmatch(NAME, name):
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")

@@ -44,8 +44,9 @@ class CellImages:
     ) -> "CellImages":
         """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
 
-        `combinations` (e,p) are p directions in the e parameters of hypotheses.Row. `errors` (s,b) are the
-        pose errors by b confirmed effects of one standard deviation each. None: nothing is added.
+        `combinations` (e,p) are p directions in the e parameters of hypotheses.Row. `errors` (s,b) are the errors of
+        the arm's poses (pose by pose: m, then rad; axes of its base) by b confirmed effects of one standard deviation
+        each. None: nothing is added.
         """
         problem = self.problem
         if combinations is not None:
@@ -59,7 +60,10 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`."""
+    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`.
+
+    World is the frame of the own camera's reconstruction, in metres.
+    """
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
@@ -120,7 +124,10 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
 
 
 def _given_poses(rigs: Rigs) -> RigGaussian:
-    """Return mean and covariance of the own camera's used poses (m), for a reconstruction without image features."""
+    """Return mean and covariance of the own camera's used poses, for a reconstruction without image features.
+
+    The mean is recon_from_camera in metres. The covariance is pose by pose: translation (m), then rotation (rad).
+    """
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:

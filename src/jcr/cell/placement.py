@@ -42,9 +42,10 @@ class TransformUncertainty(Part):
         parent_from_camera: Float[ndarray, "4 4"] | None = None,
         scene_distance_m: float | None = None,
     ) -> "TransformUncertainty":
-        """Return the record of the covariance (m, rad; parent axes) of a transform.
+        """Return the record of the covariance (translation in m, then rotation in rad; parent axes) of a transform.
 
-        If the pose and a distance (m) are given, the record includes the uncertainty of a point on the optical axis.
+        With `parent_from_camera` and `scene_distance_m` from the camera, the record includes the uncertainty of a point
+        on the optical axis.
         """
         std, at_scene = np.sqrt(np.diag(covariance)), None
         if parent_from_camera is not None and scene_distance_m is not None:
@@ -154,7 +155,7 @@ class CameraPlacement(Part):
 
     @property
     def covariance(self) -> Float[ndarray, "6 6"] | None:
-        """Covariance (6,6) of `parent_from_camera`; None if not placed."""
+        """Covariance of `parent_from_camera`: translation (m), rotation (rad); parent axes; None if not placed."""
         return None if self.uncertainty is None else np.array(self.uncertainty.covariance)
 
     @property

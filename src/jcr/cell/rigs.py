@@ -49,8 +49,9 @@ def localise(
 ) -> tuple[Registration | None, int]:
     """Return the registration (pose and inliers) of an image in the reconstruction, and the number of inliers.
 
-    The registration is None if the inliers are too few. The focal length is estimated if none is given, or if another
-    value gives clearly more inliers, because wrong intrinsics give a wrong pose with fewer inliers.
+    The pose is recon_from_camera in metres. The registration is None if the inliers are too few. The focal length is
+    estimated if none is given, or if another value gives CLEARLY_MORE (1.1) times the inliers, because wrong intrinsics
+    give a wrong pose with fewer inliers.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
@@ -93,12 +94,12 @@ class CameraViews:
 
     @property
     def places(self) -> Float[ndarray, "k 4 4"]:
-        """Poses recon_from_camera of the used images."""
+        """Poses recon_from_camera (m) of the used images."""
         return np.stack([one.pose.a_from_camera for one in self.used.values()])
 
     @property
     def covariances(self) -> Float[ndarray, "k 6 6"]:
-        """Covariances of small steps (m, rad; recon axes) of the poses `places`."""
+        """Covariances of the poses `places`: translation (m), then rotation vector (rad), in axes of the recon frame."""
         return np.stack([one.pose.covariance[:6, :6] for one in self.used.values()])
 
     @property
@@ -273,8 +274,9 @@ def fit_views(
 ) -> tuple[Calibration, tuple[Finding, ...]]:
     """Return the hand-eye calibration of a camera from its images and the poses of its gripper or rig.
 
-    `carrier` are these poses; poses are in metres, `scale_std` is the relative standard deviation of the scale between
-    them. The second result is the findings on effects such as a slip.
+    `carrier` are these poses: base_from_gripper or recon_from_rig of each used image. All poses are in metres;
+    `scale_std` is the relative standard deviation of the scale between them. The second result is the findings on
+    effects such as a slip.
     """
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, camera_errors="none")
     known = (scale_prior(1.0, scale_std),)

@@ -115,6 +115,7 @@ def place_cameras(
 def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
     """Return a finding if the images of a fixed camera have different poses; an empty tuple if the poses agree.
 
+    Poses differ if their squared Mahalanobis distance exceeds APART and a step exceeds MATERIAL standard deviations.
     Each image is adjusted with a pose of its own. The difference of two poses is compared with its covariance, in which
     common errors, as of the intrinsics, cancel.
     """
@@ -143,8 +144,10 @@ def _examined(
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Return the joint solution of all images, and for each camera the findings on effects such as a slip.
 
-    `mounted` are the cameras other than the capture's own. Confirmed effects on them are adopted in the solution.
-    Another arm's poses are tested with its camera; those of the capture's own arm were tested in its calibration.
+    `mounted` are the cameras other than the capture's own. Confirmed effects on the camera's parameters are adopted in
+    the solution. Findings are in the order of `mounted`, and empty for a camera with exact intrinsics or one that is
+    known to have moved. Another arm's poses are tested with its camera; those of the capture's own arm were tested in
+    its calibration.
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
@@ -246,8 +249,8 @@ def _uncertain(
 ) -> list[Finding]:
     """Return a list with one finding if the pose is too uncertain, else an empty list.
 
-    `focal_std` is the relative standard deviation of the focal length, for the message on a camera without given
-    intrinsics.
+    `covariance` is translation (m), then rotation (rad); the limits are MAX_STD. `focal_std` is the relative standard
+    deviation of the focal length, for the message on a camera without given intrinsics.
     """
     metres, radians = np.sqrt(np.diag(covariance)).reshape(2, 3).max(1).tolist()
     if metres <= MAX_STD[0] and radians <= MAX_STD[1]:

@@ -68,10 +68,11 @@ def absolute_pose(
 ) -> CameraPose | None:
     """Return the camera pose in the frame of k points from their pixels; None if fewer than six (planar: four) agree.
 
-    The pose has the most points with a reprojection error below `gate_px`. `planar`: the points lie in a plane; both
-    possible poses are refined and the better one is returned. `point_covariance` None: exact points; pixel noise is
-    estimated in any case. `focal` "free": the focal length is estimated. `loss` "linear" is for detected corners, which
-    have no wrong matches.
+    `x_px` are pixels of the distorted image. The pose has the most points with a reprojection error below `gate_px`.
+    `planar`: the points lie in a plane; both possible poses are refined, and the one with the smaller reprojection
+    error is returned. `point_covariance` is in the frame of the points; None: exact points; pixel noise is estimated in
+    any case. `focal` "free": the focal length is estimated; `camera` has its initial value. `loss` "linear" is for
+    detected corners, which have no wrong matches.
     """
     least, p = 4 if planar else 6, 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
@@ -118,7 +119,8 @@ def ransac_pose(
 ) -> tuple[Float[ndarray, "4 4"], Bool[ndarray, " k"]] | None:
     """Return a_from_camera by SQPNP in RANSAC, and the mask of agreeing points; None if no pose is found.
 
-    `x_px` are undistorted pixels relative to the principal point.
+    Frame a is that of `points`. `x_px` are undistorted pixels relative to the principal point. Points agree with a
+    reprojection error below `gate_px`.
     """
     done, rotation, shift, rows = cv2.solvePnPRansac(
         points, x_px, np.diag([focal_px, focal_px, 1.0]), None,
@@ -142,8 +144,9 @@ def _refined(
 ) -> CameraPose | None:
     """Return the pose with the least robust reprojection error, by iteration from `start`; None if it has few inliers.
 
-    Pixel noise and inliers are estimated anew in each round. `spread` is the covariance of each point, `p` the number
-    of unknowns (6, or 7 with the focal length), `least` the smallest number of inliers.
+    Pixel noise and inliers are estimated anew in each round. Inliers have whitened residuals times pixel noise below
+    `gate_px`. `spread` is the covariance of each point, `p` the number of unknowns (6, or 7 with the focal length),
+    `least` the smallest number of inliers.
     """
     scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
     (pose, camera, inlier), found = start, None
@@ -188,8 +191,8 @@ def _refined(
 def _noise(residual: Float[ndarray, "k 2"], added: Float[ndarray, "k 2 2"], p: int) -> float:
     """Return the pixel noise (px) for which the whitened residuals have the median length of normal errors.
 
-    `added` is the part of each residual's covariance that comes from its point's error. `p` is the number of unknowns
-    that were fitted to the residuals.
+    `added` is the part (px²) of each residual's covariance that comes from its point's error. `p` is the number of
+    unknowns that were fitted to the residuals.
     """
     values, axes = np.linalg.eigh(added)
     squared = np.einsum("kij,ki->kj", axes, residual) ** 2
@@ -211,7 +214,8 @@ def _reprojection(
 ) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 p"]]:
     """Return projected minus observed pixels, and their derivative by a pose step and (if p is 7) the log focal length.
 
-    `pose` is a_from_camera, `points` are in frame a. Points behind the camera have the residual BEHIND_PX.
+    `pose` is a_from_camera, `points` are in frame a. A step is translation, then rotation vector, in axes of a. Points
+    behind the camera have the residual BEHIND_PX.
     """
     arm = points - pose[:3, 3]
     x_in_camera = arm @ pose[:3, :3]

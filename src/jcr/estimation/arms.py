@@ -28,8 +28,9 @@ def _arm(
 ) -> Arm:
     """Return an arm whose joints rotate about z; row i of `origins` is joint i's frame in that of the previous joint.
 
-    Each row is x, y, z (m), roll, pitch, yaw (degrees), as the `origin` of a URDF. One more row is the gripper's frame,
-    unless `last_from_gripper` is given.
+    Each row is x, y, z (m), roll, pitch, yaw (degrees), as the `origin` of a URDF; the first is relative to the base.
+    One more row is the gripper's frame in that of the last joint, unless `last_from_gripper` is given. A text has the
+    numbers row by row. `limits` are (lowest, highest) angles, `rest` is the rest posture (rad).
     """
     rows = np.array(origins.split() if isinstance(origins, str) else origins, float).reshape(-1, 6)
     frames = transform(Rotation.from_euler("xyz", rows[:, 3:], degrees=True).as_matrix(), rows[:, :3])
@@ -69,8 +70,9 @@ def _ur(name: str, d1: float, a2: float, a3: float, d4: float, d5: float, d6: fl
 def _franka(name: str, limits: Limits) -> Arm:
     """Return a Franka Panda (FER) or Research 3, by modified Denavit-Hartenberg parameters; the gripper is the flange.
 
-    Source: Franka Control Interface documentation, "Robot and interface specifications"; robots/fer/kinematics.yaml
-    and robots/fr3/joint_limits.yaml of frankaemika/franka_description.
+    `limits` are (lowest, highest) joint angles (rad). Source: Franka Control Interface documentation, "Robot and
+    interface specifications"; robots/fer/kinematics.yaml and robots/fr3/joint_limits.yaml of
+    frankaemika/franka_description.
     """
     a, d = (0, 0, 0, 0.0825, -0.0825, 0, 0.088, 0), (0, 0.333, 0, 0.316, 0, 0.384, 0, 0.107)
     rows = _dh(a, d, (0, -90, 90, 90, -90, 90, 90, 0))

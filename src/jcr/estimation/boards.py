@@ -72,7 +72,8 @@ class BoardShapes:
     ) -> Float[ndarray, "c 3"]:
         """Return corner minus expected corner (printed position + deformation) along body axes, in standard deviations.
 
-        `shape` are the s shape parameters; the corners are the rows `point` of `points_in_world`.
+        `shape` are the s shape parameters; the corners are the rows `point` of `points_in_world`. Corner positions are
+        divided by the estimated size, the exponential of `shape[0]`.
         """
         pose = world_from_rig[self.rig]
         ahead = points_in_world[self.point] - pose[:, :3, 3]
@@ -90,7 +91,7 @@ class BoardShapes:
         """Return residuals and derivatives of the corners as two observations each: (x, y), and (z, 0).
 
         The image equations have `shared` columns that are common to all images; `columns` are the s shape parameters
-        among them.
+        among them. Other arguments are those of `residual`; residuals are in standard deviations.
         """
         c = len(self.point)
         residual, by = np.zeros((c, 4)), np.zeros((c, 4, shared + 9))
@@ -113,7 +114,10 @@ class BoardShapes:
         )
 
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Return the height of each corner above the plane of its body, in the unit of `x_in_body`."""
+        """Return the height (z) of each corner over its body's plane, in the unit of `x_in_body`.
+
+        `shape` are the s shape parameters, as in `residual`.
+        """
         return self.by_shape[:, 2] @ shape
 
 
@@ -122,8 +126,9 @@ def shapes_of(
 ) -> tuple[BoardShapes | None, Float[ndarray, "b 4 4"]]:
     """Return the shape prior of boards with corners among the points, and initial world_from_body of each of b bodies.
 
-    A body is a board or tag; its rig has a number from `first_rig` on. Only corners that are `seen`, and bodies with at
-    least four of them, are used. The prior is None without bodies.
+    A body is a board or tag; its rig number is `first_rig` plus the number of the body. Only corners whose points are
+    `seen` (observed), and bodies with at least four of them, are used. The prior is None without bodies. World is the
+    frame of `points_in_world`.
     """
     bodies = []
     for body in () if boards is None else boards.bodies:
@@ -166,7 +171,8 @@ def _deformations(
 ) -> tuple[Float[ndarray, "c 3 w"], Sequence[float]]:
     """Return w deformations of a body with corners printed at `x` (m), and the prior standard deviation of each.
 
-    Each is a displacement of the c corners: a relative stretch of x over y, then bends in z with an rms of 1.
+    Each is a displacement of the c corners: a relative stretch of x over y, then bends in z with an rms of 1. With
+    fewer than nine corners w is 0.
     """
     if len(x) < FEWEST_TO_BEND:
         return np.zeros((len(x), 3, 0)), ()

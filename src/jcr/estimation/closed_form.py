@@ -25,9 +25,9 @@ def closed_form(
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
     """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
-    Rotations are solved first, with `rounds` of alternating refinement; then translations and scale by linear least
-    squares (the paper's scale recovery problem, eq. 8 to 10). Degenerate motions give the translation of least norm,
-    and a scale that may be 0 or negative.
+    Inputs (...,n,4,4) are n poses; scale is a length in base over that in recon. Rotations are solved first, with
+    `rounds` of alternating refinement; then translations and scale by linear least squares (the paper's scale recovery
+    problem, eq. 8 to 10). Degenerate motions give the translation of least norm, and a scale that may be 0 or negative.
     """
     of_gripper, of_camera = base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3]
     rotation, base_rotation = rotations(of_gripper, of_camera, rounds)
@@ -54,7 +54,8 @@ def initial_estimate(
 ) -> tuple[Transform, float, Transform]:
     """Return gripper_from_camera, scale and base_from_recon of `closed_form`, with a positive scale.
 
-    A scale ≤ 0 is replaced by the extent of the gripper positions over that of the camera positions.
+    Scale is a length in base over that in recon. A scale ≤ 0 is replaced by the extent of the gripper positions over
+    that of the camera positions.
     """
     x, scale, z = closed_form(base_from_gripper, recon_from_camera)
     if scale <= 0:
@@ -66,7 +67,7 @@ def initial_estimate(
 
 
 def motions(a_from_b: Poses) -> Float[ndarray, "... n n 4 4"]:
-    """Return all relative motions: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j]."""
+    """Return all relative motions of n poses: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j], that is bᵢ_from_bⱼ."""
     return inverse(a_from_b)[..., :, None, :, :] @ a_from_b[..., None, :, :, :]
 
 

@@ -44,9 +44,10 @@ def posterior(
 ) -> tuple[Float[ndarray, " p"], Square, Budget]:
     """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
-    `mode` are the most likely logarithms of the robot's error sizes, `information` their information matrix; the
-    covariance includes `region.spread`. `expected`: for predictions, the residuals are 0 and their squares are replaced
-    by expectations under the noise at the mode.
+    The averages are over the posterior of the robot's error sizes σ. `mode` are their most likely logarithms,
+    `information` is their information matrix. The covariance includes `region.spread`, the effect of systematic errors
+    at other poses. `expected`: for predictions, the residuals are 0 and their squares are replaced by expectations
+    under the noise at the mode.
     """
     root = cholesky(equations.covariance(mode))
 
@@ -85,7 +86,10 @@ def posterior(
 def _whitened_and_fitted(
     solution: LinearSolution, matrix: Float[ndarray, "*#k s r"]
 ) -> tuple[Float[ndarray, "*k s r"], Float[ndarray, "*k p r"]]:
-    """Return A (s,r) and B (p,r) with AᵀA − BᵀB = MᵀPM, for M = `matrix` and P = `solution.projection`."""
+    """Return A (s,r) and B (p,r) with AᵀA − BᵀB = MᵀPM, for M = `matrix` and P = `solution.projection`.
+
+    A is M whitened by the covariance of the residuals; BᵀB is the part that the p unknowns of the fit explain.
+    """
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
     return lower(solution.root, matrix), fitted
 
@@ -131,9 +135,10 @@ def _widening(
 def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
     """Return the covariance of X (hand-eye) and scale by cause: robot random, robot systematic, intrinsics, images.
 
-    `elsewhere` is the covariance that systematic errors add for other poses of the workspace, at `log_sizes`. The part
-    of the intrinsics is the covariance that exact intrinsics would remove. The parts are scaled so that they add up to
-    `covariance`. The part of the images includes unobservable directions and rounding.
+    `elsewhere` is the covariance that systematic errors add for other poses of the workspace, at `log_sizes`. X and log
+    scale are in the order translation (m), rotation (rad), log scale. The part of the intrinsics is the covariance that
+    exact intrinsics would remove. The parts are scaled so that they add up to `covariance`. The part of the images
+    includes unobservable directions and rounding.
     """
     exact = replace(
         equations,

@@ -75,7 +75,8 @@ class Posture:
 def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return joint angles (n,dof) within the limits for n poses, with little change between poses, and the misfits.
 
-    If the arm does not reach all poses, a constant tool (flange_from_tool) is estimated together with the angles.
+    Angles are in rad. If the arm does not reach all poses (misfits above FITS), a constant tool (flange_from_tool) is
+    estimated together with the angles.
     """
     rng = np.random.default_rng(0)
     tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
@@ -92,7 +93,8 @@ def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> 
 def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints) -> Joints:
     """Return joint angles (n,dof) within the limits that bring the gripper nearest to each pose, from `start`.
 
-    Redundant joints move towards the rest posture.
+    `start` (n,dof) are the initial angles (rad). An angle counts as 0.3 m (geometry.ARM) per rad. Redundant joints move
+    towards the rest posture.
     """
     low, high = arm.limits.T
 
@@ -117,7 +119,7 @@ def _error(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
     """Return the step from the reached to the given pose, and the derivative of the reached pose by the joint angles.
 
-    Both are in base axes and m; rotations (rad) are multiplied by geometry.ARM.
+    Both are in base axes and m: translation, then rotation vector (rad) times geometry.ARM.
     """
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
@@ -150,7 +152,7 @@ def _posture(
 def _misfit(
     arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
-    """Return the distance (m) and angle (rad) of the reached tool poses from the given ones."""
+    """Return columns distance (m) and angle (rad) of the tool at joint angles `joints` (rad) from `base_from_tool`."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), rotation_angle(off[:, :3, :3])], 1)
 
@@ -158,8 +160,9 @@ def _misfit(
 def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:
     """Return for each pose one of its s solutions `found`, by the Viterbi algorithm.
 
-    The least weighted sum of `misfit` (m²), squared change of the angles between poses, and squared distance from rest
-    decides.
+    The path has the least weighted sum of `misfit` (m²), squared change of the angles between successive poses, and
+    squared difference of the angles from the rest posture. Angles are shifted by full turns for the least change within
+    the limits.
     """
     own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []
@@ -191,7 +194,7 @@ def _with_tool(
 ) -> Transform:
     """Return flange_from_tool that lets the arm reach all poses best, estimated together with the joint angles.
 
-    `joints` and `flange_from_tool` are the initial estimates.
+    `joints` (rad) and `flange_from_tool` are the initial estimates. At most MOST poses, evenly spaced, are used.
     """
     some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST)).astype(int))
     poses, n, dof = base_from_tool[some], len(some), arm.dof
@@ -226,9 +229,10 @@ def _with_tool(
 
 
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof).
+    """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof; rad).
 
-    `joints` None: angles by inverse kinematics. Raise InputError if poses, joints and arm do not agree.
+    `joints` None: angles and tool by inverse kinematics; the base stays. Raise InputError if poses, joints and arm do
+    not agree.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints
@@ -294,5 +298,5 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
 
 
 def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:
-    """Return two numbers, the rms distance (m) and the rms angle (rad) of n residuals."""
+    """Return the rms distance (m) and the rms angle (rad) of n residuals: columns translation, rotation vector."""
     return np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))

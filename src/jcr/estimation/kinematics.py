@@ -84,7 +84,10 @@ def forward_kinematics(arm: Arm, joints: Joints) -> Poses:
 
 
 def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, "n 6 dof"]]:
-    """Return base_from_gripper and its Jacobian: velocity (of its origin, then ω; base axes) per rad of each joint."""
+    """Return base_from_gripper and its Jacobian: velocity (of its origin, m; then ω, rad; base axes) per rad of a joint.
+
+    `joints` (n,dof) are the joint angles in rad.
+    """
     frames, gripper = joint_frames(arm, joints)
     return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
 
@@ -102,7 +105,7 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
     """Return the derivative of the gripper's true pose by the p = 5 dof kinematic errors, at errors zero.
 
     Rows are the step from the nominal to the true pose (m, rad; base axes). Columns are the offsets of all joints
-    (rad), then for each joint two translations (m) and two rotations (rad) of its axis.
+    (rad), then for each joint two translations (m) and two rotations (rad) of its axis, perpendicular to the axis.
     """
     frames, gripper = joint_frames(arm, joints)
     sideways = frames[..., :3, :3] @ perpendicular(arm.axes)

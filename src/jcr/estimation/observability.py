@@ -33,7 +33,9 @@ def excitation(
 ) -> Excitation:
     """Return how strongly n gripper poses determine each direction of X (gripper_from_camera) and the scale.
 
-    `gripper_from_camera` None: the camera is assumed at the gripper's origin.
+    `priors` add information on X and scale. `gripper_from_camera` None: the camera is assumed at the gripper's origin.
+    Excitation is the rms change of the predicted gripper poses (m; 0.3 m per rad) by a unit step along the direction,
+    after base_from_recon is fitted again.
     """
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
@@ -64,7 +66,10 @@ def observability(
 ) -> Observability:
     """Return findings for the unobservable or weakly observable directions of X (gripper_from_camera) and scale.
 
-    `recon_from_camera`, if given, distinguishes an orbit about the scene from rotations about a tool point.
+    Findings reject if the smallest excitation is below EXACT, and warn if it is only below WEAK (both lower for few
+    images). Else there are none. Two poses always give a finding. `recon_from_camera`, if given, distinguishes an orbit
+    about the scene from rotations about a tool point. Without `gripper_from_camera` the camera is assumed at the
+    gripper's origin.
     """
     n = len(base_from_gripper)
     if n == 2:
@@ -85,7 +90,10 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """Return the finding that a kind of motion leaves a direction unobservable; `at` is an axis or point in `frame`."""
+    """Return the finding that a kind of motion leaves a direction unobservable; `at` is an axis or point (m) in `frame`.
+
+    `frame` is "base" or "gripper".
+    """
     where: dict[str, Any] = (
         {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )
@@ -95,7 +103,10 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 def _explained(
     base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
 ) -> list[Finding]:
-    """Return findings that name the degenerate motion; `unseen` masks the unobservable directions of `found`."""
+    """Return findings that name the degenerate motion; `unseen` masks weak directions of `found`.
+
+    Without `recon_from_camera`, an orbit about the scene is not distinguished from rotations about a tool point.
+    """
     # The mean of the rotation matrices preserves the length of a common axis and shortens all other directions.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
@@ -127,7 +138,10 @@ def _explained(
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
-    """Return the point in frame b that moves least in frame a, and two rms motions: its own, and that of b's origin."""
+    """Return the point in frame b that moves least in frame a, and rms motions of it and of b's origin.
+
+    An rms motion is the rms distance from the mean position over the poses; all lengths are in the unit of the poses.
+    """
     rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
     rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
     point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]

@@ -51,8 +51,8 @@ class PixelNoise:
     ) -> Float[ndarray, " k"]:
         """Return the weight (1/px²) of each of k observations: Cauchy weight of its residual over its variance.
 
-        `depth` is the depth of each observed point; points behind a camera, or nearer than NEAREST of the median depth,
-        have weight 0.
+        The variance includes the inflation. `depth` is z of each observed point in the camera frame; points behind a
+        camera, or nearer than NEAREST of the median depth, have weight 0.
         """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance
@@ -98,7 +98,7 @@ class Layout:
         return common + (1 - common) * self.stated_variance
 
     def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
-        """Return the sum over image cells and both axes of (sum of the weighted residuals `pull` in the cell)²."""
+        """Return the sum over image cells and both pixel axes of (sum of the weighted residuals `pull` in the cell)²."""
         return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
 
 
@@ -111,7 +111,8 @@ def pixel_noise(
 ) -> PixelNoise:
     """Return the pixel noise: standard deviation of each of g groups, and inflation by correlation in image cells.
 
-    `ratio` (g,) is each group's variance over that of the first. The median over points without outliers sets the size.
+    `ratio` (g,) is each group's variance over that of the first. The standard deviations fit the median over points
+    without outliers of the sum of squared residuals. `depth` is z in the camera frame; `common` is `PixelNoise.common`.
     For independent errors, the squared sum of weighted residuals over a cell equals on average the sum of squares; the
     inflation is the factor by which it exceeds this (variance inflation of cluster sampling; Liang and Zeger,
     Biometrika 73, 1986).
@@ -139,9 +140,10 @@ def refined_noise(
 ) -> PixelNoise:
     """Return the pixel noise with new estimates of the variance of each group and of the common share.
 
-    Squared residuals are corrected for the leverage of the points, which follow groups with few observations.
-    `by_point` are derivatives by the points, `starts` each point's first observation, and `known` is the information
-    matrix of each point from other sources than its observations; None: there is none.
+    Squared residuals are corrected for the leverage of the points, since a fitted point reduces its own residuals.
+    `before` is the previous estimate, which gives the weights; `depth` is z in the camera frame. `by_point` are
+    derivatives by the points, `starts` each point's first observation, and `known` is the information matrix of each
+    point from other sources than its observations; None: there is none.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point

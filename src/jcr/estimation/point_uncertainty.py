@@ -54,7 +54,8 @@ def point_covariance(
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
-    of the distorted image. `distance_m` (...) is the distance along the ray; its error is that of the scale.
+    of the distorted image. `distance_m` (...) is the distance (m) along the ray; its relative error is that of the
+    scale.
     """
     return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
 
@@ -70,7 +71,8 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
     """Return base-frame coordinates (m) and covariance (m²) of points at pixels with z = `depth_m` in the camera frame.
 
-    `x` is gripper_from_camera. `noise` adds the errors of the gripper pose, for a pose in the workspace of the capture.
+    `x` is gripper_from_camera; `uncertainty` and `x_px` are those of `point_covariance`. `noise` adds the errors of the
+    gripper pose, for a pose in the workspace of the capture.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
@@ -94,6 +96,7 @@ def bounds_at(
 ) -> Seen:
     """Return 95 % bounds of the error of the point at `distance_m` (m) along the ray of the pixel `x_px`.
 
+    Bounds are of the position (mm; whole, across and along the ray), the ray's direction and the rotation (degrees).
     The error is relative to the gripper. `x` is gripper_from_camera; `uncertainty` is that of `point_covariance`.
     """
     ray = unproject(intrinsics, x_px)
@@ -119,9 +122,10 @@ def bounds_at(
 def seen_points(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
 ) -> SeenAndCorners:
-    """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` from the camera.
+    """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` along the ray.
 
-    `x` is gripper_from_camera. `camera` None (given camera poses): the point is on the optical axis, without errors of
+    The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
+    gripper_from_camera. `camera` None (given camera poses): the point is on the optical axis, without errors of
     intrinsics.
     """
     if camera is None:
@@ -140,8 +144,9 @@ def valid_radius_px(
 ) -> float | None:
     """Return the radius (px) around the image centre within which 95 % of position errors are below `bound_m`.
 
-    The points have the distance `distance_m` (m) along their rays. They lie on the half diagonals of the image, in
-    RADII steps each. The result is None if the bound holds up to the corners, and 0 if it does not hold at the centre.
+    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, in
+    RADII steps each; the worst of the four counts. `x` is gripper_from_camera. The result is None if the bound holds up
+    to the corners, and 0 if it does not hold at the centre.
     """
     half = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
     corners = half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
@@ -159,8 +164,8 @@ def with_given_intrinsics(
     """Return the gripper_from_camera to use with `given` intrinsics, and its uncertainty.
 
     The result is None if the calibration did not estimate intrinsics (`camera`). The transform is the conditional mean
-    of X for the `given` intrinsics. Its difference from the estimated X counts as uncertainty. Both are compared by a
-    point at the centre of the image at `distance_m`.
+    of X for the `given` intrinsics. Its difference from the estimated X (`x`) counts as uncertainty. Both are compared
+    by a point at `distance_m` (m) along the ray of the image centre.
     """
     joint = uncertainty.joint
     if camera is None or joint is None:
@@ -195,7 +200,11 @@ def within_95(covariance: Float[ndarray, "n n"]) -> float:
 
 
 def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
-    """Return the uncertainty of the scene's pose and scale as a whole, and of its shape, from a sample of its points."""
+    """Return the uncertainty of the scene's pose and scale as a whole, and of its shape, from a sample of its points.
+
+    The pose and scale are the similarity transform that fits the common errors of the points best; the shape is the rms
+    of the remaining errors per coordinate (m). `points` are those of `scene_points`.
+    """
     in_base, shared, own = points
     middle, count = np.median(in_base, axis=0), len(in_base)
     by_step = by_similarity(in_base - middle).reshape(3 * count, 7)
@@ -216,8 +225,8 @@ def scene_uncertainty(points: ScenePoints) -> SceneUncertainty:
 def scene_points(solution: Solution) -> ScenePoints:
     """Return up to SCENE_POINTS random points of a solution in the base frame (m), with two covariances.
 
-    The first is the joint covariance of all points by the errors of the unknowns and rigs, the second that of each
-    point by triangulation.
+    The first (p,3,p,3) is the joint covariance (m²) of all p points by errors of the unknowns and of the poses of rigs.
+    The second (p,3,3) is that of each point by triangulation from exact cameras. Both are in base axes.
     """
     problem, likely, images = solution.problem, solution.most_likely, solution.images
     some = np.sort(np.random.default_rng(0).permutation(len(images.state.points_in_world))[:SCENE_POINTS])
@@ -264,7 +273,8 @@ def _covariance(
 ) -> Covariances:
     """Return the covariance (m²) of points: the part by j unknowns plus the part by errors of the pixels.
 
-    `by_unknown` and `by_pixel` are derivatives of the points; `of_pixel` is the covariance of each pixel (px²).
+    `by_unknown` and `by_pixel` are derivatives of the points (m) by the unknowns of `uncertainty.whole`, in the same
+    order, and by the pixels; `of_pixel` is the covariance of each pixel (px²). The axes are those of the derivatives.
     """
     of_unknowns = by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2)
     return of_unknowns + by_pixel @ of_pixel @ np.swapaxes(by_pixel, -1, -2)
@@ -275,8 +285,9 @@ def _derivatives(
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"], Float[ndarray, "*points 2 2"]]:
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns and by pixels; a covariance.
 
-    The unknowns are gripper_from_camera `x` (6), log scale and the intrinsics, if estimated. The covariance (px²) is
-    that of the pixels by the distortion that the model cannot express.
+    The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale and the intrinsics, if
+    estimated. The covariance (px²) is that of the pixels by the distortion that the model cannot express. `distance_m`
+    is along the ray.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)

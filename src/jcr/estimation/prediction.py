@@ -65,7 +65,7 @@ class PredictedCamera:
 
     @staticmethod
     def of(solution: Solution) -> "PredictedCamera":
-        """Return the first camera of a solution, assuming that further images are like its images."""
+        """Return the first camera of a solution, with the mean information (1/px²) and model error of its images."""
         images, problem = solution.images, solution.problem
         own = problem.columns.model_error[0]
         return PredictedCamera(
@@ -126,7 +126,7 @@ def typical_camera(
     """Return the camera of a prediction before any images are matched, with typical image information.
 
     `intrinsics` None: guessed from `size`, the (width, height) in px. `std` are standard deviations of given
-    `intrinsics`, as in `camera_about`.
+    `intrinsics` in the order of camera.parameters; None: MEASURED.
     """
     camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
@@ -138,7 +138,8 @@ def predict(
 ) -> Uncertainty:
     """Return the predicted uncertainty of a calibration from n gripper poses.
 
-    `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad.
+    `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad. Its order is pose by
+    pose: translation (m), then rotation vector (rad), in base axes. The images of `assumptions.camera` are simulated.
     """
     x, noise, camera = assumptions.gripper_from_camera, assumptions.noise, assumptions.camera
     intrinsics = None
@@ -183,8 +184,9 @@ def predict_covariance(
 ) -> Float[ndarray, "7 7"]:
     """Return the predicted covariance of X (gripper_from_camera) and log scale for exact camera poses in metres.
 
-    `averaged`: average over the sizes of the robot's errors; else these sizes are known exactly. `systematic` is that
-    of `predict`.
+    The order is that of geometry.retract for X (translation in m, rotation in rad; gripper axes), then log scale.
+    `averaged`: average over the posterior of the robot's error sizes σ; else these are known, as in
+    `assumptions.noise`. `systematic` is that of `predict`.
     """
     x, noise = assumptions.gripper_from_camera, assumptions.noise
     problem, state = pose_problem(
@@ -207,7 +209,9 @@ def predict_covariance(
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
     """Return simulated points, where the rays of a pixel grid in each image meet the scene, and their observations.
 
-    An image observes a point inside it if direction and distance are similar to those of the point's source image.
+    An image also observes a point of another image if the lines of sight differ by less than 40° and the distances by
+    less than a factor 2 (SAME_FEATURE). `cameras` are base_from_camera; `distance_m` is along the optical axis. The
+    points are in the base frame (m).
     """
     size = np.array([intrinsics.width, intrinsics.height])
     rows = max(2, round(COLUMNS * intrinsics.height / intrinsics.width))
@@ -253,11 +257,11 @@ UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
 def choose_poses(
     count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]
 ) -> list[int]:
-    """Return the rows of the best `count` of `candidates` poses, best first, by greedy selection.
+    """Return the indices of up to `count` poses chosen among `candidates` poses, best first, by greedy selection.
 
-    `uncertainty_of(rows)` returns the uncertainty if the poses of these rows are added; each choice reduces it most.
-    Gains fall as poses are added, so only candidates with the largest earlier gains are evaluated again (accelerated
-    greedy selection: Minoux, Optimization Techniques, 1978).
+    `candidates` is the number of poses. `uncertainty_of(indices)` returns the uncertainty if these poses are added;
+    each choice reduces it most. Gains fall as poses are added, so only candidates with the largest earlier gains are
+    evaluated again (accelerated greedy selection: Minoux, Optimization Techniques, 1978).
     """
     chosen, gain = list[int](), np.full(candidates, np.inf)
     last = uncertainty_of(np.zeros(0, dtype=int))
@@ -274,8 +278,8 @@ def choose_poses(
 def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "3"] | None = None) -> float:
     """Return the sum of the variances of gripper_from_camera (6) and log scale in units of 1 mm, 0.1° and 0.2 % (UNIT).
 
-    With a `point` (m, from the camera in gripper axes), the variances of the point's position and of the rotation are
-    summed instead.
+    `covariance` has the order translation (m), rotation (rad), log scale. With a `point` (m, from the camera in gripper
+    axes), the variances of the point's position and of the rotation are summed instead.
     """
     counted = np.eye(7) / UNIT[:, None]
     if point is not None:
@@ -288,7 +292,8 @@ def pose_information(
 ) -> Float[ndarray, "n 13 13"]:
     """Return the information matrix of X (6), log scale and base_from_recon (6) by each of n gripper poses.
 
-    X is gripper_from_camera. `noise` (m, rad) are the standard deviations of the random errors of a pose.
+    X is gripper_from_camera. Both transforms have the order translation (m), rotation vector (rad). `noise` (m, rad)
+    are the standard deviations of the random errors of a pose. The reconstruction frame is the base frame, in m.
     """
     # The frame of the reconstruction is arbitrary; here it is the base frame, in metres.
     camera = base_from_gripper @ gripper_from_camera
@@ -298,17 +303,18 @@ def pose_information(
 
 
 def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
-    """Return for each of c poses the row of the nearest existing pose, by translation plus ARM times angle."""
+    """Return for each of c poses the index of the nearest `existing` pose, by translation (m) plus 0.3 m times angle."""
     return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
 def candidate_poses(
     base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
 ) -> Float[ndarray, "k 4 4"]:
-    """Return random gripper poses with the camera looking at the scene, at distances similar to those of the capture.
+    """Return k = CANDIDATES random poses base_from_gripper that look at the scene centre of `scene_of`, within 4 cm.
 
-    `x` is gripper_from_camera. `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the
-    capture, enlarged by a quarter.
+    Camera distances are 0.7 to 1.3 times those of the poses `base_from_gripper` of the capture. `x` is
+    gripper_from_camera. `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the capture,
+    enlarged by a quarter. The box grows slowly until k poses are found.
     """
     camera = base_from_gripper @ x
     center = camera[:, :3, 3]
@@ -347,7 +353,8 @@ def candidate_poses(
 def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
     """Return the scene centre, the point nearest to all optical axes, and the distance (m) of each camera from it.
 
-    `camera` are poses in the base frame.
+    `camera` are poses base_from_camera; the centre (m) is in the base frame. If the median distance is not between 0.1
+    and 2 m (nearly parallel axes), the centre is the mean of the points 0.5 m ahead of the cameras.
     """
     axis, center = camera[:, :3, 2], camera[:, :3, 3]
     scene = nearest_to_lines(center, axis)
@@ -360,15 +367,15 @@ def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
 
 
 def median_distance(camera: Poses) -> float:
-    """Return the median distance (m) of the cameras (poses in the base frame) from the scene centre."""
+    """Return the median distance (m) of the cameras (poses base_from_camera) from the scene centre of `scene_of`."""
     return float(np.median(scene_of(camera)[1]))
 
 
 def assumed_camera(base_from_gripper: Poses) -> Transform:
-    """Return an assumed gripper_from_camera: a camera at the gripper's origin that looks along one of its six axes.
+    """Return an assumed gripper_from_camera: a camera at the gripper's origin that looks along one of ±x, ±y, ±z.
 
     All views look at one scene, so the axis is chosen whose lines over all poses pass nearest to a common point,
-    relative to the distance of the point.
+    relative to the distance of the point. The result is +z if no axis has a point 0.1 to 2 m ahead.
     """
     center, best, least = base_from_gripper[:, :3, 3], np.eye(3)[2], np.inf
     for axis in np.concatenate([np.eye(3)[::-1], -np.eye(3)[::-1]]):

@@ -42,7 +42,7 @@ class ProjectedObservations:
 
     @property
     def depth(self) -> Float[ndarray, " k"]:
-        """Depth of each point along the optical axis."""
+        """Depth (z in the camera frame) of each point, in units of the world."""
         return self.in_camera[:, 2]
 
 
@@ -89,7 +89,8 @@ def derivatives(
 ) -> Derivatives:
     """Return residuals of observations and board corners with their derivatives, times the roots of the weights.
 
-    `weight` (1/px²) is that of each of k observations; the rows are in the order of `Problem.rows`.
+    `weight` (1/px²) is that of each of k observations; corner residuals are in standard deviations. `view` is the
+    projection of `state`. Observations and corners are in the order of `Problem.rows`.
     """
     columns, root = problem.columns, np.sqrt(weight)[:, None, None]
     by_rig = root * _by_rig(problem, state, view)
@@ -127,7 +128,7 @@ def derivatives(
 
 
 def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative (px per unit of the world) of each of k observations by its point, in world axes."""
+    """Return the derivative of each of k projected pixels by its point (px per world unit), in world axes."""
     out = _by_rig(problem, state, view)
     for pose, rows in zip(state.world_from_rig, problem.seen.rows, strict=True):
         out[rows] = _rotated(out[rows], pose[:3, :3])
@@ -135,7 +136,7 @@ def by_points(problem: Problem, state: State, view: ProjectedObservations) -> Fl
 
 
 def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 3"]:
-    """Return the derivative (px per unit of the world) of each of k observations by its point, in axes of its rig."""
+    """Return the derivative of each of k projected pixels by its point (px per world unit), in axes of its rig."""
     out = np.empty((len(view.in_camera), 2, 3))
     for camera, mount, rows in zip(view.cameras, state.rig_from_camera, problem.camera_rows, strict=True):
         out[rows] = _rotated(by_point(camera, view.in_camera[rows]), mount[:3, :3])
@@ -143,7 +144,7 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
-    """Return the derivative (px) of each of k observations by steps along the l columns of `Problem.directions`."""
+    """Return the derivative of each of k projected pixels by steps along the l columns of `Problem.directions`."""
     directions, own_map = problem.directions, view.own_map
     out = np.zeros((len(view.in_camera), 2, directions.shape[1]))
     for camera, own, rows in zip(view.cameras, problem.parameters_of, problem.camera_rows, strict=True):
@@ -178,7 +179,7 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
 
 
 def _slice(directions: Float[ndarray, "r l"]) -> slice:
-    """Return the slice of columns from the first to the last that is not zero."""
+    """Return the slice of columns from the first to the last with a non-zero entry; an empty slice if all are zero."""
     columns = np.flatnonzero(directions.any(0))
     return slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)
 

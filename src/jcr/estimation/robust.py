@@ -46,9 +46,10 @@ def robust_fit(
 ) -> Solution:
     """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
-    The mask `problem.used` of the solution has these images; fewer than five are all used. Arguments are those of
-    pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The problem is solved in a frame at the centre
-    of the cameras with their extent as unit, for numerical reasons; the solution is in the given frame.
+    The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
+    evidence of masks. Arguments are those of pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The
+    problem is solved in a frame at the centre of the cameras with their extent as unit, for numerical reasons; the
+    solution is in the given frame.
     """
     n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)
@@ -94,8 +95,9 @@ def robust_fit(
 def _improved(fitted: Callable[[Images], Solution], used: Images, adding: bool) -> tuple[Images, float]:
     """Return the mask of used images with the largest log evidence, by a greedy search from `used`, and that evidence.
 
-    `fitted` returns the fit for a mask. `adding`: each step adds all images that are more likely right than wrong, or
-    else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error, down to four images.
+    `fitted` returns the fit for a mask. `adding`: each step adds all images whose pose is more likely right than wrong,
+    or else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error, down to four
+    images.
     """
     fit = fitted(used)
     best = _evidence(fit, used)
@@ -119,12 +121,12 @@ def _improved(fitted: Callable[[Images], Solution], used: Images, adding: bool) 
 
 
 def _evidence(fit: Solution, used: Images) -> float:
-    """Return the log evidence of a fit: log density of the used poses' residuals and of the unused poses' errors."""
+    """Return the log evidence of a fit: log evidence of the used poses, plus `_log_wrong` of the unused poses."""
     return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
 
 
 def _distance(fit: Solution) -> Float[ndarray, " n"]:
-    """Return the squared Mahalanobis length of each pose's leave-one-out error."""
+    """Return the squared Mahalanobis length of each pose's leave-one-out error: error squared over its covariance."""
     left_out, covariance = fit.leave_one_out
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
     return np.einsum("ni,ni->n", left_out, gap)
@@ -133,7 +135,8 @@ def _distance(fit: Solution) -> Float[ndarray, " n"]:
 def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
     """Return log((2π)³ · w · d) of each pose: w odds of a wrong pose, d density of its leave-one-out error if wrong.
 
-    The errors of wrong poses have a uniform direction and a log-uniform size.
+    The errors of wrong poses have a uniform direction and a log-uniform size between LEAST_WRONG and MOST_WRONG. The
+    result is −∞ for errors below LEAST_WRONG in translation and rotation.
     """
     off = np.linalg.norm(fit.leave_one_out[0].reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
@@ -145,7 +148,8 @@ def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
 def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
     """Return the mask of images with the least trimmed squared error over fits to image triples, and the rms error (m).
 
-    Rotation errors count as ARM times the angle.
+    The trimmed error is the sum over the best SHARE_RIGHT of the images; the mask has just these images. Rotation
+    errors count as ARM times the angle.
     """
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
@@ -181,7 +185,7 @@ def _squared_error(
 ) -> Float[ndarray, "*batch n"]:
     """Return the squared error (m²) of each reported gripper pose from its prediction; an angle counts as ARM times rad.
 
-    `x` is gripper_from_camera, `z` is base_from_recon.
+    The prediction is from `recon_from_camera`, `x` (gripper_from_camera), `scale` and `z` (base_from_recon).
     """
     gap = predicted_gripper_poses(x, scale, z, recon_from_camera) - base_from_gripper
     return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
@@ -190,7 +194,8 @@ def _squared_error(
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
     """Return h triples of images whose motions `a` (gripper) and `b` (camera) have the most similar angles, best first.
 
-    `a` and `b` hold the relative motion of every pair of images.
+    `a` and `b` hold the relative motion of every pair (i, j) of images, as `closed_form.motions`. Rows of the result
+    are image numbers.
     """
     n = len(a)
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
