@@ -118,7 +118,7 @@ class CameraViews:
     ) -> CameraPlacement:
         """Return a rejected placement of the camera with the findings `why`.
 
-        If `why` is one kind of finding, the other arguments are those of Finding.of.
+        If `why` is one kind of finding, the other arguments are those of Finding.of; else they are not used.
         """
         if isinstance(why, FindingKind):
             why = (Finding.of(why, "rejects", concerns, *images, **numbers),)

@@ -43,7 +43,7 @@ class PixelNoise:
     """Share c of the variance that is equal for all observations; the share 1 − c varies as the matching states."""
 
     def variance_px2(self, layout: "Layout") -> Float[ndarray, " k"]:
-        """Return the variance (px²) of each of k observations' coordinates, without the inflation."""
+        """Return the variance (px²) of one pixel coordinate of each of k observations, without `inflation`."""
         return self.sigma_px[layout.group] ** 2 * layout.relative_variance(self.common)
 
     def weights(

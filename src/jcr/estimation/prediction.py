@@ -314,7 +314,7 @@ def candidate_poses(
 
     Camera distances are 0.7 to 1.3 times those of the poses `base_from_gripper` of the capture. `x` is
     gripper_from_camera. `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the capture,
-    enlarged by a quarter. The box grows slowly until k poses are found.
+    enlarged by a quarter, at least 5 cm, on each side. The box grows slowly until k poses are found.
     """
     camera = base_from_gripper @ x
     center = camera[:, :3, 3]
