@@ -33,11 +33,12 @@ def checked_capture(
     where: str,
     faults: Mapping[int, str] | None = None,
 ) -> tuple[Capture, list[int]]:
-    """Check images and gripper poses; return a capture without intrinsics, and the indices of the frames in it.
+    """Check images and gripper poses; return a capture without intrinsics, and the input index of each of its frames.
 
-    A frame is an image with its pose. Left out with a note are the frames in `faults` (index to message), and images
-    that are missing, damaged, duplicated or of another size. Raises InputError if more than a quarter of the frames are
-    faulty. Messages begin with `where`, the file that names the images.
+    A frame is an image (path relative to `folder`) with its pose. The frames in `faults` (index to message) and
+    positions over 10 m from the base are left out with a note. So are images that are missing, damaged, duplicated or
+    of another size than most. Raises InputError if more frames are faulty than `tolerated` permits, or if they leave
+    fewer than three. Messages begin with `where`, the file that names the images.
     """
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
@@ -88,7 +89,10 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError if there are three or more gripper poses and all are within 0.5 mm and 0.05° of the first."""
+    """Raise InputError, begun with `where`, if there are three or more gripper poses and all equal the first.
+
+    Equal means within 0.5 mm and 0.05° in each component of the translation and the rotation vector.
+    """
     steps = np.abs(step_between(base_from_gripper[:1], base_from_gripper)).max(axis=0, initial=0.0)
     metres, radians = steps[:3].max(), steps[3:].max()
     if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:

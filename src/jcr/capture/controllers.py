@@ -105,7 +105,8 @@ def numbers_from_poses(
 ) -> Float[ndarray, "n k"]:
     """Convert each pose to the k numbers of a pose convention, in the convention's order, such as x, y, z, rx, ry, rz.
 
-    The numbers are in `units` ("mm-deg"); "auto": the convention's usual ones. Inverse of `poses_from_numbers`.
+    `convention` is a key of CONVENTIONS. The poses are in metres, the numbers in `units` ("mm-deg"); "auto": the
+    convention's usual ones. Inverse of `poses_from_numbers`.
     """
     form = CONVENTIONS[convention]
     position_unit, angle_unit = form.scales(units)
@@ -124,9 +125,10 @@ def numbers_from_poses(
 def poses_from_numbers(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> Float[ndarray, "n 4 4"]:
-    """Convert rows of the k numbers of a pose convention to base_from_gripper; raise InputError if a row is no pose.
+    """Convert rows of the k numbers of a pose convention to base_from_gripper (m); raise InputError for other rows.
 
-    The numbers are in `units` ("mm-deg"); "auto": the convention's usual ones. Messages begin with `where`.
+    `convention` is a key of CONVENTIONS. The numbers are in its order and in `units` ("mm-deg"); "auto": the
+    convention's usual ones. Messages begin with `where`.
     """
     poses, faults = checked_rows(numbers, convention, units, where)
     if faults:
@@ -137,10 +139,12 @@ def poses_from_numbers(
 def checked_rows(
     numbers: Float[ndarray, "n k"], convention: str, units: UnitsName, where: str
 ) -> tuple[Float[ndarray, "n 4 4"], dict[int, str]]:
-    """Convert rows of the k numbers of a pose convention to base_from_gripper; return also the faults of the rows.
+    """Convert rows of the k numbers of a pose convention to base_from_gripper (m); return also the faults of the rows.
 
-    The faults map the index of each row that is no pose to a message; its pose is NaN. `units` such as "mm-deg" replace
-    the convention's units. Raises InputError if the size of the numbers contradicts the units.
+    The faults map the index of each row that is no pose to a message; its pose is NaN. Such a row holds NaN or
+    infinity, a position over 10 m from the base, or an invalid rotation. `convention` is a key of CONVENTIONS; `units`
+    are such as "mm-deg", or "auto" for the convention's. Raises InputError, begun with `where`, if the size of the
+    numbers contradicts the units.
     """
     form = CONVENTIONS[convention]
     per_m, per_rad = form.scales(units)
@@ -179,15 +183,15 @@ def checked_rows(
 
 
 def tolerated(count: int) -> int:
-    """Return the number of faulty frames among `count` that may be left out: a quarter, but one at least."""
+    """Return the number of faulty frames among `count` that may be left out: a quarter, rounded down, at least one."""
     return max(1, count // 4)
 
 
 def far_faults(position: Float[ndarray, "n 3"], where: str, names: Sequence[str]) -> dict[int, str]:
-    """Return a message for each row whose position (m) is more than 10 m from the base, by the index of the row.
+    """Return a message for each position (m, base frame) that is more than 10 m from the base, by the index of its row.
 
-    Raises InputError if more than a quarter of the rows are that far, because wrong units are then the cause. `names`
-    are the names of the rows in the messages.
+    Raises InputError, begun with `where`, if more rows are that far than `tolerated` permits, or the only row is. Wrong
+    units are then the cause. `names` are the names of the rows in the messages. NaN counts as 0.
     """
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
@@ -211,9 +215,11 @@ def _require_units(
     units: UnitsName,
     where: str,
 ) -> None:
-    """Raise InputError if positions (m) or angles (`rest`, as written) are too large or too small for `units`.
+    """Raise InputError if angles are too large or, for `units` "auto", angles or positions too small for their unit.
 
-    `form` is the pose convention of the numbers. The message begins with `where` and names the option that helps.
+    `position` is in m, in the base frame; `rest` has the numbers of the rotation as written, in the convention `form`.
+    Too large are angles over 2π in radians. Too small are sets of poses with all angles below 2π in degrees, or all
+    positions within 10 mm. The message begins with `where` and names the option that helps.
     """
     per_m, per_rad = form.scales(units)
     farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0)) / per_m

@@ -82,11 +82,11 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
 
 
 def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
-    """Read a 16-bit image and return the upper eight of the bits that its pixel values use.
+    """Read a 16-bit image, grey (h,w) or RGB (h,w,3), and return the upper eight of the bits that its pixel values use.
 
-    Sensors of 8, 10, 12 or 14 bits fill only the lower bits of a 16-bit file. Single defective pixels, which may have
-    any value, are ignored. Raises InputError for pixels that are fractions or have more than 16 bits, because such a
-    file does not state its black and white level.
+    The image is not rotated by its EXIF tag. Sensors of 8, 10, 12 or 14 bits fill only the lower bits of a 16-bit file.
+    Single defective pixels, which may have any value, are ignored. Raises InputError for pixels that are fractions or
+    have more than 16 bits, because such a file does not state its black and white level.
     """
     deep = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if deep is None or deep.dtype != np.uint16:
@@ -101,7 +101,7 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Read the depth along the optical axis (m) at each pixel of a depth image; 0 where none was measured.
+    """Read a depth image (in mm): return the depth along the optical axis (m) at each pixel, 0 where none was measured.
 
     Raises InputError if the file is not a 16-bit grey image of `size` (width, height).
     """
@@ -118,7 +118,10 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 
 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
-    """Return the size (width, height in px) that all images share; raise InputError if one has another size."""
+    """Return the size (width, height in px) that all images share; raise InputError if one has another size.
+
+    `sizes` maps the name of each image to its size. The message begins with `where`.
+    """
     (first, size), *others = sizes.items()
     if other := [one for one in others if one[1] != size]:
         raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
@@ -126,16 +129,20 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Return the mean grey level (0 to 255), and the variance of the Laplacian, which falls as blur increases."""
+    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian.
+
+    The variance falls as blur increases.
+    """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
 def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
-    """Return the width of an image's strongest edges as a share of its long side, along the axis with more blur.
+    """Return the width of an RGB image's strongest edges as a share of its long side, along the axis with more blur.
 
-    The width follows from the rise of grey levels within 2 pixels and within 16: 1/320 for sharp edges up to 1/40; 0
-    without edges. An image whose long side is below 640 px counts as one of 640 px.
+    The image is first reduced to a long side of 640 px; a smaller one is not, but counts as one of 640 px. The width is
+    2 px times the ratio of the grey-level differences (99 % quantiles) over 16 and 2 px, divided by 640. Sharp edges
+    have 1/320, the largest width is 1/40, and 0 means no edges.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(EDGES_AT / max(grey.shape), 1.0)
@@ -149,9 +156,11 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
 
 
 def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:
-    """Test whether two images show the same view, as from a camera at rest: their details differ little.
+    """Test whether two RGB images show the same view, as from a camera at rest: their details differ little.
 
-    After a motion by a few pixels, the details (structures of a few pixels) of two images have nothing in common.
+    Details are structures of a few pixels, normalised by their contrast. The result is True if their mean squared
+    difference is below a quarter of the sum of both mean squares. After a motion by a few pixels, the details of two
+    images have nothing in common.
     """
     details = []
     for image in (first, other):
@@ -166,7 +175,7 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
 
 
 def exposure_fault(brightness: float) -> str | None:
-    """Return "nearly black" or "nearly white" by the mean grey level (0 to 255) of an image; None if exposed well."""
+    """Return "nearly black" (mean grey level up to 12 of 255) or "nearly white" (from 243); None if exposed well."""
     if DARK < brightness < BRIGHT:
         return None
     return "nearly black" if brightness <= DARK else "nearly white"

@@ -42,8 +42,9 @@ class PoseTable:
 def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOptions) -> Paired:
     """Pair the poses of a file with a folder's images by name, else by time stamp, else by order of the names.
 
-    Return image paths, base_from_gripper of each, messages for images without a usable pose, and notes for the user.
-    Raises InputError if poses and images cannot be paired.
+    Return image paths relative to `folder`, base_from_gripper of each, messages by index for images without a usable
+    pose, and notes for the user. Poses paired by time are interpolated. Raises InputError if poses and images cannot be
+    paired.
     """
     if table.images is not None:
         return _paired_by_name(folder, file, table)
@@ -65,10 +66,10 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
 def paired_by_name(
     names: Sequence[str], poses: Float[ndarray, "n 4 4"]
 ) -> dict[bool, Float[ndarray, "n 4 4"]]:
-    """Return the pose of each name under the assumption that `poses`, in file order, belong to the sorted names.
+    """Return the pose of each name, for two ways to sort `names`, if the k-th pose belongs to the k-th sorted name.
 
-    Key True: names sorted by the numbers in them (2 before 10); key False: sorted as text. A key is left out if `names`
-    are in this order already.
+    The result maps the way to poses in the order of `names`. Key True: names sorted by the numbers in them (2 before
+    10); key False: sorted as text. A key is left out if `names` are in this order already.
     """
     found = {}
     for by_number in (True, False):
@@ -92,9 +93,10 @@ def image_names(folder: Path) -> list[str]:
 
 
 def stamp_ns(text: str, where: str) -> int:
-    """Convert a time stamp from text to nanoseconds; the size of the number tells whether it is in s, ms, µs or ns.
+    """Convert a time stamp from text to nanoseconds; its size tells whether it is in s, ms, µs or ns.
 
-    The result is exact, as a float would not be: it holds 16 of the 19 digits that nanoseconds since 1970 have.
+    Numbers below 1e11 are in s, below 1e14 in ms, below 1e17 in µs, others in ns. The result is exact; a float has 16
+    of the 19 digits of nanoseconds since 1970. Raises InputError, begun with `where`, if the text is no time stamp.
     """
     with suppress(ArithmeticError, ValueError):  # errors of Decimal and int
         value = Decimal(text)
@@ -142,7 +144,8 @@ def _paired_by_time(
 ) -> Paired | None:
     """Pair the images `taken`, named by time stamps, with interpolated poses; the result is that of `pair_with_images`.
 
-    None: the names are no time stamps, or none of the stamps is within the times of the table.
+    An image whose surrounding poses are over `options.max_gap_ms` apart has a message. The result is None if the names
+    are no time stamps, or none of the stamps is within the times of the table.
     """
     assert table.stamp_ns is not None
     try:

@@ -25,7 +25,7 @@ _DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 def read_text(file: Path, most: int = MAX_JSON) -> str:
-    """Read the text of a file; raise InputError if it is missing, too long, binary or not UTF-8."""
+    """Read the text of a file; raise InputError if it is missing, over `most` characters, binary or not UTF-8."""
     try:
         data = read_bytes(file)
     except OSError as error:
@@ -49,7 +49,11 @@ def read_lines(file: Path) -> tuple[list[str], list[str]]:
 
 
 def split_cells(lines: Sequence[str], file: Path) -> tuple[list[str] | None, list[list[str]]]:
-    """Split lines of a table into cells; return the header (None without one) and the rows of cells."""
+    """Split lines of a table into cells; return the header (None without one) and the rows of cells.
+
+    The separator is the tab, semicolon or comma in the first line, else a space. A first row without any number is the
+    header. Raises InputError, begun with `file`, if the lines are no table.
+    """
     separator = next((mark for mark in "\t;," if lines and mark in lines[0]), " ")
     try:
         rows = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for line in lines]
@@ -136,7 +140,10 @@ def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], w
 
 
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
-    """Return the content of a file, converted by `schema`; raise InputError, begun with `where`, if it does not fit."""
+    """Return the content of a file, converted by the pydantic model or type adapter `schema`.
+
+    Raises InputError, begun with `where`, if the content does not fit.
+    """
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:
         return validate(content)
@@ -157,7 +164,10 @@ def read_npy(file: Path) -> ndarray:
 
 
 def contained(folder: Path, name: str, where: str) -> Path:
-    """Return `folder/name`; raise InputError if the name is absolute, invalid, or leads out of the folder."""
+    """Return `folder/name`; raise InputError if the name is absolute, invalid, or leads out of the folder.
+
+    The file need not exist, but must not be a folder, pipe or device. Messages begin with `where`.
+    """
     try:
         longest = max(len(part.encode()) for part in Path(name).parts)
     except ValueError:  # an empty name, or half of a surrogate pair

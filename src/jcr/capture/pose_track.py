@@ -31,9 +31,9 @@ def interpolated_poses(
 ) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
     """Return poses interpolated at n time stamps (ns), and the time (ns) between the two samples around each.
 
-    `a_from_b` are the samples at the times `sample_ns`; of samples with equal times, the first is used. The time between
-    is 0 at a sample, and the largest int64 outside of the samples. Positions are interpolated linearly, rotations by
-    slerp.
+    `a_from_b` are the samples at the times `sample_ns`; of samples with equal times, the first is used. Positions are
+    interpolated linearly, rotations by slerp. Outside of the samples the nearest one is returned. The time between is 0
+    at a sample, and the largest int64 outside of the samples.
     """
     times, first = np.unique(sample_ns, return_index=True)
     before, share, gap = bracket(times, stamp_ns)
@@ -49,10 +49,11 @@ def interpolated_poses(
 def bracket(
     sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
 ) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
-    """Return for each of n time stamps (ns) the row of the sample before, its place between two samples, and their gap.
+    """Return the row of the sample before each of n time stamps (ns), the place between two samples, and the gap.
 
-    `sample_ns` are the k ascending times of the samples. The place is 0 at the sample before and 1 at the next one. The
-    gap is the time (ns) between the two: 0 for a stamp at a sample, the largest int64 outside of the samples.
+    `sample_ns` are the k ascending times of the samples. The place is 0 at the sample before and 1 at the next one, and
+    limited to this range outside of the samples. The gap is the time (ns) between the two: 0 for a stamp at a sample,
+    the largest int64 outside of the samples.
     """
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
@@ -64,9 +65,10 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """Return the speed (m/s) of a moving frame at time stamps (ns), averaged over 0.1 s around each.
+    """Return the speed (m/s) of a moving frame at n time stamps (ns), averaged over 0.1 s around each.
 
-    `poses_at` is a function from time stamps to poses. A rotation counts as its angle (rad) times 0.3 m.
+    The speed is that of the translation plus 0.3 m times the angular speed (rad/s). `poses_at` is a function from time
+    stamps to poses and gaps.
     """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
@@ -83,7 +85,7 @@ class TfTree:
         """Samples of parent_from_child by the child frame: time stamps (ns), and x, y, z, qx, qy, qz, qw of each."""
 
     def add(self, transforms: list[Any], static: bool) -> None:
-        """Add the transforms of one message; `static`: of the topic /tf_static.
+        """Add the transforms (geometry_msgs/TransformStamped) of one message; `static`: of the topic /tf_static.
 
         If a frame has another parent than before, the former parent and its samples are dropped.
         """
@@ -101,7 +103,9 @@ class TfTree:
     def poses_at(self, base: str | None, gripper: str | None, source: Path) -> PosesAt:
         """Return a function from time stamps (ns) to base_from_gripper and the gaps (ns) between samples around each.
 
-        `base` and `gripper` are names of frames. Raises InputError, begun with `source`, if they are not connected.
+        A gap is the largest of all transforms between the frames; static transforms have none. `base` and `gripper` are
+        names of frames. Raises InputError, begun with `source`, if one is None or unknown, or if they are not
+        connected.
         """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
@@ -132,7 +136,11 @@ class TfTree:
         return poses_at
 
     def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
-        """Return times (ns) and samples of a child frame's parent_from_child, and whether this transform is static."""
+        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static.
+
+        Samples are in the order of the messages. Raises InputError, begun with `source`, for numbers that are no
+        transform.
+        """
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():

@@ -63,10 +63,10 @@ class Recording:
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
-    """Write the best frames of a recording to the folder `into`; return them as a capture.
+    """Write the best frames of a recording, at most `options.frames`, to the folder `into`; return them as a capture.
 
-    Raises InputError if the poses of all frames are stale, if images are missing, or if too few frames are still and
-    sharp.
+    `report` receives the progress. Raises InputError if no frame has pose samples around it within
+    `options.max_gap_ms`. It also raises InputError if images are missing, or if too few frames are still and sharp.
     """
     options, gap_ns = recording.options, recording.gap_ns
     fresh, limit = gap_ns <= 1e6 * options.max_gap_ms, f"{options.max_gap_ms:.0f} ms"
@@ -126,11 +126,12 @@ def best_frames(
     sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
     count: int,
 ) -> tuple[Rows, tuple[str, ...]]:
-    """Return the rows of `count` sharp frames from n in order of time, and remarks on the choice for the user.
+    """Return the ascending rows of at most `count` sharp frames from n in order of time, and remarks for the user.
 
-    `speed` is that of the gripper (m/s; 1 rad counts as 0.3 m). `usable` marks the frames with a valid pose.
-    `sharpness_of` returns the sharpness of k ascending rows. Each stop of the arm gives at most one frame; the slowest
-    frames between stops are added if necessary. Raises InputError if fewer than three frames are left.
+    The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
+    as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows.
+    Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
+    necessary. Raises InputError if fewer than three frames are left.
     """
     moments = [
         run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]
@@ -180,6 +181,6 @@ def best_frames(
 
 
 def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
-    """Return the runs of consecutive rows at which `mask` is True."""
+    """Return the runs of consecutive rows at which `mask` is True, each as an ascending array of row indices."""
     rows = np.flatnonzero(mask)
     return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]

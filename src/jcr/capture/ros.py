@@ -43,7 +43,10 @@ class CameraInfo(BaseModel):
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """Read a camera_info YAML as the intrinsics of images of `size`; None if the camera was never calibrated."""
+    """Read a camera_info YAML as the intrinsics of images of `size` (width, height); None if never calibrated.
+
+    Raises InputError as `intrinsics_of_ros` does.
+    """
     return intrinsics_of_ros(read_yaml(file), size, str(file))
 
 
@@ -53,8 +56,8 @@ def intrinsics_of_ros(
     """Return the intrinsics of images of `size` (width, height); None if the camera was never calibrated.
 
     `content` is a CameraInfo message or the content of a YAML file; an uncalibrated camera has a matrix of zeros.
-    Rectified images have the intrinsics P and no distortion. Raises InputError, begun with `where`, for an unknown
-    distortion model, or intrinsics of another resolution.
+    Rectified images (`is_rectified`) have the intrinsics of the projection matrix P and no distortion. Raises
+    InputError, begun with `where`, for an unknown distortion model, or intrinsics of another resolution.
     """
     info: CameraInfo = validated_content(CameraInfo, content, where)
     matrix, model, coefficients = info.k, info.distortion_model, info.d
@@ -113,9 +116,10 @@ def read_ros_camera_info(message: Any) -> Intrinsics | None:
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
-    """Return the image of a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
+    """Return the image in a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    Raises InputError for depth and for encodings that jcr does not read.
+    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth and for
+    encodings that jcr does not read.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)
@@ -137,7 +141,7 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
 def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
     """Return the depth (mm) of a sensor_msgs/Image or CompressedImage; 0 where none was measured.
 
-    Raises InputError, begun with `where`, if the message is not a depth image.
+    Depths in metres are rounded to mm. Raises InputError, begun with `where`, if the message is not a depth image.
     """
     if hasattr(message, "format"):
         # compressed_depth_image_transport writes its quantisation before the PNG.

@@ -53,7 +53,7 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
 
 
 def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
-    """Return the joints from the root of a URDF to a link, root first; raise InputError if they form a loop."""
+    """Return all joints, fixed ones too, from the root of a URDF to a link, root first; raise InputError for a loop."""
     by_child = {joint.child: joint for joint in urdf.robot.joints}
     chain = []
     while link in by_child:
@@ -65,9 +65,10 @@ def joints_to(urdf: "yourdfpy.URDF", link: str) -> list["yourdfpy.Joint"]:
 
 
 def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
-    """Return the arm of `dof` rotating joints in a URDF (file or its content); its gripper is the link after the last.
+    """Return the arm of `dof` rotating joints in a URDF (file or its content).
 
-    Raises InputError if the URDF has no such chain or several, or if a joint does not rotate.
+    Its base is the URDF's root link, its gripper the child link of the last rotating joint. Raises InputError if the
+    URDF has no such chain or several, or if a joint does not rotate.
     """
     urdf = load_urdf(where) if isinstance(where, Path) else where
     chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
@@ -135,7 +136,10 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Convert recorded positions (a column per joint) to joint angles (rad); None if not all joints rotate."""
+        """Convert recorded positions, a column per joint in the order of `joints`, to joint angles (rad).
+
+        The result is None if not all joints rotate, or if the URDF has not exactly one chain with as many joints.
+        """
         try:
             read_chain(self.urdf, len(self.joints))
         except InputError:
@@ -143,7 +147,7 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper from recorded positions, one column per joint.
+        """Compute base_from_gripper (m) from positions in recorded units, one column per joint in order of `joints`.
 
         Raises InputError if the positions are so large that they are degrees, although the unit is radians.
         """
@@ -178,7 +182,11 @@ class RecordedArm:
 
 
 def read_arm(options: ReadOptions) -> RecordedArm:
-    """Read the arm of `options.urdf` between its links `base_frame` and `gripper_frame`; raise InputError if none."""
+    """Read the arm of `options.urdf` between its links `options.base_frame` (None: root) and `options.gripper_frame`.
+
+    Units of recorded positions are those of `options.pose_units`; "auto": m and rad. Raises InputError if a link is
+    missing, if no moving joint lies between the links, or if the URDF is invalid.
+    """
     file = options.urdf
     assert file is not None
     urdf = load_urdf(file)

@@ -151,7 +151,10 @@ class ExportedRun:
 
     @property
     def mount(self) -> ros.CameraMount:
-        """Transform of the exported camera to its parent frame, with the frame names from the options."""
+        """Transform of the exported camera (or its root link) to its parent frame, with frame names from the options.
+
+        The parent is the gripper or, for a fixed camera, the base. Raises InputError if options and run do not fit.
+        """
         options, found = self.options, self.calibration
         if self.camera is not None:
             mount = self._mount_of(self.camera, options.child_frame)
@@ -201,12 +204,12 @@ class ExportedRun:
 
     @property
     def cloud(self) -> "PointCloud":
-        """Point cloud of the run, from cloud.ply."""
+        """Point cloud of the run in the base frame (m), from cloud.ply."""
         return read_cloud(self.run.out / CLOUD)
 
     @property
     def scene(self) -> "SceneMap":
-        """Map of the run, from map.safetensors."""
+        """Map of the run in the base frame (m), from map.safetensors."""
         return load_map(self.run.out)
 
     def _camera(self, name: str) -> "CameraPlacement":
@@ -253,7 +256,7 @@ class ExportedRun:
 
     @property
     def views(self) -> "PosedImages":
-        """Registered images with their camera poses in the base frame.
+        """Registered images with their camera poses, tracks and points in the base frame (m).
 
         The camera poses are those of the reconstruction after one similarity transform, so they agree with each other
         to a fraction of a pixel. Poses computed from the gripper poses of most arms do not.

@@ -55,7 +55,7 @@ class CameraMount:
     """Intrinsics with which the transform was estimated; None if unknown."""
 
     def __post_init__(self) -> None:
-        """Check the frame names."""
+        """Raise InputError for invalid frame names, and if parent and child have the same name."""
         for name in (self.parent, self.child, self.base, self.effector):
             require_frame_name(name)
         if self.parent == self.child:
@@ -79,7 +79,8 @@ def on_root(
     """Return the mount with the camera driver's root link `root` as child instead of the optical frame.
 
     The driver already publishes a parent of the optical frame, and a frame can have only one. The result has the
-    transform parent_from_root = parent_from_optical · inverse(root_from_optical).
+    transform parent_from_root = parent_from_optical · inverse(root_from_optical). Raises InputError if `root` is the
+    name of parent or child.
     """
     if root in (mount.parent, mount.child):
         raise InputError(f"root frame {root!r}: is the name of another frame; name the camera's root link")
@@ -93,7 +94,7 @@ def static_transform_publisher(parent: str, child: str, parent_from_child: Float
 
 
 def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """Return parent_from_child (m) as the XML element `origin` of a URDF joint (xyz, rpy)."""
+    """Return parent_from_child as the XML element `origin` of a URDF joint: xyz (m), rpy (rad, about fixed axes)."""
     xyz, rpy = parent_from_child[:3, 3], roll_pitch_yaw(parent_from_child[:3, :3])
     return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
 
@@ -181,7 +182,10 @@ def _joint(parent: str, child: str, origin: str | None = None) -> str:
 
 
 def easy_handeye2(mount: CameraMount, name: str) -> str:
-    """Return the text of a .calib file, which easy_handeye2 reads as ~/.ros2/easy_handeye2/calibrations/NAME.calib."""
+    """Return the text of a .calib file, which easy_handeye2 reads as ~/.ros2/easy_handeye2/calibrations/NAME.calib.
+
+    `name` is the name of the calibration, NAME. Its transform is parent_from_child of the mount.
+    """
     content = {
         "parameters": {
             "name": name,
@@ -203,7 +207,7 @@ def easy_handeye2(mount: CameraMount, name: str) -> str:
 
 
 def camera_info(mount: CameraMount) -> str:
-    """Return the intrinsics as YAML for camera_info_manager, in pixels; (0, 0) is the centre of the first pixel.
+    """Return the intrinsics of a mount as YAML for camera_info_manager (px); (0, 0) is the centre of the first pixel.
 
     Raises InputError if the intrinsics are unknown.
     """
@@ -243,7 +247,10 @@ def notes(mount: CameraMount) -> list[str]:
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
-    """Return the command-line arguments of tf2_ros static_transform_publisher for a transform, as a list."""
+    """Return the command-line arguments of tf2_ros static_transform_publisher for a transform, as a list.
+
+    They are names and values of position (m), quaternion x, y, z, w and both frames.
+    """
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
     numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]

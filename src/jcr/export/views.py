@@ -46,11 +46,11 @@ class PosedImages:
 def write_nerfstudio(
     folder: Path, views: PosedImages, cloud: PointCloud, notes: dict[str, str], options: ExportOptions
 ) -> None:
-    """Write transforms.json, images/ and points.ply (initial points of a splat) into a new folder.
+    """Write transforms.json, images/ and points.ply (`cloud`, initial points of a splat) into a new folder.
 
-    The matrices are base_from_camera with OpenGL's camera axes (x right, y up, z backward). nerfstudio rotates, shifts
-    and scales the scene unless called with `--orientation-method none --center-method none --auto-scale-poses False`.
-    Raises InputError if nerfstudio does not support the distortion model.
+    The matrices are base_from_camera (m) with OpenGL's camera axes (x right, y up, z backward). nerfstudio rotates,
+    shifts and scales the scene unless called with `--orientation-method none --center-method none --auto-scale-poses
+    False`. `notes` are stored in the files. Raises InputError if nerfstudio does not support the distortion model.
     """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
@@ -84,9 +84,11 @@ def write_nerfstudio(
 
 
 def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write the images and a COLMAP model with all tracks (sparse/0, binary and text) into a new folder.
+    """Write the images and a COLMAP model with their tracks (sparse/0, binary and text) into a new folder.
 
-    The model is in the base frame, in metres. Raises InputError if COLMAP lacks the distortion model.
+    The model's world is the base frame, in metres. Observations outside of the written images, and points with fewer
+    than two remaining observations, are left out. `notes` are stored in README.txt. Raises InputError if COLMAP lacks
+    the distortion model.
     """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
@@ -126,7 +128,10 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:
-    """Copy, link or undistort the images into a new folder; return their file names in it and their intrinsics."""
+    """Copy, link or undistort the images into a new folder; return their file names in it and their intrinsics.
+
+    `options.undistort` and `options.link_images` choose. Images with an EXIF rotation are written upright as PNG.
+    """
     folder.mkdir()
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):

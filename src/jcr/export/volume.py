@@ -30,11 +30,12 @@ _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo want
 
 
 def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write a binary OctoMap (.bt) with voxels of side `voxel_size` m, by default the map's cell.
+    """Write a binary OctoMap (.bt) in the base frame with cubic voxels.
 
-    A voxel is occupied if its inscribed sphere touches a seen surface, and free if the sphere touches neither a surface
-    nor unseen space. All other voxels are left out, so OctoMap treats them as unknown. Raises InputError without
-    pyoctomap, and if there would be too many voxels.
+    The side of a voxel is `options.voxel_size` m, by default the map's cell. A voxel is occupied if its inscribed
+    sphere touches a seen surface, and free if the sphere touches neither a surface nor unseen space. All other voxels
+    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap, and
+    if there would be too many voxels.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, options.voxel_size)
@@ -52,11 +53,12 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 
 
 def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
-    """Write the signed distance at the centres of voxels of side `voxel_size` m, by default the map's cell, as .npz.
+    """Write the signed distance (m) at the centres of voxels in the base frame as .npz, positive outside of solids.
 
-    Unseen space counts as occupied by default. The arrays follow cuRobo: `values` (nx,ny,nz), x slowest; `origin` (3,),
-    the centre of the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and
-    quaternion w x y z. The texts are `frame`, `unit`, `sign` and `unknown`.
+    The side of a voxel is `options.voxel_size` m, by default the map's cell. Unseen space counts as occupied by
+    default. The arrays follow cuRobo except for the sign: `values` (nx,ny,nz), x slowest; `origin` (3,), the centre of
+    the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and quaternion w x y z.
+    The texts are `frame`, `unit`, `sign`, `unknown` and the other `notes`.
     """
     voxel, unknown = _voxel(scene, options.voxel_size), options.unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
@@ -101,10 +103,10 @@ def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 
 
 def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
-    """Write the seen surface with vertex colours as binary glTF.
+    """Write the seen surface with vertex colours as binary glTF (m).
 
     Vertices are in the robot's base frame with z up, as planners load them; viewers of glTF take y for up and show the
-    surface lying on its side. Raises InputError if the map has no surface.
+    surface lying on its side. `notes` are stored as metadata. Raises InputError if the map has no surface.
     """
     vertices, faces, colors = surface_mesh(scene)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
@@ -115,7 +117,11 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the centres (m) of `count` voxels along x, y, z with side `voxel` (m), from the corner `lower` (m) on."""
+    """Return the centres (x,y,z,3) in m of a grid of cubic voxels of side `voxel` (m); the axes follow x, y, z.
+
+    `count` (3,) is the number of voxels along each axis. `lower` (3,) is the corner of the grid with the smallest
+    coordinates (m).
+    """
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 
@@ -123,7 +129,8 @@ def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x 
 def _voxel(scene: SceneMap, side: float | None) -> float:
     """Return the side (m) of voxels: `side` or, if None, the map's cell.
 
-    Raises InputError if it does not fit the workspace, or if there would be too many voxels.
+    Raises InputError if it is not positive, exceeds the shortest side of the workspace, or gives over 50 million
+    voxels.
     """
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
@@ -145,7 +152,8 @@ def write_rrd(
 ) -> None:
     """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
 
-    Raises InputError if the package rerun-sdk (500 MB) is not installed.
+    All poses and points are in the base frame (m); `notes` are stored as text. Raises InputError if the package
+    rerun-sdk (500 MB) is not installed.
     """
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)

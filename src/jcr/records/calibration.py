@@ -127,7 +127,10 @@ class RobotNoise:
 
     @property
     def together(self) -> tuple[float, float]:
-        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined."""
+        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined.
+
+        It is the root of the summed squares of both; the systematic error is `systematic_left`.
+        """
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
@@ -155,7 +158,10 @@ class Share:
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
-    """Return the share of one cause: its covariance in COVARIANCE_ORDER, and standard deviations in mm and degrees."""
+    """Return the share of one cause, with standard deviations in mm and degrees, from its covariance.
+
+    The covariance is in COVARIANCE_ORDER. The standard deviations are the root mean squares over the three axes.
+    """
     metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1)).tolist()
     degrees = float(np.degrees(radians))
     return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
@@ -187,7 +193,10 @@ class Budget:
 
     @property
     def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors, which more images do not reduce, are most of the translation's variance."""
+        """Whether systematic robot errors are at least half of the translation's variance.
+
+        More images do not reduce these errors.
+        """
         others = self.robot_random, self.intrinsics, self.images, self.faults
         return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
@@ -238,7 +247,10 @@ class DepthCheck:
     """Number of features that were compared."""
 
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
-        """Return the standard deviation (m) of depths (m) with corrected scale, from noise and scale uncertainty."""
+        """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
+
+        It is the root of the summed squares of `noise_m`, `noise_per_m`·z² and the uncertainty of the scale error.
+        """
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
@@ -284,7 +296,10 @@ class SceneUncertainty:
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-        """Return the covariances (m²) of points of the scene (m, base frame), without their triangulation errors."""
+        """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors.
+
+        They include the errors of the scene's similarity (`covariance`) and of its shape (`shape_m`).
+        """
         from jcr.geometry import by_similarity  # SciPy, which help need not wait for
 
         by = by_similarity(x_in_base - self.middle_in_base)
@@ -362,13 +377,13 @@ class Uncertainty:
     @computed_field
     @property
     def translation_std_mm(self) -> list[float]:
-        """Standard deviations of the translation (mm)."""
+        """Standard deviations of the translation's x, y and z (mm), along the axes of the covariance."""
         return (1e3 * self.std[:3]).tolist()
 
     @computed_field
     @property
     def rotation_std_deg(self) -> list[float]:
-        """Standard deviations of the rotation vector (degrees)."""
+        """Standard deviations of the rotation vector's x, y and z (degrees), about the axes of the covariance."""
         return np.degrees(self.std[3:6]).tolist()
 
     @computed_field
@@ -380,7 +395,10 @@ class Uncertainty:
     @computed_field
     @property
     def scene_95_mm(self) -> float | None:
-        """Bound on 95 % of the errors of reconstructed points in the base frame (mm), at the median point."""
+        """Bound (mm) on 95 % of the errors of the median reconstructed point in the base frame.
+
+        The bound is None where no image was adjusted.
+        """
         return None if self.scene is None else 1e3 * self.scene.within_95_m
 
     @property
@@ -390,12 +408,15 @@ class Uncertainty:
 
     @property
     def intrinsics_std(self) -> Float[ndarray, " q"] | None:
-        """Standard deviations of fx, fy, cx, cy and the distortion; None where the intrinsics were not estimated."""
+        """Standard deviations of fx, fy, cx, cy (px) and distortion; None where the intrinsics were not estimated."""
         return None if self.joint is None else np.sqrt(np.diag(self.joint.covariance)[7:])
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance of transform and scale in COVARIANCE_ORDER (j = 7), followed by the intrinsics if estimated."""
+        """Covariance (j,j) of transform and scale in COVARIANCE_ORDER, then of the intrinsics if estimated.
+
+        The intrinsics are fx, fy, cx, cy and the distortion coefficients. Without these, j is 7.
+        """
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property

@@ -43,11 +43,14 @@ class Intrinsics:
 
     @property
     def matrix(self) -> Float[ndarray, "3 3"]:
-        """Camera matrix K (3,3)."""
+        """Camera matrix K (3,3) in px: rows (fx, 0, cx), (0, fy, cy), (0, 0, 1)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def with_std(self, std: Float[ndarray, " q"] | None) -> "IntrinsicsAndStd":
-        """Return the intrinsics with standard deviations, fx, fy, cx, cy and distortion; None: not estimated."""
+        """Return the intrinsics with the standard deviations `std` of their parameters; None: not estimated.
+
+        The order is fx, fy, cx, cy (px), then the distortion coefficients.
+        """
         values: dict[str, Any] = vars(self) | {"std": None if std is None else tuple(std.tolist())}
         return IntrinsicsAndStd(**values)
 
@@ -151,7 +154,7 @@ class Capture:
         return len(self.images)
 
     def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
-        """Return the capture with the images of these rows only, in the order of `rows`, without further cameras."""
+        """Return the capture with the images at the indices `rows` only, in their order, without further cameras."""
         chosen = np.asarray(rows, dtype=int).tolist()
         return replace(
             self,

@@ -38,7 +38,10 @@ def other_size(
     whose: str = "images",
     remedy: str = "take all with one camera at one resolution",
 ) -> InputError:
-    """Return the error that `what` has another resolution than `whose`: `size` instead of `expected` (width, height)."""
+    """Return the error that `what` has another resolution than `whose`: `size` instead of `expected`.
+
+    Both are width and height (px). `remedy` is the end of the message. The error is not raised.
+    """
     return InputError(
         f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
     )
@@ -64,7 +67,7 @@ RigidMatrix = Annotated[
 
 
 def _plausible(angles: list[float]) -> list[float]:
-    """Return the joint angles (rad) unchanged; raise ValueError if one is so large that it is probably in degrees."""
+    """Return the joint angles (rad) unchanged; raise ValueError if one is over 6π, and thus probably in degrees."""
     if (largest := max(map(abs, angles))) > MOST_ROTATION:
         raise ValueError(f"up to {largest:.4g} rad; these look like degrees: convert them")
     return angles

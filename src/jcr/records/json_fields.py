@@ -30,7 +30,10 @@ class Part(BaseModel):
     )
 
     def __eq__(self, other: object) -> bool:
-        """Compare two records by their JSON, because a comparison of arrays is no single truth value."""
+        """Test whether two records have the same type and JSON.
+
+        A comparison of their arrays would give no single truth value.
+        """
         return (
             isinstance(other, Part) and type(self) is type(other) and self.model_dump() == other.model_dump()
         )
@@ -75,7 +78,7 @@ def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Floa
 
 
 def in_json(kind: Any) -> GetPydanticSchema:
-    """Return the pydantic annotation of a field that JSON has in the form of the type `kind`."""
+    """Return the pydantic annotation of a field that is validated and written as the type `kind`, its form in JSON."""
     return GetPydanticSchema(lambda _source, handler: handler.generate_schema(kind))
 
 

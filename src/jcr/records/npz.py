@@ -41,7 +41,8 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     """Return a value as JSON that refers to arrays by name, and add these arrays to `arrays`.
 
-    Their names begin with `name`, followed by the path of fields and indices.
+    `value` is a dataclass, tuple, array or plain value. The names of its arrays begin with `name`, followed by the path
+    of fields and indices.
     """
     if isinstance(value, np.ndarray):
         arrays[name] = value
@@ -81,7 +82,10 @@ def read_reconstruction(path: Path) -> Reconstruction:
 
 
 def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an npz file with named arrays and the JSON object `about`; a failed write leaves an old file unchanged."""
+    """Write an npz file with named arrays and the JSON object `about`; a failed write leaves an old file unchanged.
+
+    The key "format" of `about` is the name that `read_npz` expects.
+    """
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
 

@@ -185,7 +185,7 @@ class PointCloud:
 
     @property
     def cleared(self) -> Bool[ndarray, " n"]:
-        """Mask of points whose ray from the camera counts as free space."""
+        """Mask of points whose ray from the camera counts as free space; without `clears`, all but the PRIOR points."""
         if self.clears is not None:
             return self.clears
         return np.ones(len(self.image), bool) if self.reason is None else self.reason != PRIOR

@@ -38,8 +38,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture.
 
-    Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones),
-    and if the poses of all images are stale.
+    Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones). It
+    also raises InputError if every image is more than `options.max_gap_ms` away from pose samples. `report` receives
+    the progress.
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
@@ -78,7 +79,11 @@ class _Bag:
     """Open bag, and the content of all its messages except the images, collected in one pass."""
 
     def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
-        """Read transforms, joint states, CameraInfo and image time stamps of the bag `path`, opened as `reader`."""
+        """Read transforms, joint states, CameraInfo and image time stamps of the bag `path`.
+
+        `reader` is the open bag (AnyReader); `report` receives the progress. Raises InputError for a missing topic or
+        message content that is not ROS's.
+        """
         self.reader, self.path, self.tree = reader, path, TfTree()
         stamps, recorded = list[int](), list[int]()
         self.joints = dict[str, dict[int, float]]()
@@ -117,9 +122,10 @@ class _Bag:
         """Times (ns) at which the images were recorded."""
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
-        """Yield the connection, time of recording (ns) and content of each message of the connections.
+        """Yield the connection, time of recording (ns) and decoded content of each message of `connections`.
 
-        `span` may limit the times of recording: `start` and `stop` (ns). Raises InputError if a message is damaged.
+        `connections` are those of the bag's reader. `span` may limit the times of recording: `start` (included) and
+        `stop` (excluded), in ns. Raises InputError if a message is damaged.
         """
         try:
             for connection, at, raw in self.reader.messages(connections, **span):
@@ -130,7 +136,10 @@ class _Bag:
             ) from None
 
     def pictures(self, rows: Int[ndarray, " k"]) -> Iterator[Picture]:
-        """Yield the row, image and file ending of each of k rows among the bag's images."""
+        """Yield the row, image (encoded bytes or RGB pixels) and file ending for each of k rows.
+
+        A row is the index of an image of the bag in the order of time stamps. Images that are not found are left out.
+        """
         for row in rows.tolist():
             at = int(self.log_ns[row])
             for _, _, message in self.messages(self.images, start=at, stop=at + 1):
@@ -139,7 +148,11 @@ class _Bag:
                     break
 
     def depth_at(self, row: int) -> UInt16[ndarray, "h w"] | None:
-        """Return the depth image (mm) nearest in time to the colour image of a row; None if none is within 20 ms."""
+        """Return the depth image (mm) nearest in time to the colour image of a row; None if none is within 20 ms.
+
+        A row is the index of a colour image in the order of time stamps. The depth image has the pixels of the colour
+        image, with 0 where no depth was measured.
+        """
         stamp, logged = int(self.stamp_ns[row]), int(self.log_ns[row])
         span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
         near = [
@@ -152,7 +165,7 @@ class _Bag:
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
         """Return the intrinsics in the bag's CameraInfo for images of `size` (width, height); None if it has none.
 
-        For rectified images they are those of the matrix P, without distortion.
+        For rectified images they are those of CameraInfo's projection matrix P (3,4), without distortion.
         """
         if (info := self.camera_info) is None:
             return None
@@ -162,7 +175,7 @@ class _Bag:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a bag and yield its reader; raise InputError if the path is no bag or the bag is damaged."""
+    """Open a bag and yield its rosbags AnyReader; raise InputError if the path is no bag or the bag is damaged."""
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:
@@ -188,7 +201,11 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
-    """Return the topic of --camera-topic, or without that option the only topic with colour images."""
+    """Return the topic of --camera-topic, or without that option the only topic with colour images.
+
+    `reader` is the open bag (AnyReader), `path` its path for messages. Raises InputError that lists the topics if that
+    one does not exist, or if several have colour images.
+    """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
     # A topic /compressed repeats the images of its raw topic.
     colour = [
@@ -202,7 +219,11 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
 
 
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
-    """Return the connections with the robot's poses: tf, or joint states if a URDF is given."""
+    """Return the reader's connections (topics) with the robot's poses: tf, or joint states if `options.urdf` is given.
+
+    `reader` is the open bag (AnyReader), `path` its path for messages. Raises InputError if there are none, or if
+    several topics have joint states and the options choose none.
+    """
     if options.urdf is None:
         found = [c for c in reader.connections if c.msgtype in TF]
         if not found:
@@ -214,6 +235,6 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
 
 
 def _stamp(message: Any, log_ns: int) -> int:
-    """Return the time stamp (ns) of a message; the time of its recording if the driver left the stamp empty."""
+    """Return the time stamp (ns) in the header of a ROS message; `log_ns`, the time of recording, if the stamp is 0."""
     stamp = message.header.stamp
     return stamp.sec * 10**9 + stamp.nanosec or log_ns

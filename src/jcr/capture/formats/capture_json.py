@@ -39,7 +39,10 @@ def recognises(path: Path) -> bool:
 
 
 def read_capture_json(file: Path) -> CaptureFile:
-    """Read a capture.json; raise InputError if the file is missing or does not fit the schema."""
+    """Read a capture.json; raise InputError if the file is missing or does not fit the schema.
+
+    Of the frames, only the image names are checked; `frame_of` validates the rest.
+    """
     if not file.is_file():
         raise InputError(f"{file.parent}: holds no capture.json; name a capture folder")
     content = read_json(file)
@@ -52,7 +55,10 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 
 def read_intrinsics(file: Path) -> IntrinsicsEntry:
-    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics"."""
+    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics".
+
+    Raises InputError if the file is missing or holds no valid intrinsics.
+    """
     content = read_json(file)
     if isinstance(content, dict):
         content = content.get("intrinsics", content)
@@ -62,13 +68,16 @@ def read_intrinsics(file: Path) -> IntrinsicsEntry:
 
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
-    """Return the validated frame number `row` of a capture.json; raise InputError that names its image if invalid."""
+    """Return the validated frame `row` (from 0) of a capture.json; raise InputError that names its image if invalid."""
     where = f"{file}: frame {row} ({content.frames[row]['image']})"
     return validated_content(FrameEntry, content.frames[row], where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
-    """Read the capture in a folder, or the one of a capture.json; the options have no effect."""
+    """Read the capture in a folder, or the one of a capture.json; the options have no effect.
+
+    A few frames that cannot be used are left out with a note. Raises InputError for any other fault.
+    """
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     content = read_capture_json(file)
     count = len(content.frames)
@@ -190,7 +199,9 @@ def _stated_intrinsics(
 ) -> dict[str, Any]:
     """Return the intrinsics of an entry in a capture.json as the fields `intrinsics` and `intrinsics_std` of Capture.
 
-    `size` is the width and height of the images (px). Raises InputError, begun with `where`, for invalid intrinsics.
+    `stated` is the entry, and `size` the width and height of the images (px). `intrinsics` is None, and
+    `intrinsics_std` is missing, where the entry has none. Raises InputError, begun with `where`, for invalid
+    intrinsics.
     """
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
@@ -218,7 +229,10 @@ def _intrinsics_entries(record: Capture | CellCamera) -> dict[str, Any]:
 
 
 def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
-    """Return the entry "cameras" of a capture.json; empty if the wrist camera is the only one."""
+    """Return the entry "cameras" of a capture.json, by camera name; empty if the wrist camera is the only one.
+
+    Otherwise the first entry is the capture's own camera, without images.
+    """
     if not capture.others and capture.mount == "gripper":
         return {}
     entries = {capture.camera_name: CameraEntry(mount=capture.mount)}
@@ -237,7 +251,7 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
-    """Write the capture.json of a capture whose images are in `folder` already.
+    """Write the capture.json of a capture whose images are in `folder` already, and copy the arm's URDF beside it.
 
     `remarks` are further entries of the file, which readers of captures ignore.
     """

@@ -41,7 +41,11 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
-    """Read the images that have both a camera pose in a COLMAP model and a gripper pose in a table."""
+    """Read the images that have both a camera pose in the COLMAP model at a path and a gripper pose in a table.
+
+    The table of gripper poses is read with `options`, as by `table.read`. Intrinsics and camera poses are those of the
+    model; the field `cameras` names its folder. Raises InputError if there is no such image.
+    """
     folder = find_model(path)
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
@@ -87,7 +91,10 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
 
 
 def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
-    """Read the names of the registered images, sorted, and recon_from_camera (n,4,4) of each."""
+    """Read the names of the n registered images of a COLMAP model, sorted, and recon_from_camera (n,4,4) of each.
+
+    The recon frame is the model's world frame, in its unit. Raises InputError if no image is registered.
+    """
     model = read_model(folder)
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
     if not images:
@@ -100,8 +107,8 @@ def read_registered_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 
 def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] | None = None) -> Intrinsics:
     """Return the intrinsics that all registered images of a COLMAP model share, or all registered images in `names`.
 
-    Raises InputError if intrinsics differ, are for images of another size than `size` (width, height), or have a
-    distortion model that jcr does not support.
+    Pixel (0, 0) is the centre of the top-left pixel, unlike in the model. Raises InputError if intrinsics differ, are
+    for images of another size than `size` (width, height), or have a distortion model that jcr does not support.
     """
     model = read_model(folder)
     images = [model.image(k) for k in model.reg_image_ids()]

@@ -82,8 +82,8 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Extract the sharpest frames at rest from the episodes that the options name; return them as a capture.
 
-    Images are written to the folder `into`. Raises InputError that lists the existing cameras, states or episodes if the
-    options name others.
+    Images are written to the folder `into`; `report` receives the progress. Raises InputError that lists the existing
+    cameras, states or episodes if the options name others.
     """
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
@@ -116,7 +116,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
 
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """Read the episode number `index` of the data set at `path`, whose meta/info.json is `info`.
+    """Read the episode number `index` (from 0) of the data set at `path`, whose meta/info.json is `info`.
 
     `camera` and `key` are the names of the image column and of the column of robot states. Raises InputError if the
     episode is missing or damaged.
@@ -171,7 +171,10 @@ def _read_table(
 
 
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
-    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`."""
+    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`.
+
+    The template is relative to the data set `path`. Raises InputError if the result leads out of it.
+    """
     name = re.sub(
         r"\{(\w+)(?::0?(\d?\d)d)?\}",  # the value of a field is padded with zeros to the width in the template
         lambda field: str(fields.get(field[1], field[0])).zfill(int(field[2] or 0)),
@@ -181,10 +184,10 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 
 
 def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
-    """Yield row, image and file ending for each of k ascending rows, from the episodes' videos or tables.
+    """Yield row, image (encoded bytes or RGB pixels) and file ending for each of k ascending rows.
 
-    A row is the index of a frame, counted over all episodes. `key` is the image column, `fps` the frame rate of the
-    videos (1/s).
+    A row is the index of a frame, counted over all episodes. The images are from the videos or tables of `episodes`.
+    `key` is the image column, `fps` the frame rate of the videos (1/s).
     """
     first = 0
     for episode in episodes:
@@ -213,7 +216,10 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield the RGB frames at ascending times (s); raise InputError if a time has no frame within the tolerance (s)."""
+    """Yield the RGB frames at n ascending times (s) since the start of a video.
+
+    Raises InputError if the file is no video, or if a time has no frame within `tolerance_s`.
+    """
     av = extra("av", "lerobot", "a video")
     due = time_s.tolist()
     try:
@@ -238,10 +244,11 @@ def _video_frames(
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
-    """Return the gripper poses (m) and joint angles (rad) of n frames from `state`, k numbers per frame.
+    """Return base_from_gripper (m) and joint angles (rad) of n frames from `state`, k numbers per frame.
 
-    With `options.urdf` the numbers are positions of the joints, else poses. The joint angles are None without a URDF,
-    or if a sliding joint moves the gripper. `key` and `feature` are the name and description of the data set's column.
+    With `options.urdf` the numbers are positions of the joints, else poses. The joint angles, in the order of the arm's
+    chain, are None without a URDF, or if a sliding joint moves the gripper. `key` and `feature` are the name and
+    description of the data set's column, `path` is that of the data set. Raises InputError if the numbers are neither.
     """
     where, names = f"{path}: {key}", feature.numbers()
     if options.urdf is not None:

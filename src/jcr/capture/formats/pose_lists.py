@@ -35,9 +35,9 @@ def read_yaml_or_json(file: Path) -> Any:
 
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
-    """Return the two keys under which each sample of a list has its gripper pose and its marker pose.
+    """Return the keys of gripper pose and marker pose in the samples of a YAML or JSON file; None if it has no samples.
 
-    `content` is that of a YAML or JSON file, as of easy_handeye2: ("robot", "tracking"). None: it is no such list.
+    `content` is that of the file. For easy_handeye2 the keys are ("robot", "tracking").
     """
     first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
@@ -126,9 +126,10 @@ def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
-    """Yield column name and number of each number in a list: a matrix (m00 …), a rotation or a position (x, y, z).
+    """Yield column name and number of each number in a list: a matrix, a rotation or a position (x, y, z).
 
-    `names` are the column names if the list is a rotation; None: its key in the file is not that of a rotation.
+    A matrix has nine, twelve or 16 numbers in rows, named m00, m01, … by row and column. `names` are the column names
+    if the list is a rotation; None: its key in the file is not that of a rotation.
     """
     rows = [row if isinstance(row, list) else [row] for row in value]
     flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}

@@ -24,7 +24,8 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> PosePairs:
     """Read samples of MoveIt Calibration (effector_wrt_world, object_wrt_sensor) or easy_handeye2 (robot, tracking).
 
-    Raises InputError for eye_on_base, where the camera does not move with the robot and `robot` is inverted.
+    The marker frame is the recon frame: recon_from_camera is the inverse of the sample's camera_from_marker (m). Raises
+    InputError for eye_on_base, where the camera does not move with the robot and `robot` is inverted.
     """
     content = read_yaml_or_json(path)
     keys = pair_keys(content)

@@ -72,7 +72,8 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> Capture:
     """Read a capture from a file of gripper poses, or a folder with such a file, and the images in the same folder.
 
-    The images may also be in its subfolder images/.
+    The images may also be in its subfolder images/. Depth images (depth/) and intrinsics (camera_info.yaml) in the
+    folder are read if they exist. Raises InputError if there is no such file or no image for it.
     """
     file = options.poses or find_table(path)
     if file is None:
@@ -110,9 +111,10 @@ def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
 def pose_table(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
 ) -> PoseTable:
-    """Convert rows of cells to poses, NaN for a few rows without a pose; raise InputError if more rows have none.
+    """Convert rows of cells to poses, NaN for rows without one; raise InputError if more are than `tolerated` permits.
 
-    `header` has the names of the columns; None if the table has no header.
+    `header` has the names of the columns; None if the table has no header. Convention and units follow from `options`
+    or, if "auto", from the header. Messages begin with `where`.
     """
     if not rows or not rows[0]:
         raise InputError(f"{where}: holds no poses; expected one row per image")
@@ -157,7 +159,10 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the pose convention that column names identify; raise InputError if they identify none or several."""
+    """Return the pose convention that column names identify; raise InputError, begun with `where`, if they do not.
+
+    For columns rx, ry, rz, which two conventions use, the error is an OpenConventionError.
+    """
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
@@ -221,7 +226,11 @@ def _named_columns(
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
-    """Read the header of a pose file (None without one) and the cells of every row."""
+    """Read the header of a pose file (None without one) and the cells of every row.
+
+    The file is a text table, UR's p[…], YAML, JSON or .npy. Matrices of a .npy file become rows of numbers, matrix row
+    by matrix row.
+    """
     if file.suffix in pose_lists.SUFFIXES:
         return pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     if file.suffix == ".npy":
@@ -245,7 +254,11 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
 
 
 def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
-    """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp."""
+    """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp.
+
+    The header has "image" or "timestamp" if present, then x, y, z, ur_x, ur_y, ur_z. Raises InputError for a line that
+    differs.
+    """
     rows = list[list[str]]()
     for number, line in enumerate(lines, start=1):
         match = _UR_POSE.search(line)
@@ -262,7 +275,10 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm"."""
+    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm".
+
+    The unit is "" if the header has none.
+    """
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
