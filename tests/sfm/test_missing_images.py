@@ -24,7 +24,7 @@ from jcr.geometry import (
     transform,
 )
 from jcr.records import Intrinsics, Tracks
-from jcr.sfm.missing_images import with_missing_images
+from jcr.sfm.missing_images import nearer_to_robot, with_missing_images
 from jcr.sfm.model import (
     adjust_robustly,
     colmap_camera,
@@ -235,3 +235,9 @@ def test_what_shows_something_else_keeps_its_keypoint(greys: UInt8[ndarray, "m h
     kept = (found.x_px == start.x_px).all(1)
     assert kept[start.image == 0].mean() > 0.95
     assert kept[start.image == 2].all()
+
+
+def test_a_map_of_few_images_is_kept_since_no_transform_follows_from_them():
+    model, none = pycolmap.Reconstruction(), Matcher.__new__(Matcher)
+    poses = np.broadcast_to(np.eye(4), (3, 4, 4))
+    assert nearer_to_robot(Path("never-read"), model, poses, np.eye(4), none) is model

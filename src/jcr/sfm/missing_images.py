@@ -53,14 +53,17 @@ def nearer_to_robot(
 ) -> pycolmap.Reconstruction:
     """Return a map near the cameras that the gripper poses predict, if it agrees with them much better than `model`.
 
-    Otherwise `model` is returned. It is kept, too, if its rms distance from the gripper poses, over the images that fit
-    best, is below CONTRADICTED (m). Much better means an rms distance smaller by the factor BETTER. The mapper goes
-    astray if its first two images show one plane (two solutions), or if objects moved while the images were taken. `x`
-    is a rough estimate of gripper_from_camera; matches that contradict the predicted cameras are left out.
+    Otherwise `model` is returned. It is kept, too, if it has fewer than LEAST_MAPPED images, or if its rms distance from
+    the gripper poses, over the images that fit best, is below CONTRADICTED (m). Much better means an rms distance
+    smaller by the factor BETTER. The mapper goes astray if its first two images show one plane (two
+    solutions), or if objects moved while the images were taken. `x` is a rough estimate of gripper_from_camera; matches
+    that contradict the predicted cameras are left out.
     """
     rows = rows_of(model)
+    if len(rows) < LEAST_MAPPED:
+        return model
     error = least_trimmed(base_from_gripper[rows], poses_of(model, rows))[1]
-    if len(rows) < LEAST_MAPPED or error < CONTRADICTED:
+    if error < CONTRADICTED:
         return model
     predicted = dict(enumerate(base_from_gripper @ x))
     nearer = model_near_cameras(database, model.camera(1), predicted, matcher.known)
