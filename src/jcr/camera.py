@@ -69,7 +69,10 @@ def without_distortion(camera: Intrinsics) -> Intrinsics:
 
 
 def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
-    """Return the pixels (...,2) of points (...,3) in front of the camera; other points give meaningless pixels."""
+    """Return the pixels (x, y) (...,2) of points (...,3) in the camera frame; points with z ≤ 0 give meaningless pixels.
+
+    Pixel (0, 0) is the centre of the top-left pixel, here and in all functions of this module.
+    """
     x, y, z = x_in_camera[..., 0], x_in_camera[..., 1], x_in_camera[..., 2]
     if is_distorted(camera):
         x, y = _distorted(camera, x / z, y / z)
@@ -80,7 +83,8 @@ def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Floa
 def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
     """Return the rays (...,3) with z = 1 in the camera frame of pixels (...,2), by Newton's method.
 
-    They are exact for pixels nearer to the principal point than `fold_distance_px`.
+    They are exact for pixels nearer to the principal point than `fold_distance_px`, or for all pixels of the image if
+    it is None. Rays of other pixels are not valid.
     """
     target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if camera.model == "fisheye":
@@ -97,7 +101,10 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
 
 
 def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2 3"]:
-    """Return the derivatives (...,2,3) of the pixel of `project` by the coordinates of the point in the camera frame."""
+    """Return the derivatives (...,2,3) of the pixel of `project` by the coordinates of the point in the camera frame.
+
+    The rows are pixel x and y, the columns x, y, z of the point, which must be in front of the camera (z > 0).
+    """
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
     x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
@@ -111,7 +118,10 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
 def by_parameters(
     camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]
 ) -> Float[ndarray, "*batch 2 p"]:
-    """Return the derivatives (...,2,p) of the pixel of `project` by the p numbers of `parameters(camera)`."""
+    """Return the derivatives (...,2,p) of the pixel of `project` by the p numbers of `parameters(camera)`.
+
+    The rows are pixel x and y, the columns fx, fy, cx, cy and the distortion coefficients. Points have z > 0.
+    """
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
     r2, xy, none = x * x + y * y, 2 * x * y, np.zeros_like(x)
     out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
@@ -156,7 +166,10 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 def _slopes(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y."""
+    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y.
+
+    `x` and `y` are the undistorted coordinates of rays (x, y, 1).
+    """
     r2 = x * x + y * y
     radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
@@ -195,7 +208,8 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
     """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
 
-    The unknown of Newton's method is the angle between ray and optical axis.
+    The unknown of Newton's method is the angle between ray and optical axis. Coordinates whose angle exceeds 84° get a
+    ray at 84°.
     """
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
@@ -256,13 +270,16 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
 
 
 def guessed_intrinsics(size: tuple[int, int], focal: float = USUAL_FOCAL) -> Intrinsics:
-    """Return a pinhole with square pixels for images of `size` (width, height); `focal` is relative to the long side."""
+    """Return a pinhole with square pixels for images of `size` (width, height); `focal` is relative to the long side.
+
+    The principal point is the image centre.
+    """
     (width, height), focal_px = size, focal * max(size)
     return Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def resized(camera: Intrinsics, width: int, height: int) -> Intrinsics:
-    """Return the camera with its image resized to `width` x `height` pixels."""
+    """Return the camera with its image resized to `width` x `height` pixels; its distortion does not change."""
     sx, sy = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -289,7 +306,7 @@ def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
     """Return the undistorted pinhole camera that sees the largest view whose pixels are all inside the camera's image.
 
     Its long side has `long_side_px` pixels. If the distortion folds over, the view is a rectangle of the image's shape
-    within the fold.
+    within 0.9 times `fold_distance_px`. The view extends at most 60° from the optical axis in x and in y.
     """
     corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     if (fold_px := fold_distance_px(camera)) is not None:
@@ -309,7 +326,7 @@ def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
 
 
 def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
-    """Return the ray with z = 1 of every pixel of an undistorted camera, in the camera frame."""
+    """Return the ray with z = 1 of the centre of every pixel of an undistorted camera, in the camera frame."""
     u, v = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
     return unproject(pinhole, np.stack([u, v], axis=-1).astype(np.float64))
 
@@ -319,7 +336,8 @@ def undistortion(
 ) -> Callable[[UInt8[ndarray, "h w 3"]], UInt8[ndarray, "h2 w2 3"]]:
     """Return a function that resamples images of a camera to those of an undistorted pinhole camera.
 
-    Its lookup table is computed once. Pixels are averaged over areas if the pinhole camera has fewer of them.
+    Both cameras have the same camera frame. The image is interpolated bilinearly, with border pixels repeated outside,
+    and averaged over areas if the pinhole camera has fewer pixels per angle. The lookup table is computed once.
     """
     factor = max(1, round(camera.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)

@@ -35,7 +35,7 @@ def inlined(function: Callable[..., Any]) -> Any:
 @compiled
 @no_type_check
 def random_state(seed):
-    """Return the initial state of the generator `uniform` for an integer seed, an array of one uint64.
+    """Return the initial state, an array of one uint64, of the generator `uniform` for an integer `seed`.
 
     The state does not depend on the thread or on the version of NumPy.
     """
@@ -45,7 +45,10 @@ def random_state(seed):
 @inlined
 @no_type_check
 def uniform(state):
-    """Return a random number in [0, 1) and update the array `state` (Marsaglia, "Xorshift RNGs", 2003)."""
+    """Return a uniform random number in [0, 1) and update `state` (Marsaglia, "Xorshift RNGs", 2003).
+
+    `state` is the array that `random_state` returned; each call changes it in place.
+    """
     x = state[0]
     x ^= x << np.uint64(13)
     x ^= x >> np.uint64(7)

@@ -29,7 +29,9 @@ class f:  # noqa: N801
 
     @staticmethod
     def logsf(x: Number, over: Number, under: Number) -> Any:
-        """Return log P(F > x); `over` and `under` are the degrees of freedom of numerator and denominator.
+        """Return the natural logarithm of P(F > x), the probability that an F-distributed number F exceeds `x`.
+
+        `over` and `under` are the degrees of freedom of numerator and denominator.
 
         If P underflows, the result is the leading term of the incomplete beta function (DLMF 8.17.7).
         """

@@ -17,7 +17,10 @@ def printable(text: str) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return "; did you mean …?" with the known word most similar to `word`; empty if none is similar."""
+    """Return "; did you mean …?" with the known word most similar to `word`; empty if none is similar.
+
+    Words are similar if their ratio of matching characters is 0.6 or more (difflib.get_close_matches).
+    """
     like = get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
@@ -58,7 +61,7 @@ class RejectedError(RuntimeError):
         self.despite_texture = despite_texture
 
     def with_more(self, *also: str) -> "RejectedError":
-        """Return the error with additional sentences appended to `also`."""
+        """Return a copy of the error with the sentences of the argument `also` appended to those of its attribute."""
         return RejectedError(
             self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
         )

@@ -53,7 +53,7 @@ def rotation_log(rotation: Rotations) -> Vectors:
 
 
 def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"] | np.floating:
-    """Return the angle of rotation in [0, π] rad, accurate near 0 and π too (unlike arccos of the trace)."""
+    """Return the angles (...) of rotations (...,3,3), 0 to π rad; accurate near 0 and π, unlike arccos of the trace."""
     return np.linalg.norm(rotation_log(rotation), axis=-1)
 
 
@@ -65,7 +65,11 @@ def skew(v: Vectors) -> Rotations:
 
 
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
-    """Return [I, -skew(v), v], derivatives of points v by translation (3), rotation about the origin (3), log scale."""
+    """Return [I, -skew(v), v] (...,3,7), the derivatives of points v (...,3) by a small similarity transform.
+
+    Columns: translation (3), rotation vector about the origin (3, rad), natural logarithm of the scale (1), in the
+    frame of v.
+    """
     identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
     return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
 
@@ -91,7 +95,10 @@ def inverse(a_from_b: Transforms) -> Transforms:
 def retract(
     a_from_b: Float[ndarray, "*#batch 4 4"], step: Float[ndarray, "*#batch 6"]
 ) -> Float[ndarray, "... 4 4"]:
-    """Return transforms (...,4,4) after steps (v, w) of shape (...,6): translation t + v, rotation exp(w) R."""
+    """Return transforms (...,4,4) after steps (v, w) of shape (...,6): translation t + v, rotation exp(w) R.
+
+    t and R are those of `a_from_b`; v is a translation (m) and w a rotation vector (rad), both in the axes of frame a.
+    """
     return transform(
         rotation_exp(step[..., 3:]) @ a_from_b[..., :3, :3], a_from_b[..., :3, 3] + step[..., :3]
     )
@@ -100,7 +107,10 @@ def retract(
 def step_between(
     a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
 ) -> Float[ndarray, "... 6"]:
-    """Return the steps (...,6) for which `retract(a_from_b, step)` is `target`; translation, then rotation vector."""
+    """Return the steps (...,6) for which `retract(a_from_b, step)` is `target`.
+
+    A step is a translation (m), then a rotation vector (rad), in the axes of frame a. `target` is an a_from_b, too.
+    """
     rotation = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(rotation)], axis=-1)
 
@@ -119,7 +129,8 @@ def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
 def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
     """Return the matrices (...,6,6) that turn steps (v, w) of a_from_b into twists (v + t × w, w) about the origin of a.
 
-    A twist (u, w) moves every point x by u + w × x. Bodies that move together have equal twists, unlike steps.
+    A twist (u, w) moves every point x in frame a by u + w × x; t is the translation of a_from_b. Bodies that move
+    together have equal twists, unlike steps.
     """
     out = np.zeros((*a_from_b.shape[:-2], 6, 6))
     out[..., range(6), range(6)] = 1.0
@@ -128,7 +139,10 @@ def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
 
 def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
-    """Return the matrices (...,6,6) that turn small steps (`retract`) of a_from_b into those of its inverse b_from_a."""
+    """Return the matrices (...,6,6) that turn small steps (`retract`) of a_from_b into those of its inverse b_from_a.
+
+    Steps of a_from_b are in the axes of frame a, those of b_from_a in the axes of frame b: translation, then rotation.
+    """
     rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     out = -step_axes(rotation_t)
     out[..., :3, 3:] = -rotation_t @ skew(a_from_b[..., :3, 3])
@@ -162,7 +176,7 @@ class Similarity:
     """Metres per unit of b."""
 
     def __call__(self, x_in_b: Vectors) -> Vectors:
-        """Return points (…,3) in a."""
+        """Return x_in_a (…,3) in metres, the transformed points `x_in_b` (…,3)."""
         return apply(self.rigid, self.scale * np.asarray(x_in_b, float))
 
 
@@ -206,7 +220,11 @@ def across_lines(direction: Vectors) -> Rotations:
 def nearest_to_lines(
     origin: Float[ndarray, "*#batch n 3"], direction: Float[ndarray, "*#batch n 3"]
 ) -> Float[ndarray, "... 3"]:
-    """Return the point (...,3) nearest to n lines, each given by a point `origin` on the line and a unit `direction`."""
+    """Return the point (...,3) with the least sum of squared distances to n lines.
+
+    A line is given by a point `origin` on the line and a unit vector `direction`. Among the points nearest to parallel
+    lines, the one closest to the coordinate origin is returned.
+    """
     across = across_lines(direction)
     normal = across.sum(-3) + PARALLEL * np.eye(3)
     return np.linalg.solve(normal, (across @ origin[..., None]).sum(-3))[..., 0]
@@ -218,7 +236,7 @@ def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
 
 
 def largest_motion(a_from_b: Float[ndarray, "n 4 4"]) -> tuple[float, float]:
-    """Return the longest translation (m) and the largest rotation (rad) between any two of the transforms."""
+    """Return the largest distance (m) between the origins of b, and the largest angle (rad), in any two transforms."""
     motion = inverse(a_from_b)[:, None] @ a_from_b[None]
     return float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()), float(
         np.max(rotation_angle(motion[..., :3, :3]))
@@ -228,7 +246,7 @@ def largest_motion(a_from_b: Float[ndarray, "n 4 4"]) -> tuple[float, float]:
 def rotation_between_deg(
     a: Float[ndarray, "*#batch 3 3"], b: Float[ndarray, "*#batch 3 3"]
 ) -> Float[ndarray, "..."] | np.floating:
-    """Return the angle in degrees between rotations a and b (...,3,3), which broadcast."""
+    """Return the angle (degrees, 0 to 180) of the rotation aᵀb between rotations a, b (...,3,3), which broadcast."""
     return np.degrees(rotation_angle(np.swapaxes(a, -1, -2) @ b))
 
 
@@ -240,9 +258,10 @@ def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
 
 
 def require_rigid(matrix: Transform, where: str) -> Transform:
-    """Return the matrix with its rotation made exact; raise InputError if it is too far from rigid.
+    """Return the matrix (4,4) with its rotation R made exact; raise InputError if it is no rigid transform.
 
-    `where` begins the message: the file and frame, or the argument, that the matrix came from.
+    An element of RᵀR may deviate from the identity by 1e-3 at most. `where` begins the message: the file and frame, or
+    the argument, that the matrix came from.
     """
     if not (np.abs(matrix) < HUGE).all():
         raise InputError(

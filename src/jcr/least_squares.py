@@ -56,9 +56,11 @@ def damped_gauss_newton(
 ) -> tuple[Unknowns, Any, bool]:
     """Minimise a cost from `start`; return the unknowns, their cost, and whether the iteration converged.
 
-    `step` returns the unknowns after a step, from the present ones, the result of `linearise` and the damping. The
-    iteration ends when a step changes the cost by less than `enough(cost)`. For an array of independent problems, costs
-    and dampings are arrays.
+    `linearise` returns the system of equations at the unknowns. `step` returns the unknowns after a step, from the
+    present ones, this system and the damping (Levenberg-Marquardt). `damping` is its initial value, which grows tenfold
+    after a step that increases the cost and shrinks tenfold after any other. The iteration converges when a step
+    changes the cost by less than `enough(cost)`; it ends after `iterations` steps at the latest. Costs and dampings are
+    arrays, one element per problem, if independent problems are solved together.
     """
     unknowns, least, settled = start, cost(start), False
     system: System | None = None
@@ -78,7 +80,10 @@ def damped_gauss_newton(
 
 
 def _where(better: Any, tried: Any, before: Any) -> Any:
-    """Return `tried` for the problems that are `better`, `before` for the others: arrays, or tuples of arrays."""
+    """Return `tried` for the problems that are `better`, `before` for the others: arrays, or tuples of arrays.
+
+    `better` has a truth value for each problem; the first axis of the arrays is the problem.
+    """
     if np.all(better):
         return tried
     if isinstance(tried, tuple):
@@ -96,9 +101,10 @@ def minimise(
 ) -> Minimum[Unknowns]:
     """Minimise ½ Σ ρ(|r|²) over k residuals r of m components each; ρ is the loss, applied to the squared length.
 
-    `linearised` returns residuals and their derivatives by a step of p numbers; `moved` returns the unknowns after a
-    step. The iteration ends when a step changes the cost by less than the share `tolerance`. Leading axes (b) are
-    independent problems.
+    `linearised` returns the residuals and their derivatives by a step of p numbers, at the unknowns; `moved` returns
+    the unknowns after a step. `loss` names ρ, as in scipy.optimize.least_squares. The iteration ends when a step
+    changes the cost by less than the share `tolerance`, or after `iterations` steps. Leading axes (b) are independent
+    problems.
     """
 
     def step(
@@ -128,7 +134,10 @@ def minimise(
 
 
 def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray, "*batch"]:
-    """Return the derivative of the loss by the squared length (`squared`) of a residual: its weight."""
+    """Return the weights ρ'(s) of residuals: derivatives of the loss ρ at their squared lengths s (`squared`).
+
+    The loss ρ(s) is s for "linear", 2(√(1 + s) − 1) for "soft_l1" and log(1 + s) for "cauchy".
+    """
     if loss == "linear":
         return np.ones_like(squared)
     return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)
@@ -147,7 +156,7 @@ def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
 def _equations(
     loss: Loss, residual: Float[ndarray, "*b k m"], jacobian: Float[ndarray, "*b k m p"]
 ) -> tuple[Float[ndarray, "*b p p"], Float[ndarray, "*b p"]]:
-    """Return JᵀWJ and JᵀWr of each problem b: J is the Jacobian, r the residuals, W their weights by the loss."""
+    """Return JᵀWJ and JᵀWr of each problem b: J is the Jacobian, r the residuals, W their weights (`loss_weight`)."""
     root = np.sqrt(loss_weight(loss, (residual**2).sum(-1)))[..., None]
     flat = (root[..., None] * jacobian).reshape(*residual.shape[:-2], -1, jacobian.shape[-1])
     transposed = np.swapaxes(flat, -1, -2)

@@ -12,11 +12,17 @@ Progress = Callable[[str, float], None]
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Do nothing: the callback of progress for a run without display."""
+    """Do nothing: the callback of progress for a run without display.
+
+    `stage` is the name of the stage, `fraction` its finished part, 0 to 1.
+    """
 
 
 def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:
-    """Yield the items one by one, and report the finished fraction of the stage before each item and at the end."""
+    """Yield the items one by one, and report the finished fraction of the stage before each item and at the end.
+
+    `progress` is called with the name `stage` and the fraction, 0 to 1.
+    """
     for k, item in enumerate(items):
         progress(stage, k / len(items))
         yield item

@@ -170,7 +170,7 @@ class RunResult:
 
     @cached_property
     def scene(self) -> "SceneMap | None":
-        """Map of the run; None for a run without a map."""
+        """Map of the run in the base frame; None for a run without a map."""
         return load_map(self.out) if (self.out / MAP).is_file() else None
 
     @cached_property
@@ -190,12 +190,12 @@ class RunResult:
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:
-        """Rows, in the capture, of the images that the reconstruction registered."""
+        """Indices in the capture, from 0, of the m images that the reconstruction registered."""
         return self.reconstruction.image_index
 
     @property
     def scale_std(self) -> float:
-        """Relative standard deviation of the scale; 0 for a failed calibration."""
+        """Standard deviation of the scale (metres per recon unit) divided by the scale; 0 for a failed calibration."""
         uncertainty = self.calibration.uncertainty
         return 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100
 

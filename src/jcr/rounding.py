@@ -7,7 +7,10 @@ MOST_DECIMALS = 9
 
 
 def decimals_of(std: float) -> int:
-    """Return the number of decimals for a value with this standard deviation; the last place is worth std/10 to std."""
+    """Return the number of decimals for a value with this standard deviation; the last place is worth std/10 to std.
+
+    There are at most nine decimals, nine for std 0, and none for a std that is negative, infinite or NaN.
+    """
     if not np.isfinite(std) or std <= 0:
         return MOST_DECIMALS if std == 0 else 0
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
@@ -20,7 +23,10 @@ def with_std(value: float, std: float) -> str:
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Return the number as text with `digits` significant digits and at most six decimals, without an exponent."""
+    """Return the number as text with `digits` significant digits and at most six decimals, without an exponent.
+
+    NaN and infinity give "unknown".
+    """
     if not np.isfinite(value):
         return "unknown"
     if abs(value) < 0.5e-6:

@@ -92,7 +92,10 @@ LONGEST_LINE = 2000
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line `arguments` and exit with its status, without Python's clean-up, which takes a second."""
+    """Run the command line `arguments` and exit with its status, without Python's clean-up, which takes a second.
+
+    `arguments` are the words after "jcr"; None: those of this process.
+    """
     # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -158,7 +161,11 @@ def command(name: str) -> Any:
 
 
 def dispatch(arguments: Sequence[str]) -> int:
-    """Run one command line and return its exit status; print an error as one line on stderr."""
+    """Run one command line and return its exit status; print an error as one line on stderr.
+
+    The status is 0 for success, 2 for invalid input or a lack of disk or memory, 3 for a rejected result, and 130 after
+    Ctrl-C.
+    """
     try:
         status = _dispatched(arguments)
         sys.stdout.flush()

@@ -142,8 +142,9 @@ def _conclude(
 ) -> int:
     """Print the result of a capture and the next command; return the exit status.
 
-    The status is 3 if the calibration is rejected or does not meet `--until-accurate`, else 0. `facts` is the content
-    of --json; `result` None: there is no calibration.
+    The status is 3 if the calibration is rejected or failed, or if `--until-accurate` is given and not met; else 0.
+    `facts` is the content of --json, to which the result is added. `result` None: there is no calibration.
+    `requirement_met`: the last live calibration met the requirement, and its leave-one-out error confirms this.
     """
     from jcr.calibration.words import summary
 

@@ -61,7 +61,7 @@ class CheckCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Check the capture, print the result and return the exit status."""
+        """Check the capture and print the result; return the exit status, 3 for the verdict "rejected", else 0."""
         from jcr.calibration.options import CalibrateOptions, check_options
         from jcr.pipeline.check import check_capture, read_and_compare
 
@@ -100,7 +100,10 @@ def read_arguments(read: ReadOptions) -> list[str]:
 def _check_lines(
     command: CheckCommand, capture: Capture | PosePairs, read: ReadOptions, found: "Examination"
 ) -> list[str]:
-    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, proposed poses."""
+    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, proposed poses.
+
+    `read` are the options with which the capture was read, repeated in the next command.
+    """
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
     from jcr.pipeline.check import QUICK
 
@@ -200,7 +203,10 @@ class CompareCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print the difference of two calibrations, whether the reported errors explain it, and its possible causes."""
+        """Print the difference of two calibrations, whether the reported errors explain it, and its possible causes.
+
+        Return the exit status: 3 if the reported errors do not explain it or a calibration is rejected, else 0.
+        """
         from jcr.calibration.difference import difference, read_hand_eye
 
         known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
@@ -263,7 +269,10 @@ class VerifyCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status."""
+        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status.
+
+        The status is 3 if a camera has moved, else 0.
+        """
         from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 
@@ -332,7 +341,10 @@ class TouchCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the verdict, then the error at each touched point and its expected standard deviation."""
+        """Print the verdict, then the error at each touched point and its expected standard deviation.
+
+        Return the exit status: 3 if the errors are larger than the reported uncertainty explains, else 0.
+        """
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)

@@ -47,5 +47,5 @@ def warn(text: str) -> None:
 
 
 def numbers(values: Iterable[float], digits: int, sign: str = "") -> str:
-    """Return numbers as one line of text with `digits` decimals; `sign` "+" writes the sign of positive ones, too."""
+    """Return numbers, separated by spaces, with `digits` decimals; `sign` "+" writes the sign of positive ones, too."""
     return " ".join(f"{value:{sign}.{digits}f}" for value in values)

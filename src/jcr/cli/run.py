@@ -51,7 +51,7 @@ class CalibrateCommand:
     depth: DepthOptions = field(default_factory=DepthOptions)
 
     def main(self) -> int:
-        """Calibrate, print the result and return the exit status."""
+        """Calibrate and print the result; return the exit status: 3 if calibration or a camera is rejected, else 0."""
         from jcr.calibration.stage import is_one
         from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
@@ -91,7 +91,7 @@ class RunCommand(CalibrateCommand):
     """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
 
     def main(self) -> int:
-        """Run every stage, print the result and return the exit status."""
+        """Run every stage, print the result and return the exit status: 3 if a calibration is rejected, else 0."""
         from jcr.capture.read import read_capture
         from jcr.result import CAPTURE
 
@@ -134,7 +134,7 @@ class BatchCommand:
     map: MapOptions = field(default_factory=MapOptions)
 
     def main(self) -> int:
-        """Run all captures and print a table; raise RejectedError if one failed or is rejected."""
+        """Run all captures and print a table; raise RejectedError if one failed or is rejected, else return 0."""
         from jcr.pipeline.batch import batch
 
         if len(self.paths) < 2:
@@ -181,7 +181,7 @@ class AddCameraCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Locate the camera and print its pose."""
+        """Locate the camera and print its pose in the base frame; return the exit status 0."""
         from jcr.cell.placement import in_words
         from jcr.pipeline.run import add_camera
 

@@ -103,18 +103,23 @@ class LiveCalibration:
     ) -> Progress:
         """Add an image (h,w,3) uint8 and its gripper pose (4,4) to the capture, and calibrate all images again.
 
-        `joints` are the joint angles of the arm (rad), `time_s` is the time of the image, `depth_mm` (h,w) is the depth
-        of its pixels (0: unknown), and `color` is the order of the channels ("bgr" for OpenCV). Grey images are valid.
-        Raises InputError for an array that is no image or no rigid pose, a pose that is not in metres, an image of
-        another size than the others, and an image that repeats another. The capture is then unchanged. Several threads
-        may call this at the same time; the calls are served one after the other.
+        Returns the new state of the calibration. `joints` are the joint angles of the arm (rad), `time_s` is the time
+        of the image (s). `depth_mm` (h,w) is the depth of its pixels along the optical axis (0: unknown). `color` is
+        the order of the channels ("bgr" for OpenCV). Grey images are valid. Raises InputError for an array that is no
+        image or no rigid pose, a pose that is not in metres, an image of another size than the others, and an image
+        that repeats another. The capture is then unchanged. Several threads may call this at the same time; the calls
+        are served one after the other.
         """
         with self._lock:
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
     def remove(self, index: int) -> Progress:
-        """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image."""
+        """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image.
+
+        Returns the new state of the calibration. A negative `index` counts from the end; InputError if there is no such
+        image.
+        """
         with self._lock:
             names = self.live.names
             if not -len(names) <= index < len(names):
@@ -123,7 +128,10 @@ class LiveCalibration:
             return self.update()
 
     def undo(self) -> Progress:
-        """Undo the last addition or removal of an image since this object was made, and calibrate again."""
+        """Undo the last addition or removal of an image since this object was made, and calibrate again.
+
+        Returns the new state of the calibration, which is the same if there is nothing to undo.
+        """
         with self._lock:
             self.live.undo()
             return self.update()
@@ -164,7 +172,10 @@ class LiveCalibration:
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with a new proposed pose, distant from `base_from_gripper`, where no image could be kept."""
+        """Return the state with another proposed pose, because no image could be kept at `base_from_gripper` (m).
+
+        The camera is more than 0.06 m from where it was at that pose and at the poses of earlier calls, if possible.
+        """
         with self._lock:
             self._refused.append(base_from_gripper)
             self.progress = replace(self.progress, **self._propose())
@@ -177,7 +188,7 @@ class LiveCalibration:
             self._opened.close()
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
-        """Return the state of the calibration; without a result if fewer than three images are registered.
+        """Return the state of the calibration; without a calibration if fewer than three images are registered.
 
         `capture` has all images (None: there are none); `added` is the name of the image added last, None if none was.
         """
@@ -231,8 +242,8 @@ class LiveCalibration:
 def _longest(tracks: Tracks, most: int) -> Tracks:
     """Return the tracks of board points and of the points that the most images observe, up to `most` observations.
 
-    Among points with equally many observations, the fractional part of a pixel coordinate decides: this is as good as a
-    random choice, and does not depend on the order of the images.
+    All observations of a chosen point are kept. Among points with equally many, the one whose pixels have the smallest
+    fractional part of x is first. This is as good as a random choice, and independent of the image order.
     """
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     fraction = np.ones(len(count))

@@ -273,7 +273,8 @@ def _realsense_reader(
 ) -> Callable[[], Frame | None]:
     """Return a function that reads the next frame, with depth if the camera measures it, and returns None at the end.
 
-    `rs` is the module pyrealsense2; `pipeline` and `profile` are its objects for the opened camera.
+    `rs` is the module pyrealsense2; `pipeline` and `profile` are its objects for the opened camera. `is_file`: the
+    camera is a recording, whose time stamps are used.
     """
     aligned, has_depth = rs.align(rs.stream.color), False
     with suppress(RuntimeError):
@@ -307,7 +308,8 @@ def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None
 
     OpenCV's coefficients k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for
     a grid of pixels, because its distortion models differ ("Projection in Intel RealSense SDK 2.0"). None: the fit
-    deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its intrinsics of the camera.
+    deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its object rs.intrinsics of the colour
+    camera.
     """
     intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):
@@ -348,22 +350,30 @@ class ImageSummary:
 
     @staticmethod
     def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":
-        """Return the reduced grey levels and the sharpness of an RGB image."""
+        """Return the summary of an RGB image: grey levels at low resolution, and sharpness.
+
+        The grey levels are those of the image reduced to a width of 160 px, minus their mean. The sharpness is the
+        variance of the Laplacian of the full image.
+        """
         size = GRID_PX, max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images are the same view: equal size, and grey levels that differ by noise only."""
+        """Test whether two images are the same view: equal size, and grey levels that differ by noise only.
+
+        The mean absolute difference of the reduced images must be below 2.5 of 255 grey levels.
+        """
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 
 def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patience_s: float) -> Frame | str:
     """Return the first frame at rest that can be kept; after `patience_s` seconds, the reason why none can be kept.
 
-    A frame is at rest if it shows the same as a frame 0.2 s earlier. `kept` are the images taken at other gripper
-    poses, from which the frame must differ. Raises StopIteration at the end of a video file.
+    A frame is at rest if it shows the same as a frame at least 0.2 s earlier (`is_like`). It can be kept if it is also
+    well exposed, not blurred, and different from the images `kept`, which were taken at other gripper poses. Raises
+    StopIteration at the end of a video file.
     """
     usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
     earlier = next(frames)

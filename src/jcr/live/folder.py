@@ -81,7 +81,7 @@ class LiveFolder:
         return len(self._earlier) > 0
 
     def summary(self, name: str) -> ImageSummary:
-        """Return grey levels and sharpness of an image of the folder, computed once."""
+        """Return the summary (grey levels, sharpness) of the image of this name in the folder, computed once."""
         if name not in self._summaries:
             self._summaries[name] = ImageSummary.of(read_image(self.folder / name))
         return self._summaries[name]
@@ -161,7 +161,7 @@ class LiveFolder:
     def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
         """Raise InputError if the image `new` shows the same view as an image of the folder.
 
-        `base_from_gripper` is the pose of the new image, `number` its name in the message.
+        `base_from_gripper` (4,4) is the gripper pose (m) of the new image, `number` its name in the message.
         """
         for one in self.images:
             if not new.is_like(self.summary(one.image)):
@@ -210,7 +210,8 @@ class LiveFolder:
 def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
     """Return an image in RGB, (h,w,3) uint8; grey images (h,w) or (h,w,1) are converted.
 
-    Raises InputError for any other array; its message starts with `number`, the image's name for the user.
+    `color` is the order of the channels, "rgb" or "bgr". Raises InputError for any other array or a path; its message
+    starts with `number`, the image's name for the user.
     """
     if isinstance(image, str | Path):
         raise InputError(

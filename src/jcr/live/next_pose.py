@@ -45,8 +45,9 @@ def propose(
 
     `registered` are the indices of the images with a camera pose. The expected errors of robot and images are those of
     `case`, the last calibration if accepted, else typical ones; `hand_eye` may be a rejected calibration. The pose is
-    within the joint limits of `arm` and in the `box` (lower, upper corner; m, base frame), and distant from the gripper
-    poses `refused`, at which no image could be kept. The result is empty for fewer than two images.
+    within the joint limits of `arm` and in the `box` (lower, upper corner; m, base frame). If possible, its camera is
+    more than 0.06 m from the cameras at the gripper poses `refused`, at which no image could be kept. The result is
+    empty for fewer than two images.
     """
     if len(capture) < 2:
         return {}
@@ -109,7 +110,7 @@ def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibra
 
 
 def _least_rotation(added: Poses, known: Float[ndarray, "n 4 4"]) -> Float[ndarray, " k"]:
-    """Return for each of k poses `added` the angle (rad) between its rotation and the most similar one in `known`."""
+    """Return the smallest rotation angle (rad) between each pose in `added` (k,4,4) and the n poses in `known`."""
     relative = np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3]
     return np.asarray(rotation_angle(relative)).min(1)
 
@@ -122,8 +123,9 @@ def joints_at(
 ) -> Float[ndarray, " dof"] | None:
     """Return joint angles (rad) within the limits of `arm` that move the gripper to the pose `goal`; None if impossible.
 
-    `base_from_gripper` and `joints` (rad) are those of the n images; `joints` None: not recorded. Recorded joints
-    determine the pose of the tool on the flange, and the result keeps the arm's configuration (elbow up or down, …).
+    `goal` is a base_from_gripper. `base_from_gripper` and `joints` (rad) are those of the n images; `joints` None: not
+    recorded. The last recorded joints determine the pose of the tool on the flange, and the result keeps their
+    configuration (elbow up or down, …).
     """
     if joints is not None:
         now = joints[-1:]

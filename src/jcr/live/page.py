@@ -86,7 +86,10 @@ def _is_proposed(state: SessionState) -> bool:
 
 
 def _cards(state: SessionState) -> list[dict[str, Any]]:
-    """Return a card for each image: its number in commands, file name, the finding about it, and registration state."""
+    """Return a card for each image: its number in commands, file name, the finding about it, and registration state.
+
+    Keys: "number" (from 1), "name", "fault" (empty without one) and "state" ("registered", "not registered" or "new").
+    """
     progress, against = state.progress, dict[str, str]()
     for one in progress.findings[::-1]:
         if len(one.images) == 1 and one.severity != "informs":
@@ -133,7 +136,8 @@ def verdict_lines(state: SessionState) -> list[str]:
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     """Return tiles of reached and required accuracy, number of registered images, and leave-one-out error.
 
-    The accuracy is that of the final calibration if there is one.
+    The accuracy is that of the final calibration if there is one. `required` are bounds (mm, degrees) on 95 % of the
+    errors of a point at the working distance. There are no tiles without images.
     """
     if not state.images:
         return []
@@ -151,7 +155,10 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
-    """Return the data of the 3D view: points, images, next pose, and, after a calibration, cameras with their poses."""
+    """Return the data of the 3D view (`scene_data`) in the base frame: points, gripper poses, and the next pose.
+
+    After a calibration, the data also contain the camera poses of the registered images.
+    """
     progress, found = state.progress, state.progress.hand_eye
     x = np.eye(4) if found is None else found.gripper_from_camera
     views = []
@@ -172,12 +179,12 @@ def _scene(state: SessionState) -> dict[str, Any]:
 
 @lru_cache(maxsize=128)
 def image_card(file: Path) -> bytes:
-    """Return an image file as a JPEG that is CARD_PX wide."""
+    """Return an image file as the bytes of a JPEG that is 330 px (CARD_PX) wide."""
     return _jpeg(_small(read_image(file), CARD_PX))
 
 
 def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
-    """Return the image as a JPEG, NOW_PX wide with a ring at each SIFT feature, and a sentence on their number."""
+    """Return an RGB image as a JPEG, 640 px wide with a ring at each SIFT feature, and a sentence on their number."""
     small = _small(image, NOW_PX)
     found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
     for feature in found:
@@ -188,7 +195,7 @@ def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
 
 
 def _small(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
-    """Return a copy of an image that is scaled to a width (px)."""
+    """Return a copy of an image that is scaled to a `width` (px) with its aspect ratio, averaged over areas."""
     size = width, max(1, round(width * image.shape[0] / image.shape[1]))
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 

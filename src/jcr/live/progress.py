@@ -57,13 +57,16 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors; None if the calibration has no requirement."""
+        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors of a point at the working distance.
+
+        None without a calibration, or if the calibration has no requirement.
+        """
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
     @property
     def leave_one_out(self) -> LeaveOneOut | None:
-        """Leave-one-out error of the calibration; None with fewer than CONFIRMING_IMAGES used images."""
+        """Leave-one-out error of the calibration; None with fewer than eight used images."""
         found = self.hand_eye
         if found is None or found.inliers.sum() < CONFIRMING_IMAGES:
             return None
@@ -125,7 +128,7 @@ def faults(state: Progress) -> list[Finding]:
 
 
 def finding_lines(state: Progress) -> list[str]:
-    """Return each finding that rejects or warns as a sentence, with the commands that retake or remove its image.
+    """Return each finding of `faults` as a sentence; one about a single image has the commands to retake or remove it.
 
     Images are numbered from 1 in the commands.
     """
@@ -137,7 +140,10 @@ def finding_lines(state: Progress) -> list[str]:
 
 
 def progress_lines(state: Progress, notation: Notation) -> list[str]:
-    """Return the state as lines of the terminal: accuracy, faults, and the next pose in this notation."""
+    """Return the state as lines of the terminal: accuracy, faults, and the next pose in this notation.
+
+    With one image at most, the only line is advice; if the requirement is met, a line says so instead of the next pose.
+    """
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
     below = finding_lines(state)
@@ -155,8 +161,9 @@ def progress_lines(state: Progress, notation: Notation) -> list[str]:
 def next_lines(state: Progress, notation: Notation) -> list[str]:
     """Return lines of text on the next pose: what it improves, the gripper pose in this notation, and joint angles.
 
-    The first line has the distance from the closest image's pose, and the expected accuracy. For the convention of UR,
-    there is also a line in URScript. A line is added if the arm of `notation` cannot reach the pose.
+    The state must have a next pose. The first line has the translation (mm) and rotation (degrees) from the closest
+    image's pose, and the expected accuracy. For the convention of UR, there is also a line in URScript. A line is added
+    if the arm of `notation` cannot reach the pose.
     """
 
     def joined(numbers: Float[ndarray, " k"], digits: int) -> str:
@@ -194,7 +201,7 @@ def next_lines(state: Progress, notation: Notation) -> list[str]:
 
 
 def accuracy_line(state: Progress) -> str:
-    """Return a line with the number of registered images and the reached and required accuracy."""
+    """Return a line with the number of registered images and the reached and required accuracy (95 %; mm, degrees)."""
     images = f"{len(state.registered)} of {len(state.images)} images registered"
     if state.reached is None or state.hand_eye is None:
         return f"{images}: no calibration yet"

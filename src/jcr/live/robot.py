@@ -69,7 +69,8 @@ States = Callable[[], Iterator[RobotState]]
 def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[float, float]) -> RobotState:
     """Wait until the arm rests at a pose that differs from `last` by more than `limit` (m, rad); return its state.
 
-    `states` connects to the arm. `last` is a gripper pose (4,4); None: any pose at rest is returned.
+    The arm is at rest if it moves less than 0.2 mm and 0.03° in 0.5 s. `states` connects to the arm. `last` is a
+    gripper pose (4,4); None: any pose at rest is returned. Raises InputError if the states end before.
     """
     recent: deque[RobotState] = deque()
     for state in states():
@@ -87,7 +88,7 @@ def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[f
 
 
 def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[float, float]) -> bool:
-    """Test whether two gripper poses (4,4) differ by more than `limit` in translation (m) or in rotation (rad)."""
+    """Test whether two gripper poses a, b (4,4) differ by more than `limit` in translation (m) or in rotation (rad)."""
     motion = inverse(a) @ b
     return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
 
@@ -98,6 +99,7 @@ def pose_of_numbers(
     """Return base_from_gripper (4,4) from the numbers of one pose; raise InputError, begun with `where`, for others.
 
     `convention` "auto": 6 numbers are x y z and a rotation vector, 7 are x y z qx qy qz qw, 16 are a matrix by rows.
+    `units` "auto": the units of the convention, which are m and rad for these three.
     """
     named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
     if named is None or len(numbers) != len(CONVENTIONS[named].columns):
@@ -237,7 +239,8 @@ HELP = "type take, retake [NUMBER], remove [NUMBER], undo or finish, and Enter; 
 def without_commands(lines: Iterable[str], press: Callable[[Action, int | None], None]) -> Iterator[str]:
     """Yield the typed lines that are no commands; for each command, call `press` with action and image number.
 
-    The number is None if the command has none. The first three letters of an action are enough.
+    Commands are take, retake, remove, undo and finish. The number, counted from 1, is None if the command has none. The
+    first three letters of an action are enough.
     """
     for line in lines:
         first, *rest = line.split() or [""]

@@ -127,7 +127,10 @@ class LiveServer(ThreadingHTTPServer):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Wait, for LAST_S at most, until an open page has the last state; then stop the server."""
+        """Wait, for LAST_S at most, until an open page has the last state; then stop the server.
+
+        `error` is the exception of the `with` block, which is raised again.
+        """
         end = time.monotonic() + LAST_S
         while time.monotonic() < end and (
             time.monotonic() - self.page_s < OPEN_S and self.page_version < self.session.state.version
@@ -236,7 +239,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _is_key(self, given: str) -> bool:
-        """Test whether a key is that of the session, in constant time."""
+        """Test whether a key is that of the session, in a time that does not depend on the key."""
         return hmac.compare_digest(given.encode(), self.server.key.encode())
 
     def _body(self, most: int) -> bytes | None:

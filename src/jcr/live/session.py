@@ -172,8 +172,8 @@ class LiveSession:
     def take(self, state: RobotState, waits: bool = False) -> Answer:
         """Take an image while the arm rests at `state`, start to calibrate all images, and return an answer for JSON.
 
-        The answer has "accepted", and "image" (name) or "reason". `waits`: wait for the calibration, and add its state
-        and the next pose to the answer.
+        `state` is written with the image: gripper pose and joint angles. The answer has "accepted", and "image" (name)
+        or "reason". `waits`: wait for the calibration, and add its state and the next pose to the answer.
         """
         with self._lock:
             if self.state.is_over:
@@ -282,6 +282,7 @@ class LiveSession:
     def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
         """Calibrate the images if they changed; propose a pose distant from the gripper pose `refused`, unless None.
 
+        Distant: its camera is more than 0.06 m from where the camera was, if possible.
         With --until-accurate, end the capture if the calibration of all images meets the requirement.
         """
         try:

@@ -158,8 +158,9 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
 def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
     """Return the rows with the camera's motion between episodes, and a reason where the motion is significant.
 
-    `moved_mm` and `moved_deg` are relative to one episode of the same capture, whose median χ² difference to all its
-    episodes is the smallest.
+    `moved_mm` and `moved_deg` are relative to the accepted episode of the same capture with the smallest median χ² to
+    all its accepted episodes. χ² is the squared difference of two hand-eye transforms, weighted by its inverse
+    covariance. Significant is a p-value below 0.001. Captures with fewer than three accepted episodes are unchanged.
     """
     found = list(rows)
     for capture in {row.capture for row in rows}:

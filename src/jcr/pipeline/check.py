@@ -164,9 +164,10 @@ def check_capture(
 def _look(
     capture: Capture, views: tuple[Finding, ...]
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, " n"], list[str]]:
-    """Return the rows of well exposed sharp images, the sharpness of all n images (median 1), remarks on exposure.
+    """Return the indices of well exposed sharp images, the sharpness of all n images, and remarks on their exposure.
 
-    `views` are the findings of `view_findings`, which name the blurred images.
+    The sharpness is the variance of the Laplacian, divided by the median of all images. `views` are the findings of
+    `view_findings`, which name the blurred images.
     """
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
@@ -188,9 +189,9 @@ def _compare(
 ) -> _Comparison:
     """Calibrate from gripper and camera poses, and return whether and how well both agree.
 
-    The camera poses of PosePairs are given, others are reconstructed from features: first those of QUICK images of
-    reduced size; then those of all images if `thorough` is set, or if the first comparison fails, is rejected, or does
-    not use all QUICK images.
+    `robot` is the prior of the robot errors of all images, `seed` that of the reconstruction. The camera poses of
+    PosePairs are given, others are reconstructed from features: first those of QUICK images of reduced size; then those
+    of all images if `thorough` is set, or if the first comparison fails, is rejected, or does not use all QUICK images.
     """
     if isinstance(capture, PosePairs):
         hand_eye, assumptions = calibrate_pose_pairs(capture, options), None
@@ -237,8 +238,10 @@ def read_and_compare(
     """Read a capture; if its file does not determine the pose convention, select the one that fits the images best.
 
     Return the capture, with a note on the selected convention, and the options with which it was read. The fit is the
-    median residual between gripper poses and camera poses from a few images of reduced size. Raises InputError if these
-    images cannot be reconstructed, or the best convention does not fit CLEARER times better than the second.
+    median residual between gripper poses and camera poses from a few images of reduced size. Its unit is m: translation
+    plus 0.3 m times rotation (rad). `into` is the new folder to which the images of a recording are extracted. Raises
+    InputError if the images cannot be reconstructed, or the best convention does not fit three times better than the
+    second.
     """
     options = options or ReadOptions()
     with suppress(OpenConventionError):
@@ -279,5 +282,5 @@ def read_and_compare(
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
-    """Return up to QUICK rows, spread evenly over `count` images."""
+    """Return the indices, from 0, of up to eight (QUICK) images, spread evenly over `count` images in their order."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)

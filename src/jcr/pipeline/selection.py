@@ -85,7 +85,8 @@ class Trial:
     def rank(self) -> tuple[bool, bool, bool, float]:
         """Sort key, largest for the best trial: (calibrated, accepted, explained, minus leave-one-out error in m).
 
-        A rejection is explained if its finding holds for every reconstruction of the same images.
+        A rejection is explained if its finding holds for every reconstruction of the same images. The error is
+        √(translation² + (0.3 m · rotation)²), infinite if there is none.
         """
         if self.hand_eye is None:
             return False, False, False, 0.0
@@ -106,7 +107,7 @@ class Trial:
     def in_words(self, is_kept: bool = False) -> str:
         """Return the back end, its features and its leave-one-out error, and the reason why it failed or is rejected.
 
-        `is_kept`: the reason is left out.
+        `is_kept`: the calibration is the selected one, and the reason is left out.
         """
         name = " with ".join(filter(None, (self.account.backend, self.account.features)))
         if self.hand_eye is None:
@@ -117,7 +118,7 @@ class Trial:
         return name if is_kept else f"{name} is rejected ({self.hand_eye.doubt})"
 
     def is_textured(self, images: int) -> bool:
-        """Test whether COLMAP found at least TEXTURED SIFT features per image, so that a lack of texture is excluded.
+        """Test whether COLMAP found at least 50 SIFT features per image, so that a lack of texture is excluded.
 
         `images` is the number of images of the capture. Learned features do not count: they are found without texture.
         """
@@ -180,8 +181,8 @@ def _why_untried(
     `options` are those of the next back end, `images` is the number of images, and `of_images` returns the findings of
     the images alone. The reason is None if the back end is tried, or if there is nothing to report. No other back end
     is tried if the best trial is accepted, if its rejection does not depend on the back end, or if `of_images` reject.
-    Other features are not tried if SIFT registers nearly all images. A back end that does not test the camera's
-    intrinsics is not tried if SIFT finds enough features, because it could accept a wrong calibration.
+    Other features are not tried if SIFT registers 90 % or more of the images. A back end that does not test the camera's
+    intrinsics is not tried if SIFT finds enough features (`is_textured`), because it could accept a wrong calibration.
     """
     best = max(trials, key=lambda one: one.rank)
     if best.hand_eye is not None:

@@ -35,7 +35,7 @@ class TouchTest:
 
     @property
     def rms(self) -> float:
-        """Root mean square length (m) of the errors."""
+        """Root mean square length (m) of the errors: tip minus surface point, over all touched points."""
         return float(np.sqrt((self.error**2).sum(1).mean()))
 
     @property
@@ -45,7 +45,10 @@ class TouchTest:
 
     @property
     def common(self) -> Float[ndarray, "3"]:
-        """Mean error (m, base axes); a wrong position of the tip in the gripper frame would cause one."""
+        """Mean over the points of tip minus surface point (m, base axes).
+
+        A wrong position of the tip in the gripper frame would cause one.
+        """
         return self.error.mean(0)
 
 
@@ -53,9 +56,10 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     """Compare points that the robot's tip touched with the surface points at their pixels in images of a run.
 
     `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
-    run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The expected errors include
-    the covariance of the calibration, common to all points, and the robot's errors at each touch. Raises InputError for
-    fewer than three points, an image that is not in the run, or a pixel without a surface.
+    run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The surface point is that
+    of the nearest pixel of the image's pointmap. The expected errors include the covariance of the calibration, common
+    to all points, and the robot's errors at each touch. Raises InputError for fewer than three points, an image that is
+    not in the run, or a pixel without a surface.
     """
     points = Path(points)
     calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
@@ -79,7 +83,10 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
-    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m."""
+    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m.
+
+    Raises InputError for a missing column or fewer than three points.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()

@@ -56,17 +56,20 @@ class Verification(Drift):
 
     @property
     def std(self) -> Float[ndarray, "6"]:
-        """Standard deviations of `offset`: three translations (m), three rotations (rad)."""
+        """Standard deviations of `offset`: translation x, y, z (m), rotation vector x, y, z (rad).
+
+        The axes are those of the gripper, or of the base for a fixed camera.
+        """
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def drift_m(self) -> float:
-        """Length (m) of the camera's translation since the calibration."""
+        """Length (m) of the camera's translation relative to the gripper, or base if fixed, since the calibration."""
         return float(np.linalg.norm(self.offset[:3]))
 
     @property
     def drift_rad(self) -> float:
-        """Angle (rad) of the camera's rotation since the calibration."""
+        """Angle (rad) of the camera's rotation relative to the gripper, or base if fixed, since the calibration."""
         return float(np.linalg.norm(self.offset[3:]))
 
     @property
@@ -158,8 +161,9 @@ def _new_images(
 ) -> tuple[list[UInt8[ndarray, "h w 3"]], list[UInt8[ndarray, "h w 3"]]]:
     """Return the images of a camera's calibration, and its new images.
 
-    `then` and `now` are the camera in the captures `capture` and `new`. Raises InputError if the new images have another
-    size, or if one of them was used for the calibration, which it would confirm.
+    `then` is the camera in the capture `capture` of the calibration, `now` the same one in the capture `new`. Raises
+    InputError if the new images have another size, or if one of them was used for the calibration, which it would
+    confirm.
     """
     if now.image_size != then.image_size:
         (width, height), (wide, high) = now.image_size, then.image_size
@@ -189,8 +193,9 @@ def _in_old_scene(
 ) -> Verification:
     """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 
-    `located` maps rows of `new` to these poses; `notes` are warnings about new images without one. Gripper and camera
-    poses of the calibration are fitted again, because calibration.json lacks the joint covariance that the test needs.
+    `located` maps indices of images in `new` to these poses (recon frame); `notes` are warnings about new images
+    without one. Gripper and camera poses of the calibration are fitted again, because calibration.json lacks the joint
+    covariance that the test needs.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
     calibrate_options, rows = run.state.options.calibrate, list(located)
@@ -271,7 +276,9 @@ def _fixed_cameras(
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
     """Return the drift of a camera from its old to its new pose, with a χ² test of the step between both.
 
-    `offset` is that step (translation in m, rotation vector in rad), `covariance` its covariance.
+    `offset` is that step (`step_between`; translation in m, then rotation vector in rad), `covariance` its covariance.
+    Its axes are those of the gripper, or of the base for a fixed camera. `options.alpha` is the probability of a false
+    alarm.
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, options.alpha)
@@ -284,7 +291,9 @@ def _judged(
 ) -> Verification:
     """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
 
-    `images` are the new images that were used, `how` is the method in words.
+    Significant is a p-value below `options.alpha`. `options.tolerance` (mm, degrees) is exceeded if translation or
+    rotation is larger. `notes` are warnings to include, `images` are the new images that were used, `how` is the method
+    in words.
     """
     notes = list(notes)
     if found.is_noisier:

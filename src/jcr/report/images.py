@@ -71,8 +71,9 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:
     """Return for GRID x GRID points of a displayed image their pixels in the image file: {"x": rows, "y": rows}.
 
-    The displayed image has `size` (width, height) and no distortion; the file has the distortion of `intrinsics`. The
-    page uses the grid to show the pixel under the pointer.
+    The points form a regular 17 x 17 grid over the whole displayed image, row by row from its top-left corner. The
+    displayed image has `size` (width, height) and no distortion; the file has the distortion of `intrinsics` (None:
+    none). The page uses the grid to show the pixel under the pointer.
     """
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
     shown = np.stack(np.meshgrid(u, v), axis=-1)
@@ -86,7 +87,7 @@ def _reprojections(result: RunResult) -> dict[int, str]:
     """Return the reprojection errors of each registered image as an SVG path, by the index of the image in the capture.
 
     Each path has lines for up to 120 features, from the feature towards the projection of its 3D point, 20 times as
-    long as the error (px).
+    long as the error (px). Its coordinates are pixels of the undistorted image from the top-left corner.
     """
     found, tracks = result.reconstruction, result.reconstruction.tracks
     straight = without_distortion(result.intrinsics or found.intrinsics)
@@ -106,7 +107,10 @@ def _reprojections(result: RunResult) -> dict[int, str]:
 
 
 def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
-    """Return every image as data URL of a small undistorted JPEG; its width decreases with the number of images."""
+    """Return every image as data URL of a small undistorted JPEG; its width decreases with the number of images.
+
+    `intrinsics` are those of the image files; None: the distortion is unknown and not removed.
+    """
     shape = capture.image_size[1] / capture.image_size[0]
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)

@@ -64,7 +64,9 @@ def motion_section(result: RunResult) -> Content:
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
     """Yield a bar (CSS class, name, length in percent, number) for each direction of the seven parameters.
 
-    The parameters are gripper_from_camera and scale. The direction that the motions determine least comes first.
+    The parameters are translation, rotation and scale of the hand-eye transform. The direction that the motions
+    determine least comes first. The name lists the direction's components above 0.4, the number is its excitation, and
+    an excitation of 0.4 or more has length 100.
     """
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
@@ -76,7 +78,8 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
     """Yield a bar for each axis x, y, z, as wide as ± its standard deviation in `std` relative to the largest of them.
 
-    `name` and `unit` are written beside the bars.
+    A bar is (text beside it, left end and width in percent of the chart, number as text). The text is `name` with the
+    axis; `unit` is that of `std`.
     """
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
@@ -99,7 +102,11 @@ def _next_poses(result: RunResult) -> dict[str, Any] | None:
 
 
 def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:
-    """Return a proposed gripper pose in a convention, with motion and expected uncertainty as cells of a table."""
+    """Return a proposed gripper pose in a convention, with motion and expected uncertainty as cells of a table.
+
+    The motion is that from the image with the nearest gripper pose; the uncertainty is that of a calibration with the
+    pose.
+    """
     numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
     mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())
     percent = significant(100 * float(pose.expected_std[6]))

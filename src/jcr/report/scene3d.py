@@ -137,7 +137,10 @@ def scene_view(
     base_from_gripper: Float[ndarray, "4 4"],
     base_from_camera: Float[ndarray, "4 4"] | None,
 ) -> dict[str, Any]:
-    """Return the JSON entry of an image in the 3D view; base_from_camera is None for an image without a camera pose."""
+    """Return the JSON entry of an image in the 3D view; base_from_camera is None for an image without a camera pose.
+
+    `caption` is the text shown with its `name`; `used`: the calibration uses the image. Poses are in metres.
+    """
     camera = None if base_from_camera is None else _rows(base_from_camera)
     return {
         "name": name,
@@ -149,7 +152,7 @@ def scene_view(
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
-    """Return the upper three rows of a transform (m), rounded to six decimals."""
+    """Return the upper three rows [R | t] of a transform as lists, t in metres, rounded to six decimals."""
     return a_from_b[:3].round(6).tolist()
 
 

@@ -90,7 +90,9 @@ def sketch(
 ) -> dict[str, Any]:
     """Return a sketch of the camera, as a pyramid with axes, in the gripper frame (z drawn downwards) or the base frame.
 
-    "shapes" are tag, attributes and text of SVG elements; "label" is the description for screen readers.
+    The frame is that of `mount`. `intrinsics` give the shape of the pyramid; None: those of a usual camera. "shapes"
+    are tag, attributes and text of SVG elements. "width" and "height" are the size (px), "label" is the text for screen
+    readers.
     """
     down = mount == "gripper"
     away = float(np.linalg.norm(parent_from_camera[:3, 3]))
@@ -139,7 +141,8 @@ def _projection(
 ) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
     """Return a function that projects points (k,3) m to pixels (k,2) of the sketch, in parallel projection.
 
-    Its scale is such that all points `x` are visible; `down`: the z axis is drawn downwards, else upwards.
+    The points are in the parent frame. The scale is such that all points `x` are visible; `down`: the z axis is drawn
+    downwards, else upwards.
     """
     azimuth, elevation = np.radians(EYE_DEG)
     up_z = -1.0 if down else 1.0

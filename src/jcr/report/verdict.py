@@ -76,7 +76,8 @@ def _leave_one_out(calibration: AnyCalibration) -> str:
 def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     """Yield tiles (a number in a box) of the accuracy of a point at the image centre and corner, used images, and scale.
 
-    Tiles whose numbers the calibration does not have are left out or replaced by the rotation of the camera.
+    A tile is (name, number as text, remark, whether it is a main number). Tiles whose numbers the calibration does not
+    have are left out; without the corner, the rotation uncertainty of the camera is given.
     """
     uncertainty, required = calibration.uncertainty, calibration.requirement
     if required is not None:
