@@ -461,7 +461,10 @@ class FailedCalibration(Outcome):
         return None
 
     def __getattr__(self, name: str) -> Any:
-        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods."""
+        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
+
+        Raises AttributeError for a name that a Calibration does not have.
+        """
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
             return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):

@@ -90,7 +90,8 @@ def checked_case(
 ) -> Case:
     """Return the case after fit, adjustment and checks, without required accuracy and proposed gripper poses.
 
-    `robot` is the error prior of the registered images' gripper poses.
+    A rejected calibration is returned with its findings, not raised; a check that its geometry makes impossible is
+    skipped. `robot` is the error prior of the registered images' gripper poses.
     """
     case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
     for check in CHECKS:

@@ -86,7 +86,10 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the paths of the images in a folder or its subfolder images/, relative to the folder, in natural order."""
+    """Return the paths of the images in a folder, relative to it, in natural order ("2.png" before "10.png").
+
+    If the folder has a subfolder images/, only the images in the subfolder are returned.
+    """
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     return sorted((str(file.relative_to(folder)) for file in files), key=natural)

@@ -246,7 +246,7 @@ def read_cameras(folder: Path) -> CamerasFile | None:
 
 
 def in_words(content: CamerasFile) -> list[str]:
-    """Return lines of text for the terminal for each camera and arm."""
+    """Return lines of text that state each camera's and each further arm's pose (m), uncertainty and warnings."""
     lines = [line for camera in content.cameras for line in camera.in_words]
     for arm in content.arms:
         rows = _rows(np.array(arm.base_from_other_base))

@@ -98,8 +98,9 @@ def _keep_better(found, v, u, k, tried):
     """Replace the planes of 16 pixels in `found` by those in `tried` with a higher score that face the camera.
 
     The pixels are those of row v from column u on. A plane faces the camera if the cosine between its normal and the
-    ray is above MOST_SLANTED. Rows of `found` (4,h,w) and `tried` (7,16): the first three are the plane; the score is
-    row 3 of `found` and row 6 of `tried`. Row 5 of `tried` is the inverse depth; `k` is fx, fy, cx, cy.
+    ray is above MOST_SLANTED. Rows 0 to 2 of `found` (4,h,w) and `tried` (7,16) are the plane p, with p·x = 1 for
+    its points x in the camera frame. The score is row 3 of `found` and row 6 of `tried`. Row 5 of `tried` is the inverse
+    depth; its rows 3 and 4 are not read. `k` is fx, fy, cx, cy.
     """
     for lane in range(LANES):
         rx, ry = _ray(v, u + lane, k)
@@ -114,10 +115,10 @@ def _keep_better(found, v, u, k, tried):
 @inlined
 @no_type_check
 def _try_passed(found, row, u, side, tried):
-    """Write to rows 0 to 2 of `tried` the planes that `found` (4,h,w) has in image row `row`, for 16 pixels.
+    """Write to rows 0 to 2 of `tried` (7,16) the planes that `found` (4,h,w) has in image row `row`, for 16 pixels.
 
     The pixels are those from column u on. For `side` 0 the planes are those of the same columns. For `side` -1 (1) they
-    are those of highest score among the _BESIDE columns to the left (right).
+    are those of highest score (row 3 of `found`) among the _BESIDE columns to the left (right).
     """
     last = found.shape[2] - 1
     for lane in range(LANES):

@@ -97,8 +97,9 @@ def assumed(
 ) -> Assumptions:
     """Return assumptions before any calibration: typical robot errors, and a camera at the gripper's origin.
 
-    `camera` None: camera poses are given and exact. `noise` (m, rad) is a lower bound on the random errors of the
-    robot.
+    The recorded or planned poses `base_from_gripper` determine the axis along which the camera looks
+    (`assumed_camera`) and the median distance of the scene. `camera` None: camera poses are given and exact. `noise`
+    (m, rad) is a lower bound on the random errors of the robot.
     """
     x = assumed_camera(base_from_gripper)
     return Assumptions(

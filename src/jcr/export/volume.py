@@ -58,7 +58,7 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
     The side of a voxel is `options.voxel_size` m, by default the map's cell. Unseen space counts as occupied by
     default. The arrays follow cuRobo except for the sign: `values` (nx,ny,nz), x slowest; `origin` (3,), the centre of
     the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and quaternion w x y z.
-    The texts are `frame`, `unit`, `sign`, `unknown` and the other `notes`.
+    The texts `sign` and `unknown` follow, and those of `notes` (frame, unit and others).
     """
     voxel, unknown = _voxel(scene, options.voxel_size), options.unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)

@@ -147,8 +147,9 @@ def match(
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
     """Return pixels (x, y) of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
 
-    As in the network's training, -1 and 1 are the centres of the outermost pixels; grid_sample itself has them at the
-    outer edges.
+    The last two axes of `image` are height h and width w. A pixel x becomes 2x/(w-1) - 1, as in the network's training,
+    where -1 and 1 are the centres of the outermost pixels. grid_sample itself (align_corners=False) has them at the
+    outer edges; this offset is kept.
     """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]

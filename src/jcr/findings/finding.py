@@ -194,7 +194,7 @@ def doubt_of(findings: Iterable[Finding]) -> str | None:
 
 
 def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
-    """Return message and remedy of each finding that rejects or warns."""
+    """Return one sentence, message and remedy together, for each finding that rejects or warns."""
     return tuple(sentence(finding) for finding in findings if finding.severity != "informs")
 
 

@@ -93,7 +93,7 @@ def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx
 
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
-    """Return the mask at half the resolution; a cell is set if any of its 2 x 2 x 2 cells is set."""
+    """Return the mask at half the resolution, sides rounded down; a cell is set if one of its 2 x 2 x 2 cells is."""
     return F.max_pool3d(mask[None].float(), 2)[0] > 0
 
 

@@ -57,7 +57,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Read the names of labels from names.json, by label; empty if there is no such file.
+    """Return the name of each label in the file `path`, names.json; an empty dict if there is no such file.
 
     Raises InputError if the file has another format.
     """

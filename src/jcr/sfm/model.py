@@ -112,7 +112,10 @@ def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarr
 def reconstruction_of(
     model: pycolmap.Reconstruction, rows: Sequence[int], intrinsics: Intrinsics
 ) -> Reconstruction:
-    """Return the cameras and tracks of the model's images `rows` as a reconstruction with these intrinsics."""
+    """Return the cameras and tracks of the model's images `rows` as a reconstruction with these intrinsics.
+
+    `rows` are indices of images of the capture; COLMAP's id of an image is its row + 1. All must be registered.
+    """
     return Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=poses_of(model, rows),

@@ -42,7 +42,8 @@ def reconstruct_dust3r(
 ) -> Reconstruction:
     """Return camera poses and pointmaps of a capture, in metres with MASt3R and in an arbitrary unit with DUSt3R.
 
-    Raises InputError for images or weights that cannot be used.
+    `weights` decide which of both networks runs, on the torch device `device`. `backend` is the name that the result
+    states, "dust3r" or "mast3r". Raises InputError for images or weights that cannot be used.
     """
     network = load_weights(weights, device)
     images = prepare_images(capture)
