@@ -87,7 +87,7 @@ class Layout:
 
     @property
     def states_variances(self) -> bool:
-        """Whether the stated variances differ between observations."""
+        """Whether `stated_variance` differs between observations; if not, all pixels have the same variance."""
         return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
 
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:

@@ -92,7 +92,7 @@ class _Search:
 
     @property
     def systematic(self) -> float:
-        """Largest systematic difference of camera and gripper rotation, as a share of the angle."""
+        """Assumed bound on the systematic difference of camera and gripper rotation, as a share of the angle."""
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:

@@ -391,8 +391,9 @@ class Viewer:
             along = (self.points - origin_in_base) @ direction
             aside = np.linalg.norm(self.points - origin_in_base - along[:, None] * direction, axis=1)
             near = np.flatnonzero((along > 0.02) & (aside < np.maximum(CLICK_RAD * along, POINT_M / 2)))
-            self._mark.visible, self.clicked.content = len(near) > 0, "No point there."
+            self._mark.visible = len(near) > 0
             if len(near) == 0:
+                self.clicked.content = "No point there."
                 return self.clicked.content
             self._mark.position = point = self.points[near[along[near].argmin()]]
             rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
