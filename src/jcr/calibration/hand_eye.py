@@ -90,10 +90,8 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
-    gripper, camera = (
-        _checked(base_from_gripper, "base_from_gripper"),
-        _checked(recon_from_camera, "recon_from_camera"),
-    )
+    gripper = _checked(base_from_gripper, "base_from_gripper")
+    camera = _checked(recon_from_camera, "recon_from_camera")
     if (n := len(gripper)) != len(camera):
         raise InputError(
             f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"

@@ -189,11 +189,7 @@ def advised(
     x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty
     seen = seen_points(x, uncertainty, hand_eye.intrinsics, assumptions.distance_m)
     uncertainty = replace(uncertainty, seen=seen, scene=scene)
-    required = _required(uncertainty, options)
-    if required.at == "seen" and uncertainty.joint is not None and hand_eye.intrinsics is not None:
-        bound_m, distance_m = 1e-3 * required.translation_mm, assumptions.distance_m
-        valid_px = valid_radius_px(x, uncertainty, hand_eye.intrinsics, distance_m, bound_m)
-        required = replace(required, valid_px=valid_px)
+    required = _required(hand_eye.with_uncertainty(uncertainty), options, assumptions.distance_m)
     # More images reduce neither the error of wrong intrinsics nor that of robot errors that depend on the reach.
     lasting = [
         one.covariance
@@ -238,11 +234,18 @@ def advised(
     return hand_eye.with_findings(short)
 
 
-def _required(uncertainty: Uncertainty, options: CalibrateOptions) -> Requirement:
-    """Return the accuracy that the options require (default: GRASPING), and the accuracy that `uncertainty` states."""
+def _required(hand_eye: Calibration, options: CalibrateOptions, distance_m: float) -> Requirement:
+    """Return the accuracy that the options require (default: GRASPING), and the accuracy that the calibration states.
+
+    `distance_m` is the distance (m) of a point at the image centre from the camera, and of one at the valid radius.
+    """
+    uncertainty, camera, valid_px = hand_eye.uncertainty, hand_eye.intrinsics, None
     reached_mm, reached_deg = reached(uncertainty, options.require_at)
     translation_mm, rotation_deg = options.require or GRASPING
     assert uncertainty.seen is not None
+    if options.require_at == "seen" and uncertainty.joint is not None and camera is not None:
+        x = hand_eye.gripper_from_camera
+        valid_px = valid_radius_px(x, uncertainty, camera, distance_m, 1e-3 * translation_mm)
     return Requirement(
         translation_mm=translation_mm,
         rotation_deg=rotation_deg,
@@ -251,4 +254,5 @@ def _required(uncertainty: Uncertainty, options: CalibrateOptions) -> Requiremen
         reached_mm=reached_mm,
         reached_deg=reached_deg,
         at=options.require_at,
+        valid_px=valid_px,
     )

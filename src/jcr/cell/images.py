@@ -60,10 +60,7 @@ class CellImages:
 
 
 def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the estimation problem of a cell: images of the capture's own camera, then used images of `members`.
-
-    World is the frame of the own camera's reconstruction, in metres.
-    """
+    """Return the estimation problem of a cell (world: own recon frame in m): own images, then used ones of `members`."""
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.

@@ -111,8 +111,7 @@ def match_depth(
     Returns for each pixel the inverse depth (1/z, per recon unit) and the mean correlation with its two best neighbours
     (-1 to 1). `colors` and poses are of all m undistorted images, on the pixel grid of `pinhole`. `neighbours` and
     `planes` come from `choose_neighbours` and `sweep_planes`. The search covers the inverse depths between an image's
-    two planes, from a quarter of the largest on. `report` is called with the finished fraction. The result does not
-    depend on `threads`.
+    two planes, from a quarter of the largest on. `report` is called with the finished fraction.
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)
