@@ -1,5 +1,6 @@
 """Fixed cameras, second wrist cameras, second arms and eye-to-hand: simulated cells, and real images of a capture."""
 
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
+import jcr
 from benchmarks.page import folders_with_captures, largest_std, mm_deg, of_rows, squared_distance, table
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
@@ -24,7 +26,10 @@ from jcr.geometry import apply, inverse, scale_translation, step_between
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import CellCamera
 from simulation.arms import PresetName
+from simulation.cell_faults import CellKind, further_camera
 from simulation.cells import CellProblem, Kind, cell_problem
+from simulation.faults import Faults
+from simulation.image_faults import IMAGES, ImageFault, draw, rendered, write
 
 DRAWS, COUNT = 10, 10
 """Cells of each kind, and poses of each arm."""
@@ -33,6 +38,20 @@ WITHHELD = 4
 """Every this many of a real capture's images are declared images of fixed cameras, one each."""
 UNMOVED = np.eye(4)
 Of = Callable[[State], Float[ndarray, "4 4"]]
+
+
+CELL_SEEDS = (0, 2)
+"""Seeds of rendered cells; their scenes have arms without systematic errors."""
+CELL_FAULTS: tuple[tuple[str, CellKind, Faults], ...] = (
+    ("none", "fixed", Faults()),
+    ("bumped by 20 mm 1.5° between its two images", "fixed", Faults(slip=(0.02, np.radians(1.5)))),
+    ("none", "wrist", Faults()),
+    ("bumped by 5 mm midway", "wrist", Faults(slip=(0.005, 0.0))),
+    ("none", "arm", Faults()),
+    ("slips by 12 mm 4° midway", "arm", Faults(slip=(0.012, np.radians(4.0)))),
+    ("poses late by 5 % of the time between images", "arm", Faults(delay_s=0.05, view_s=1.0)),
+)
+"""Fault, mount and size of each rendered further camera."""
 
 
 class Draw(NamedTuple):
@@ -94,6 +113,7 @@ def answered(problem: CellProblem, seed: int, world: Float[ndarray, "4 4"] = UNM
 
 def run(captures: Path) -> str:
     """Return the page in Markdown: simulated cells of each kind, and withheld images of the captures."""
+    faults = [cells for seed in CELL_SEEDS for cells in _with_faults(seed)]
     real = [row for folder in folders_with_captures(captures) for row in _withheld(folder)]
     every, rows = [], []
     for kind, preset in product(get_args(Kind), PRESET_NAMES):
@@ -127,6 +147,11 @@ def run(captures: Path) -> str:
         "withheld. Its base_from_camera is compared with the reported pose times the X of the other images.",
         "",
         *table("capture | image | points | off: mm | ° | ±σ: mm | °", (cells for cells, _ in real)),
+        "",
+        f"Rendered: a wrist camera with {IMAGES} images, and a further camera with one fault. A camera that moved is "
+        "compared before and after, whichever is farther.",
+        "",
+        *table("mount | fault | verdict | findings | off: mm | ° | σ", faults),
     ]
     return "\n".join(lines) + "\n"
 
@@ -186,3 +211,23 @@ def _withheld(folder: Path) -> Iterator[tuple[list[str], tuple[float, float] | N
             off = mm_deg(step_between(camera.parent_from_camera, there))
             numbers = [f"{value:.2f}" for value in (*off, *largest_std(camera.covariance))]
         yield [folder.name, capture.images[row], str(camera.images[0].points), *numbers], off
+
+
+def _with_faults(seed: int) -> Iterator[list[object]]:
+    """Calibrate a rendered wrist camera, and yield a row for the placement of each further camera of CELL_FAULTS."""
+    scene = rendered(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        made = write(draw(scene, seed, ImageFault()), Path(folder) / "capture")
+        result = jcr.calibrate(made, Path(folder) / "out")
+        for fault, kind, faults in CELL_FAULTS:
+            camera, truths = further_camera(kind, faults, scene, seed, Path(folder) / kind)
+            file, _, _ = place_cameras(result.capture, [camera], result.reconstruction, result.found)
+            (placed,) = file.cameras
+            names = ", ".join(dict.fromkeys(one.kind for one in placed.findings)) or "–"
+            off = ["–"] * 3
+            if placed.parent_from_camera is not None and placed.covariance is not None:
+                steps = [step_between(placed.parent_from_camera, true) for true in truths]
+                sigmas = [float(np.abs(step / np.sqrt(np.diag(placed.covariance))).max()) for step in steps]
+                far = int(np.argmax(sigmas))
+                off = [f"{value:.2f}" for value in (*mm_deg(steps[far]), sigmas[far])]
+            yield [kind, fault, placed.verdict, names, *off]

@@ -141,18 +141,24 @@ class ImageFault:
     """Rows of the images whose poses or content are wrong, so that no result may rest on them."""
 
 
+def rows_of(scene: Rendered, seed: int) -> Int[ndarray, " n"]:
+    """Draw the rows of the scene's views that are the images of a capture."""
+    return np.sort(np.random.default_rng([seed, 30]).permutation(len(scene.images))[:IMAGES])
+
+
 def draw(scene: Rendered, seed: int, fault: ImageFault, given: bool = True) -> Drawn:
     """Draw a capture of a scene with or without `given` intrinsics; views and random errors follow from the seed."""
-    choice, noise, pixels, of_faults, of_change = (np.random.default_rng([seed, 30 + k]) for k in range(5))
-    rows = np.sort(choice.permutation(len(scene.images))[:IMAGES])
-    faults, x = fault.faults, scene.gripper_from_camera
+    noise, pixels, of_faults, of_change = (np.random.default_rng([seed, 31 + k]) for k in range(4))
+    rows, faults, x = rows_of(scene, seed), fault.faults, scene.gripper_from_camera
     mounts, pushes = moved_parts(x, IMAGES, faults, of_faults)
     # The images are those of the scene, so the gripper is where they would be of the moved camera and base.
     cameras = scene.base_from_gripper[rows] @ x
     true = inverse(pushes) @ cameras @ inverse(mounts)
     optics = optics_of(faults, scene.camera, cameras, scene.distance[rows], of_faults)
     wide = [scene.images[row] for row in rows] if fault.scene is None else scene.changed(rows, fault.scene)
-    images = [_noisy(taken(one, by.believed_from_px), pixels) for one, by in zip(wide, optics, strict=True)]
+    images = [
+        with_noise(taken(one, by.believed_from_px), pixels) for one, by in zip(wide, optics, strict=True)
+    ]
     truths = [x] if np.allclose(mounts[0], mounts[-1]) else [mounts[0], mounts[-1]]
     if faults.is_bent:
         truths = [effective_transform(scene.base_from_gripper, x, faults)]
@@ -185,7 +191,7 @@ def write(drawn: Drawn, folder: Path) -> Path:
     return folder
 
 
-def _noisy(image: UInt8[ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[ndarray, "h w 3"]:
+def with_noise(image: UInt8[ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[ndarray, "h w 3"]:
     """Return an image with the noise of a sensor."""
     noise = rng.normal(0, NOISE_GREY, image.shape)
     return np.clip(image + noise + 0.5, 0, 255).astype(np.uint8)
