@@ -49,8 +49,8 @@ GOAL = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
 FIRST, MOST = 3, 24
 """Images at varied poses with which every way begins, and images after which a capture ends without a claim."""
 SCENES = 2
-WAYS = ("proposed", "varied", "random")
-"""Ways to choose the next pose: as the calibration proposes, by the pattern `varied`, or at random over the table."""
+WAYS = ("proposed", "varied", "random", "grid")
+"""Ways to choose the next pose: as the calibration proposes, by the pattern `varied`, at random, or on a grid."""
 ARMS: tuple[RobotName, ...] = ("ur5e", "panda", "fr3", "ur10e", "xarm6")
 AROUND = 0.5
 """m, of a UR5e: distance from which random poses look at the middle of the table."""
@@ -198,8 +198,12 @@ def _next_pose(cell: Cell, way: str, state: Progress, count: int) -> Float[ndarr
     if way == "varied":
         return cell.arm.reported(cell.varied[count : count + 1])[0]
     rng = np.random.default_rng([cell.seed, 60, count])
-    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(45, 85))
-    far = AROUND * rng.uniform(0.8, 1.3) * max(view_size(cell.arm.arm), 0.55)
+    if way == "grid":
+        azimuth, elevation = np.pi / 3 * (count % 6), np.radians([80, 65, 50][count // 6 % 3])
+        far = AROUND * [0.9, 1.2][count // 18] * max(view_size(cell.arm.arm), 0.55)
+    else:
+        azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(45, 85))
+        far = AROUND * rng.uniform(0.8, 1.3) * max(view_size(cell.arm.arm), 0.55)
     toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     middle = cell.scene.table_center_in_base
     return looking_at(middle + far * np.array(toward), middle, rng) @ inverse(cell.physical)

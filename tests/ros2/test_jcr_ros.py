@@ -131,6 +131,18 @@ def test_intrinsics_that_are_not_known_and_a_gripper_that_is_not_in_tf_are_named
     assert "gripper_frame" in calibrator.take()[1]
 
 
+def test_a_rejected_transform_is_not_broadcast(tmp_path: Path):
+    broadcast: list[ndarray] = []
+    nothing: Any = lambda *_: None  # noqa: E731
+    calibrator = Calibrator(Settings(folder=tmp_path / "c"), lambda: None, nothing, nothing, broadcast.append)
+    found = {"gripper_from_camera": np.eye(4), "covariance": np.eye(7), "warnings": ["the camera moved"]}
+    for converged, verdict in ((False, "rejected"), (True, "accepted")):
+        result = SimpleNamespace(**found, converged=converged, verdict=verdict)
+        calibrator._conclude(SimpleNamespace(finish=lambda result=result: result))  # type: ignore[arg-type]
+        assert len(broadcast) == converged and calibrator.outcome[0] is converged
+        assert converged or calibrator.outcome[1].endswith("rejected: the camera moved")
+
+
 def test_an_image_gets_the_depth_of_its_own_stamp():
     """A depth camera's images come later or earlier than the colour images of the same moment."""
     stream, image = FrameStream(has_depth=True), np.zeros((4, 6, 3), np.uint8)
