@@ -57,11 +57,11 @@ from .records import NextPose as NextPose
 from .records import Observability as Observability
 from .records import PointCloud as PointCloud
 from .records import Pointmaps as Pointmaps
+from .records import PointUncertainty as PointUncertainty
 from .records import PosePairs as PosePairs
 from .records import Reconstruction as Reconstruction
 from .records import Requirement as Requirement
 from .records import RobotNoise as RobotNoise
-from .records import Seen as Seen
 from .records import Uncertainty as Uncertainty
 from .result import RunOptions as RunOptions
 from .result import RunResult as RunResult

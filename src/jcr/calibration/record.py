@@ -41,9 +41,10 @@ from jcr.findings import (
 from jcr.geometry import Similarity, rotation_log
 from jcr.records import (
     Attempt,
-    BoardFound,
+    BoardEstimate,
     Capture,
     DepthCheck,
+    GivenIntrinsicsResult,
     ImageVerdict,
     IntrinsicsAndStd,
     JointOffsets,
@@ -58,7 +59,6 @@ from jcr.records import (
     Requirement,
     RobotNoise,
     Uncertainty,
-    WithGivenIntrinsics,
 )
 from jcr.records.json_fields import Matrix, Positive, rounded
 from jcr.records.notebook import table
@@ -270,13 +270,13 @@ class Calibration(Outcome):
     """Required and reached accuracy; None for the result of `solve_hand_eye`."""
     next_poses: tuple[NextPose, ...] = ()
     """Gripper poses to add: those that reduce the uncertainty most."""
-    with_given_intrinsics: WithGivenIntrinsics | None = None
+    with_given_intrinsics: GivenIntrinsicsResult | None = None
     """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
     depth_check: DepthCheck | None = None
     """Scale and noise of the depth images; None without them, or if too few features have a depth."""
     lengths: tuple[LengthCheck, ...] = ()
     """Known lengths, each compared with the robot's positions."""
-    board: BoardFound | None = None
+    board: BoardEstimate | None = None
     """Adjusted board; None unless a board was adjusted together with features."""
 
     @model_validator(mode="after")

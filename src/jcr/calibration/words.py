@@ -19,7 +19,7 @@ from jcr.findings import (
     verdict_of,
     without_consequences,
 )
-from jcr.records import BoardFound, LeaveOneOut, SeenAndCorners, WithGivenIntrinsics, share_of
+from jcr.records import BoardEstimate, GivenIntrinsicsResult, LeaveOneOut, PointUncertaintyOverImage, share_of
 from jcr.rounding import labelled, significant, with_std
 
 NEGLIGIBLE = 0.02
@@ -219,7 +219,7 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
     }
 
 
-def _board(board: BoardFound) -> dict[str, str]:
+def _board(board: BoardEstimate) -> dict[str, str]:
     """Return named values of an adjusted board: corners, size, flatness, and position in the base frame."""
     stated = f", {board.stated_mm:g} mm stated" if board.stated_mm else ""
     rows = {
@@ -252,7 +252,7 @@ def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Floa
     return f"along {name}: ±{size}"
 
 
-def seen_in_words(seen: SeenAndCorners) -> str:
+def seen_in_words(seen: PointUncertaintyOverImage) -> str:
     """Return a sentence with the point uncertainty (95 %, mm) across the ray, along the ray, and in an image corner."""
     return (
         f"point uncertainty: {significant(seen.lateral_95_mm)} mm across the ray and "
@@ -261,7 +261,7 @@ def seen_in_words(seen: SeenAndCorners) -> str:
     )
 
 
-def given_in_words(given: WithGivenIntrinsics) -> str:
+def given_in_words(given: GivenIntrinsicsResult) -> str:
     """Return a sentence with the distance between one point's positions by the given and the estimated intrinsics.
 
     Each set of intrinsics is used with its own transform. The sentence also states the point uncertainty (95 %, mm)

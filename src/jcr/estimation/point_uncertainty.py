@@ -27,13 +27,13 @@ from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
 from jcr.geometry import apply, by_similarity, retract, skew
 from jcr.records import (
+    GivenIntrinsicsResult,
     Intrinsics,
+    PointUncertainty,
+    PointUncertaintyOverImage,
     RobotNoise,
     SceneUncertainty,
-    Seen,
-    SeenAndCorners,
     Uncertainty,
-    WithGivenIntrinsics,
 )
 
 Transform = Float[ndarray, "4 4"]
@@ -93,7 +93,7 @@ def bounds_at(
     intrinsics: Intrinsics,
     x_px: Float[ndarray, "2"],
     distance_m: float,
-) -> Seen:
+) -> PointUncertainty:
     """Return 95 % bounds of the error of the point at `distance_m` (m) along the ray of the pixel `x_px`.
 
     Bounds are of the position (mm; whole, across and along the ray), the ray's direction and the rotation (degrees).
@@ -109,7 +109,7 @@ def bounds_at(
     by_unknown[:, :3] = by_unknown[2] = 0.0
     by_unknown[2, 3:6] = distance_m * axes[2] @ x[:3, :3].T
     rotated = _covariance(uncertainty, by_unknown, by_pixel, of_pixel) / distance_m**2
-    return Seen(
+    return PointUncertainty(
         distance_mm=1e3 * distance_m,
         within_95_mm=1e3 * within_95(moved),
         lateral_95_mm=1e3 * within_95(moved[:2, :2]),
@@ -121,7 +121,7 @@ def bounds_at(
 
 def seen_points(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
-) -> SeenAndCorners:
+) -> PointUncertaintyOverImage:
     """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` along the ray.
 
     The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
@@ -130,13 +130,13 @@ def seen_points(
     """
     if camera is None:
         at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)
-        return SeenAndCorners(**vars(at_centre), corners=at_centre)
+        return PointUncertaintyOverImage(**vars(at_centre), corners=at_centre)
     right, bottom = camera.width - 1.0, camera.height - 1.0
     centre, *corners = (
         bounds_at(x, uncertainty, camera, np.array(x_px), distance_m)
         for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
     )
-    return SeenAndCorners(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
+    return PointUncertaintyOverImage(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
 
 
 def valid_radius_px(
@@ -160,7 +160,7 @@ def valid_radius_px(
 
 def with_given_intrinsics(
     x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, given: Intrinsics, distance_m: float
-) -> WithGivenIntrinsics | None:
+) -> GivenIntrinsicsResult | None:
     """Return the gripper_from_camera to use with `given` intrinsics, and its uncertainty.
 
     The result is None if the calibration did not estimate intrinsics (`camera`). The transform is the conditional mean
@@ -180,7 +180,7 @@ def with_given_intrinsics(
     pair = uncertainty.with_error(np.outer(moved, moved))
     x_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
     apart = _derivatives(x, uncertainty, camera, x_px, distance_m)[0] @ moved
-    return WithGivenIntrinsics(
+    return GivenIntrinsicsResult(
         gripper_from_camera=retract(x, step[:6]),
         covariance=pair.covariance,
         intrinsics=given,

@@ -99,9 +99,9 @@ class NextPose:
     expected_std: Numbers7
     """Predicted standard deviations, in COVARIANCE_ORDER."""
     within_95_mm: Spread
-    """Predicted bound on 95 % of the errors of a point (mm), as in Seen."""
+    """Predicted bound on 95 % of the errors of a point (mm), as in PointUncertainty."""
     rotation_95_deg: Spread
-    """Predicted bound on 95 % of the direction errors (degrees), as in Seen."""
+    """Predicted bound on 95 % of the direction errors (degrees), as in PointUncertainty."""
     moved_m: Annotated[Metres, Field(alias="moved_mm")] = 0.0
     """Distance of the gripper's origin from its position at the image `like` (m)."""
     rotation_rad: Annotated[Radians, Field(alias="rotated_deg")] = 0.0
@@ -256,7 +256,7 @@ class DepthCheck:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
+class PointUncertainty:
     """Uncertainty of a point that the camera sees: bounds on 95 % of its errors, for exact gripper poses."""
 
     distance_mm: Spread
@@ -274,10 +274,10 @@ class Seen:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeenAndCorners(Seen):
+class PointUncertaintyOverImage(PointUncertainty):
     """Uncertainty of points at the median distance of the scene: at the image centre and at the worst corner."""
 
-    corners: Seen
+    corners: PointUncertainty
     """Point uncertainty at the worst corner of the image."""
 
 
@@ -307,7 +307,7 @@ class SceneUncertainty:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WithGivenIntrinsics:
+class GivenIntrinsicsResult:
     """Most likely transform, and its covariance, for a user who keeps the given instead of the estimated intrinsics."""
 
     gripper_from_camera: Matrix
@@ -315,7 +315,7 @@ class WithGivenIntrinsics:
     """Covariance in COVARIANCE_ORDER, including the difference from the transform for the estimated intrinsics."""
     intrinsics: Intrinsics
     """Given intrinsics."""
-    seen: Seen
+    seen: PointUncertainty
     """Point uncertainty with the given intrinsics, including the effect of their errors."""
     differs_mm: Spread
     """Distance (mm) between the positions of one point at the image centre by the given and the estimated intrinsics,
@@ -363,7 +363,7 @@ class Uncertainty:
     """Covariance with the intrinsics; None where the intrinsics were not estimated."""
     model_error: ModelError | None = None
     """Distortion that the model cannot express; None where the intrinsics were not estimated."""
-    seen: SeenAndCorners | None = None
+    seen: PointUncertaintyOverImage | None = None
     """Point uncertainty at the working distance; None for the result of `solve_hand_eye`."""
     scene: SceneUncertainty | None = None
     """Uncertainty of the whole reconstruction in the base frame; None where no image was adjusted."""
@@ -420,7 +420,7 @@ class Uncertainty:
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property
-    def corner(self) -> Seen | None:
+    def corner(self) -> PointUncertainty | None:
         """Point uncertainty in the worst corner of the image; None where the intrinsics were not estimated."""
         return None if self.seen is None or self.joint is None else self.seen.corners
 
@@ -469,7 +469,7 @@ class LengthCheck:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardFound:
+class BoardEstimate:
     """Adjusted board, or adjusted tags of one `--board` option: size, flatness, and positions in the base frame."""
 
     spec: str

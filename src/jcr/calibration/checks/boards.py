@@ -15,7 +15,7 @@ from jcr.estimation.projection import by_points
 from jcr.estimation.solve import Solution, size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, skew
-from jcr.records import BoardFound, Boards, Tracks
+from jcr.records import BoardEstimate, Boards, Tracks
 
 LIKELY, STRETCHED = 2.0, 4.0
 """Stretch of a board, in standard deviations of a printer's stretch, from which it is estimated without a prior; and the
@@ -50,7 +50,7 @@ def check_boards(case: Case) -> Case:
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
         return case.after(tuple(findings))
-    found = board_found(case.adjusted, boards)
+    found = board_estimate(case.adjusted, boards)
     if boards.is_stretched:
         stretch, std = stretch_of(case.adjusted)
         size = {"value": abs(stretch), "std": std, "board": boards.spec}
@@ -170,10 +170,10 @@ def stretch_of(adjusted: Solution) -> tuple[float, float]:
     return float(shape[k]), float(np.sqrt(adjusted.covariance[own, own][k, k]))
 
 
-def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
+def board_estimate(adjusted: Solution, boards: Boards) -> BoardEstimate:
     """Return the record of the adjusted boards: size, residuals, flatness, and positions in the base frame.
 
-    `adjusted` must contain boards; `boards` states their name and printed size. BoardFound defines units and terms.
+    `adjusted` must contain boards; `boards` states their name and printed size. BoardEstimate defines units and terms.
     """
     problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
     assert shapes is not None and problem.observations is not None
@@ -190,7 +190,7 @@ def board_found(adjusted: Solution, boards: Boards) -> BoardFound:
     rigs = state.world_from_rig[shapes.first_rig + numbers]
     normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
     points = apply(state.z[0], state.scale * state.points_in_world[shapes.point])
-    return BoardFound(
+    return BoardEstimate(
         spec=boards.spec,
         bodies=len(numbers),
         images=len(np.unique(problem.observations.image[of_corners])),
