@@ -255,10 +255,7 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
 
 
 def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
-    """Return given intrinsics (or None) and warnings; distortion that folds over inside the image is set to zero.
-
-    Images with such a distortion could not be registered.
-    """
+    """Return given intrinsics (or None) and warnings; distortion that folds over inside the image is set to zero."""
     # A fisheye's border, beyond the widest angle, may have pixels without rays; the rest of the image is usable.
     if camera is None or camera.model == "fisheye" or (fold := fold_distance_px(camera)) is None:
         return camera, ()
@@ -270,10 +267,7 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
 
 
 def guessed_intrinsics(size: tuple[int, int], focal: float = USUAL_FOCAL) -> Intrinsics:
-    """Return a pinhole with square pixels for images of `size` (width, height); `focal` is relative to the long side.
-
-    The principal point is the image centre.
-    """
+    """Return a centred pinhole for images of `size` (width, height); `focal` is relative to the long side."""
     (width, height), focal_px = size, focal * max(size)
     return Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
 

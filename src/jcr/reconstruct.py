@@ -259,14 +259,6 @@ class ReconstructOptions:
     """Camera poses from another tool, a COLMAP model; selects the back end given."""
 
 
-def check_board(options: ReconstructOptions) -> None:
-    """Raise InputError if the option --board does not describe a board."""
-    if options.board is not None:
-        from jcr.boards.detection import boards
-
-        boards(options.board)
-
-
 def reconstruct(
     capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
@@ -381,10 +373,7 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """Return the options with `cameras` set to the COLMAP model that belongs to the capture.
-
-    They are unchanged if the capture has no model, or if the options name `cameras` or another back end.
-    """
+    """Return the options with `cameras` set to the capture's COLMAP model, unless another is chosen or there is none."""
     if capture.cameras is None or options.cameras is not None:
         return options
     selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
@@ -435,10 +424,7 @@ def _given_options(options: ReconstructOptions) -> dict[str, Any]:
 
 
 def device_of(options: ReconstructOptions) -> str:
-    """Return "cuda" or "cpu" for the option `device`; for `auto`, "cuda" if a CUDA device is available.
-
-    Raises InputError if `device` is "cuda" and no CUDA device is available.
-    """
+    """Return "cuda" or "cpu" for `device`; `auto`: "cuda" if available. Raise InputError if "cuda" is not available."""
     if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
         return "cpu"
     torch = extra("torch", "networks", "--device cuda")

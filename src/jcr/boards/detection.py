@@ -164,10 +164,7 @@ def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
 
 @cache
 def _charuco_shift_px() -> float:
-    """Return how far (0 or 0.5 px) the installed OpenCV reports ChArUco corners too far right and down.
-
-    OpenCV's pull request 28380 removed this shift. It is measured once, in a drawn board.
-    """
+    """Return how far (0 or 0.5 px) the installed OpenCV displaces ChArUco corners right and down, from a drawn board."""
     square, margin = 40, 20
     board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
     drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)

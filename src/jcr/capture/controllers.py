@@ -45,18 +45,12 @@ class Convention:
         return self.rotation not in (*QUATERNIONS, "matrix")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg").
-
-        For `asked` "auto" they are the usual units of this convention.
-        """
+        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg"; "auto": usual ones)."""
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
     def scales(self, asked: UnitsName) -> tuple[float, float]:
-        """Return the factors from the pose's numbers to metres and to radians, for the units `asked`, such as "mm-deg".
-
-        For `asked` "auto" they are those of the convention's usual units.
-        """
+        """Return the factors from the pose's numbers to metres and to radians; `asked` is as in `units`."""
         length, angle = self.units(asked)
         return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
@@ -92,12 +86,6 @@ OF_ARM = (
     | {"z1": "unitree"}
 )
 """Name in CONVENTIONS of each arm's controller; the arms are those of estimation.arms.ROBOT_NAMES."""
-
-
-def units_of(convention: str) -> str:
-    """Return the usual units of the pose convention of this name as text: "m, rad", "mm, °", or "m" without angles."""
-    form = CONVENTIONS[convention]
-    return f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
 
 
 def numbers_from_poses(

@@ -118,10 +118,7 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 
 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
-    """Return the size (width, height in px) that all images share; raise InputError if one has another size.
-
-    `sizes` maps the name of each image to its size. The message begins with `where`.
-    """
+    """Return the size (width, height in px) that all `sizes` by image name share; raise InputError if one differs."""
     (first, size), *others = sizes.items()
     if other := [one for one in others if one[1] != size]:
         raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
@@ -129,10 +126,7 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian.
-
-    The variance falls as blur increases.
-    """
+    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian, lower with blur."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
 

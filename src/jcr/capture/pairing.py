@@ -86,10 +86,7 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the paths of the images in a folder, relative to it, in natural order ("2.png" before "10.png").
-
-    If the folder has a subfolder images/, only the images in the subfolder are returned.
-    """
+    """Return the paths of the images in a folder, or in its subfolder images/, relative to it, in natural order."""
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     return sorted((str(file.relative_to(folder)) for file in files), key=natural)

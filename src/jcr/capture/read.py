@@ -100,10 +100,7 @@ def read_source(
 
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches.
-
-    With `options.poses`, a path of no earlier format is a table.
-    """
+    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches."""
     has_poses = options is not None and options.poses is not None
     for name, form in FORMATS.items():
         if form.recognises(path) or (name == "table" and has_poses):

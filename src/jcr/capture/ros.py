@@ -43,10 +43,7 @@ class CameraInfo(BaseModel):
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """Read a camera_info YAML as the intrinsics of images of `size` (width, height); None if never calibrated.
-
-    Raises InputError as `intrinsics_of_ros` does.
-    """
+    """Read a camera_info YAML as `intrinsics_of_ros` does, for images of `size` (width, height)."""
     return intrinsics_of_ros(read_yaml(file), size, str(file))
 
 
@@ -164,10 +161,7 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return the pixel data of an image message, the first `used` bytes of each of its h rows, without padding.
-
-    Raises InputError, begun with `where` and the name `what` of the data, if bytes are missing.
-    """
+    """Return an image message's pixels, `used` bytes of each row; raise InputError about `what` if bytes are missing."""
     data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
     if message.step < used or data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")

@@ -133,7 +133,26 @@ class ModelsCommand:
     def main(self) -> int:
         """Print the list of back ends, or download the weights of one; return the exit status."""
         if self.action == "get":
-            return self._get()
+            with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
+            name = self.name
+            row = BACKENDS.get(name or "")
+            if name is None or not (HUB_ID.fullmatch(name) or name in with_weights):
+                named = "name one" if name is None else f"{name} has none to get"
+                raise InputError(
+                    f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
+                )
+            hub_id, revision = (row.hub_id, row.revision) if row else (name, None)
+            if row and not (row.commercial or row.has_weights() or self.accept_licence):
+                raise InputError(
+                    f"{weights_command(row)}; its licence is {row.licence}; accept it with --accept-licence, or take da3"
+                )
+            folder = download(hub_id, self.revision or revision, self.output.quiet)
+            lines = [f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}"]
+            if row and not row.is_installed():
+                lines.append(f"its package is missing: {row.install}")
+            facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
+            self.output.result(lines, facts | {"folder": str(folder)})
+            return 0
         if self.name is not None or self.accept_licence or self.revision is not None:
             raise InputError(
                 "jcr models: a name, --accept-licence and --revision are for jcr models get NAME"
@@ -156,27 +175,4 @@ class ModelsCommand:
             fact = {"backend": row.name, "weights": row.hub_id, "scale": scale, "present": present}
             facts.append(fact | own | {"parameters_m": row.parameters})
         self.output.result(lines, {"models": facts})
-        return 0
-
-    def _get(self) -> int:
-        """Download the weights of a back end or hub id, check them, and store them where runs look for them."""
-        with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
-        name = self.name
-        row = BACKENDS.get(name or "")
-        if name is None or not (HUB_ID.fullmatch(name) or name in with_weights):
-            named = "name one" if name is None else f"{name} has none to get"
-            raise InputError(
-                f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
-            )
-        hub_id, revision = (row.hub_id, row.revision) if row else (name, None)
-        if row and not (row.commercial or row.has_weights() or self.accept_licence):
-            raise InputError(
-                f"{weights_command(row)}; its licence is {row.licence}; accept it with --accept-licence, or take da3"
-            )
-        folder = download(hub_id, self.revision or revision, self.output.quiet)
-        lines = [f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}"]
-        if row and not row.is_installed():
-            lines.append(f"its package is missing: {row.install}")
-        facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
-        self.output.result(lines, facts | {"folder": str(folder)})
         return 0

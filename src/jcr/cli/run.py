@@ -197,10 +197,7 @@ class AddCameraCommand:
 
 
 def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
-    """Return the options of a run (RunOptions) from the fields of a command that have the same names.
-
-    Options in `chosen` replace them.
-    """
+    """Return the options of a run from the fields of a command with the same names; those in `chosen` replace them."""
     from jcr.result import RunOptions
 
     given = {

@@ -178,10 +178,7 @@ class QueryCommand:
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
-    """Read points x, y, z (n,3) in metres, base frame, from .csv (three columns), .npy (n,3) or .ply (vertices).
-
-    Raises InputError for another file, and for a point that is not finite.
-    """
+    """Read points x, y, z (n,3) in metres, base frame, from .csv, .npy or .ply; raise InputError for other files."""
     from jcr.capture.plain_files import read_lines, read_npy, split_cells
 
     if not path.is_file():

@@ -157,10 +157,7 @@ def planar_prior(
 
 
 def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Return for each of r regions whether it touches one of the `chosen` regions; `label` is each pixel's region.
-
-    Two regions touch if a pixel of one is next to a pixel of the other in a row or column.
-    """
+    """Return for each of r regions whether one of its pixels is next to one of a `chosen` region in a row or column."""
     beside = np.zeros(len(chosen), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
         beside[one[chosen[other]]] = True

@@ -155,10 +155,7 @@ class Matcher:
         return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
-        """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
-
-        The rays and intrinsics are those of `view`; `geometry` is the result of `verified`.
-        """
+        """Return the inliers of a pair by its key, and the motions its geometry allows in `view`; cached."""
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)

@@ -56,10 +56,7 @@ def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
 
 
 def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return for each image the row of the first image of the same viewpoint (SAME_VIEWPOINT).
-
-    `motion[i, j]` is the gripper's i_from_j.
-    """
+    """Return for each image the row of the first image of its viewpoint; `motion[i, j]` is the gripper's i_from_j."""
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -74,11 +71,21 @@ def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarra
     the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
     gripper's i_from_j.
     """
-    x = hand_eye_of_pairs(found, motion)
-    if x is None:
+    if (gripper_from_camera := hand_eye_of_pairs(found, motion)) is None:
         return []
-    first_from_camera = motion[0] @ x
-    points = _scene_points(view, found, first_from_camera)
+    first_from_camera = motion[0] @ gripper_from_camera
+    kept = [np.zeros((0, 3))]  # points (m) of pairs with parallax, in the gripper frame of image 0
+    for pair in found.confirmed:
+        rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
+        pose = first_from_camera[list(pair.key)]
+        ray = np.stack([view.rays[row][own] for row, own in zip(pair.key, rows.T, strict=True)], 1)
+        direction = np.einsum("bij,mbj->mbi", pose[:, :3, :3], np.insert(ray, 2, 1.0, axis=2))
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        x = nearest_to_lines(pose[:, :3, 3], direction)
+        far = ((x[:, None] - pose[:, :3, 3]) * direction).sum(2)
+        parallax = np.linalg.norm(np.cross(direction[:, 0], direction[:, 1]), axis=1)
+        kept.append(x[(far > 0.02).all(1) & (parallax > np.sin(np.radians(1)))])
+    points = np.concatenate(kept)
     if len(points) < 20:
         return []
     inside, size = [], [view.intrinsics.width - 0.5, view.intrinsics.height - 0.5]
@@ -119,27 +126,6 @@ def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[n
         information = np.einsum("p,pki,pkj->ij", weight, a, a) + np.eye(3) / PRIOR_STD_M**2
         t = -np.linalg.solve(information, np.einsum("p,pki,pk->i", weight, a, b))
     return transform(found.of_x.rotation, t)
-
-
-def _scene_points(
-    view: ImageGeometry, found: Gate, first_from_camera: Float[ndarray, "n 4 4"]
-) -> Float[ndarray, "p 3"]:
-    """Return the points (m) triangulated from confirmed pairs with parallax, in the gripper frame of image 0.
-
-    `first_from_camera` are the camera poses in this frame. Parallax is an angle of more than 1° between the two rays.
-    """
-    kept = [np.zeros((0, 3))]
-    for pair in found.confirmed:
-        rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
-        pose = first_from_camera[list(pair.key)]
-        ray = np.stack([view.rays[row][own] for row, own in zip(pair.key, rows.T, strict=True)], 1)
-        direction = np.einsum("bij,mbj->mbi", pose[:, :3, :3], np.insert(ray, 2, 1.0, axis=2))
-        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
-        points = nearest_to_lines(pose[:, :3, 3], direction)
-        far = ((points[:, None] - pose[:, :3, 3]) * direction).sum(2)
-        parallax = np.linalg.norm(np.cross(direction[:, 0], direction[:, 1]), axis=1)
-        kept.append(points[(far > 0.02).all(1) & (parallax > np.sin(np.radians(1)))])
-    return np.concatenate(kept)
 
 
 def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"]) -> list[Key]:

@@ -38,10 +38,7 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
 
 
 def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
-    """Return keypoints (x, y in px; pixel centres are whole numbers) and unit descriptors (RootSIFT) of a grey image.
-
-    The arrays are empty if nothing is found.
-    """
+    """Return keypoints (x, y in px; pixel centres are whole numbers) and RootSIFT descriptors of a grey image."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)

@@ -146,10 +146,7 @@ class _Search:
         )
 
     def hide_still_parts(self) -> None:
-        """Find the cells of the image that stay while the gripper moves; verify all matches without these cells.
-
-        Pairs with too few other matches are removed.
-        """
+        """Verify all matches without the cells that stay while the gripper moves; remove pairs with too few others."""
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)

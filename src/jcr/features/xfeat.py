@@ -50,10 +50,7 @@ SHA256 = {
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    """Return XFeat and LightGlue with their published weights, in evaluation mode.
-
-    Raises InputError if the weights are not installed.
-    """
+    """Return XFeat and LightGlue with published weights, to evaluate; raise InputError if they are not installed."""
     kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
     network, matcher = (
         kornia.XFeatModel(),
@@ -224,42 +221,30 @@ class LearnedFeatures:
         """Find keypoints in an image rotated by an angle, `key` = (row, degrees), clockwise on the screen.
 
         Returns keypoints and descriptors in the rotated image, its size (width, height), and the keypoints in the
-        original image.
+        original image. The long side is first reduced to LONG_SIDE_PX.
         """
-        row, degrees = key
-        pixels, given_from_rotated = _prepared(self._images[row], math.radians(degrees))
+        image, roll = self._images[key[0]], math.radians(key[1])
+        height, width = image.shape[:2]
+        scale = min(1.0, LONG_SIDE_PX / max(height, width))
+        w, h = round(width * scale), round(height * scale)
+        small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA) if scale < 1 else image
+        sx, sy = width / w, height / h
+        given_from_small = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        rotated_from_small = np.eye(3)
+        cosine, sine = math.cos(roll), math.sin(roll)
+        rotated_from_small[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        corners = rotated_from_small[:2, :2] @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
+        rotated_from_small[:2, 2] = -corners.min(1)
+        extent = (corners.max(1) - corners.min(1)).tolist()
+        out = [MULTIPLE * math.ceil((round(side) + 1) / MULTIPLE) for side in extent]
+        rotated = cv2.warpAffine(small, rotated_from_small[:2], out, borderMode=cv2.BORDER_REPLICATE)
+        pixels = torch.from_numpy(np.ascontiguousarray(rotated)).permute(2, 0, 1).float() / 255
+        given_from_rotated = (given_from_small @ np.linalg.inv(rotated_from_small))[:2]
         x_px, descriptor = detect(self._network, pixels, KEYPOINTS)
         given = x_px.double().numpy() @ given_from_rotated[:, :2].T + given_from_rotated[:, 2]
-        height, width = self._images[row].shape[:2]
         inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in the replicated border
         kept = torch.from_numpy(inside)
         return x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]), given[inside]
-
-
-def _prepared(
-    image: UInt8[ndarray, "h w 3"], roll: float
-) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "2 3"]]:
-    """Return an image rotated by `roll` (rad), reduced and padded (RGB, 0 to 1), and its affine map to the original.
-
-    A positive angle rotates clockwise on the screen. The long side is reduced to LONG_SIDE_PX before the rotation. The
-    map (2,3) takes pixels (x, y, 1) of the result to pixels of the original image.
-    """
-    height, width = image.shape[:2]
-    scale = min(1.0, LONG_SIDE_PX / max(height, width))
-    w, h = round(width * scale), round(height * scale)
-    small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA) if scale < 1 else image
-    sx, sy = width / w, height / h
-    given_from_small = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-    rotated_from_small = np.eye(3)
-    cosine, sine = math.cos(roll), math.sin(roll)
-    rotated_from_small[:2, :2] = [[cosine, -sine], [sine, cosine]]
-    corners = rotated_from_small[:2, :2] @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
-    rotated_from_small[:2, 2] = -corners.min(1)
-    extent = (corners.max(1) - corners.min(1)).tolist()
-    out = [MULTIPLE * math.ceil((round(side) + 1) / MULTIPLE) for side in extent]
-    rotated = cv2.warpAffine(small, rotated_from_small[:2], out, borderMode=cv2.BORDER_REPLICATE)
-    pixels = torch.from_numpy(np.ascontiguousarray(rotated)).permute(2, 0, 1).float() / 255
-    return pixels, (given_from_small @ np.linalg.inv(rotated_from_small))[:2]
 
 
 def _one_thread() -> None:

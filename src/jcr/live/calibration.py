@@ -128,10 +128,7 @@ class LiveCalibration:
             return self.update()
 
     def undo(self) -> Progress:
-        """Undo the last addition or removal of an image since this object was made, and calibrate again.
-
-        Returns the new state of the calibration, which is the same if there is nothing to undo.
-        """
+        """Undo the last addition or removal of an image, if there is one; return the new state of the calibration."""
         with self._lock:
             self.live.undo()
             return self.update()
@@ -172,10 +169,7 @@ class LiveCalibration:
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with another proposed pose, because no image could be kept at `base_from_gripper` (m).
-
-        The camera is more than 0.06 m from where it was at that pose and at the poses of earlier calls, if possible.
-        """
+        """Return the state with another next pose, 0.06 m from `base_from_gripper` (m), where no image could be kept."""
         with self._lock:
             self._refused.append(base_from_gripper)
             self.progress = replace(self.progress, **self._propose())

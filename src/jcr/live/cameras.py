@@ -361,10 +361,7 @@ class ImageSummary:
         return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images are the same view: equal size, and grey levels that differ by noise only.
-
-        The mean absolute difference of the reduced images must be below 2.5 of 255 grey levels.
-        """
+        """Test whether two images have equal size and grey levels that differ by noise only, under 2.5 of 255."""
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 

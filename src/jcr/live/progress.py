@@ -57,10 +57,7 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors of a point at the working distance.
-
-        None without a calibration, or if the calibration has no requirement.
-        """
+        """Bounds (mm, degrees) on 95 % of errors of a point at the working distance; None without a requirement."""
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
@@ -117,10 +114,7 @@ class Progress:
 
 
 def faults(state: Progress) -> list[Finding]:
-    """Return the findings that reject the calibration or warn, first those about the image added last.
-
-    Findings that only state that more images are needed are left out.
-    """
+    """Return findings that reject or warn, first those on the last image; not those that only ask for more images."""
     more_images = FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES
     acting = (one for one in without_consequences(state.findings) if one.severity != "informs")
     found = [one for one in acting if one.kind not in more_images]

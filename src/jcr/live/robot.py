@@ -174,10 +174,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
 
 
 def franka_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a Franka arm (FER, FR3), read from its control interface by the package franky-control.
-
-    base_from_gripper is O_T_EE: the pose of the end effector that is set in Franka Desk.
-    """
+    """Yield the states of a Franka arm by franky-control; base_from_gripper is O_T_EE, as set in Franka Desk."""
     where = f"--poses franka:{host}"
     franky = extra("franky", "franka", where)
     try:
@@ -196,10 +193,7 @@ def franka_states(host: str) -> Iterator[RobotState]:
 
 
 def xarm_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a UFACTORY arm (xArm, Lite 6, 850), read by the package xarm-python-sdk.
-
-    base_from_gripper is the pose of the tool centre point that is set in UFACTORY Studio.
-    """
+    """Yield the states of a UFACTORY arm by xarm-python-sdk; base_from_gripper is the TCP set in UFACTORY Studio."""
     where = f"--poses xarm:{host}"
     timeout = socket.getdefaulttimeout()
     # The package prints its version and errors, which the InputError replaces, and changes the timeout of all sockets.

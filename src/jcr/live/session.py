@@ -202,10 +202,7 @@ class LiveSession:
         return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
-        """Execute a command of a person, such as "take" or "remove".
-
-        `number` is the number of the image that it concerns, counted from 1; None: the last image.
-        """
+        """Execute a command such as "remove"; `number` is its image, counted from 1, None: the last."""
         with self._lock:
             names = self.folder.names
             number = len(names) if number is None else number
@@ -271,7 +268,7 @@ class LiveSession:
         return found
 
     def _refuse(self, event: str) -> None:
-        """Publish `event`, the reason why a request or command was not executed, on the page and through `tell`."""
+        """Publish the reason why a request or command was not executed, on the page and through `tell`."""
         self._say(event, {"accepted": False, "reason": event.removeprefix("refused: ")})
 
     def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
@@ -313,10 +310,7 @@ class LiveSession:
         self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
-        """Publish an event (text) on the page, and with `answer` (JSON) through `tell`.
-
-        `changes` are new values of fields of SessionState.
-        """
+        """Publish an event (text) on the page and, with `answer` (JSON), through `tell`; `changes` as in `_show`."""
         self._show(event, is_refusal=not answer.get("accepted", True), **changes)
         self._tell(answer, [event])
 

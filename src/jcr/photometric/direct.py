@@ -182,10 +182,7 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Undistort images (RGB, 0 to 255) and reduce them to the height of each stage; return the levels by height in px.
-
-    `intrinsics` are those of the images as given, with distortion.
-    """
+    """Undistort images (RGB, 0 to 255) by their intrinsics, reduce them to each stage's height; return levels by px."""
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255

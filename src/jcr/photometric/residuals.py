@@ -107,10 +107,7 @@ class PhotometricEquations:
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """Return a level: the images (RGB, 0 to 1) reduced to `height` pixels and blurred (BLUR_PX).
-
-    `grid` are the intrinsics of the images before the reduction.
-    """
+    """Return a level: images (RGB, 0 to 1) with intrinsics `grid`, reduced to `height` pixels and blurred (BLUR_PX)."""
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:

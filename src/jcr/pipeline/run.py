@@ -36,7 +36,7 @@ from jcr.pipeline.stages import (
     place,
 )
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BackendName, check_board
+from jcr.reconstruct import BackendName
 from jcr.records import Capture, PosePairs
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
@@ -67,7 +67,10 @@ def run(
     out, report = Path(out), progress or silent
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
-    check_board(options.reconstruct)
+    if options.reconstruct.board is not None:
+        from jcr.boards.detection import boards
+
+        boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
     if not isinstance(capture, Capture):

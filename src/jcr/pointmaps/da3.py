@@ -46,10 +46,7 @@ def reconstruct_da3(
 
 
 def load(weights: Path, device: str) -> Predict:
-    """Return the function that predicts views with the network of a folder with config.json and model.safetensors.
-
-    Raises InputError for files that are missing, damaged or of another network.
-    """
+    """Return the function that predicts views by a network's folder; raise InputError if its files are not usable."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -105,10 +102,7 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
 
 
 def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Return the network's grid for an image of `size` (width, height), px.
-
-    The long edge is resized to `long_edge` px, and both edges are rounded to multiples of PATCH.
-    """
+    """Return the grid of an image of `size` px: its long edge is `long_edge`, and both are multiples of PATCH."""
     edges = (round(edge * long_edge / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))

@@ -60,18 +60,12 @@ class PairPredictions:
 
 
 def read_pairs(path: Path) -> PairPredictions:
-    """Read pairwise predictions from an npz file and check them.
-
-    Raises InputError for a file that is missing, damaged, lacks an array, or has inconsistent shapes.
-    """
+    """Read pairwise predictions from an npz file; raise InputError if it is damaged, incomplete or inconsistent."""
     return pairs_from_arrays(read_arrays(path), str(path))
 
 
 def read_arrays(path: Path) -> dict[str, ndarray]:
-    """Read all arrays of an npz file.
-
-    Raises InputError for a file that is missing or damaged, or that does not fit into memory.
-    """
+    """Read all arrays of an npz file; raise InputError if it is missing or damaged, or does not fit into memory."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give predictions as npz (jcr docs predictions)")
     try:
@@ -170,10 +164,7 @@ def camera_of_arrays(
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
-    """Return all ordered pairs of `count` images, as rows of images: first (i, j) with i > j, then each reversed.
-
-    DUSt3R has the same order.
-    """
+    """Return all ordered pairs of `count` images as in DUSt3R: first (i, j) with i > j, then each reversed."""
     return window_pairs(count, count)
 
 

@@ -40,10 +40,7 @@ class PosedPointmaps:
     warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
-        """Return the pointmaps with each point moved, at constant z, to its pixel's ray by the grid's `pinhole`.
-
-        Points with confidence 0 become 0.
-        """
+        """Return the pointmaps with points moved, at constant z, to their pixels' rays; 0 where the confidence is 0."""
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 

@@ -26,10 +26,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Content:
-    """Return tables of names and values: calibration, map (`map_history`), options of each stage, and versions.
-
-    `map_history` are names and values stored with the map; None: there is no map.
-    """
+    """Return tables of names and values: calibration, map (None: no map), options of each stage, and versions."""
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {

@@ -1,10 +1,9 @@
 """File report.html: one page with the verdict on a calibration, the transform to copy, and the evidence."""
 
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-from jcr.calibration.record import AnyCalibration, FailedCalibration
+from jcr.calibration.record import FailedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
@@ -75,14 +74,6 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         }
     sections["details"] = details_section(calibration, options, None if scene is None else scene.history)
     shown = {name: content for name, content in sections.items() if content is not None}
-    return _page(about, source, calibration, shown)
-
-
-def _page(about: str, source: Path, calibration: AnyCalibration, sections: Mapping[str, Content]) -> str:
-    """Return the report as one HTML page; `sections` maps the name of each section to the content of its template.
-
-    `about` is a line on the capture, `source` the path of the capture that the user gave.
-    """
     # Files with a usual name, such as capture.json, do not name the capture; their folder does.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -97,8 +88,8 @@ def _page(about: str, source: Path, calibration: AnyCalibration, sections: Mappi
     content = {
         "name": printable(named.resolve().name),
         "about": [*lines, run, printable(str(source))],
-        "sections": sections,
+        "sections": shown,
         "open": OPEN,
-        "links": {name: LINKS[name] for name in sections if name in LINKS},
+        "links": {name: LINKS[name] for name in shown if name in LINKS},
     }
     return render("report.html", content)

@@ -1,5 +1,7 @@
 """Section of the images in the report: each with its residuals and the reprojection errors of its features."""
 
+import base64
+import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -7,18 +9,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics
-from jcr.report.render import Content, image_url
+from jcr.report.render import Content
 from jcr.result import RunResult
 from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Largest and smallest width (px) of the images in the report, and largest number of pixels of all together, which is
 about a megabyte."""
+JPEG_QUALITY = 80
 MARKS, MAGNIFIED = 120, 20
 """Largest number of features drawn over an image, and factor by which their reprojection errors are magnified."""
 SHOWN = 12
@@ -114,7 +118,6 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
     shape = capture.image_size[1] / capture.image_size[0]
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)
-
     size = width, round(width * shape)
     undistort = None
     if intrinsics is not None and is_distorted(intrinsics):
@@ -124,7 +127,9 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
     def thumbnail(name: str) -> str:
         """Return one image as a data URL."""
         pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
-        return image_url(pixels if undistort is None else undistort(pixels))
+        stream, shown = io.BytesIO(), pixels if undistort is None else undistort(pixels)
+        Image.fromarray(shown).save(stream, "JPEG", quality=JPEG_QUALITY)
+        return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(thumbnail, capture.images))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jcr.calibration.words import given_in_words, seen_in_words
-from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
+from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses
 from jcr.estimation.observability import WEAK, excitation
 from jcr.records import Capture, Excitation, NextPose
 from jcr.report.render import Content
@@ -93,10 +93,12 @@ def _next_poses(result: RunResult) -> dict[str, Any] | None:
     capture, convention = result.capture, ANY_CONVENTION
     if isinstance(capture, Capture):
         convention = capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
-    written = MATRICES.get(convention) or ", ".join(CONVENTIONS[convention].columns)
+    form = CONVENTIONS[convention]
+    units = f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
+    written = MATRICES.get(convention) or ", ".join(form.columns)
     return {
         "in_the_3d_view": isinstance(capture, Capture),
-        "notation": f"{written} ({units_of(convention)}), as {convention} writes poses",
+        "notation": f"{written} ({units}), as {convention} writes poses",
         "rows": [_next_pose(pose, convention) for pose in poses],
     }
 

@@ -1,8 +1,6 @@
-"""Rendering of HTML pages from templates, with every text escaped and all files embedded; images and label colours."""
+"""Rendering of HTML pages from templates, with every text escaped and all files embedded, and label colours."""
 
-import base64
 import colorsys
-import io
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -12,15 +10,11 @@ from jaxtyping import UInt8
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy import ndarray
-from PIL import Image
 
 REPORT = "jcr.report"
 """Package whose templates all pages share."""
 TRACK_COLOR = (229, 40, 40)
 """RGB of tracked features in 3D views."""
-JPEG_QUALITY = 80
-
-
 Content = Mapping[str, Any]
 """Content of a section of the report; its template reads it as the variable `it`."""
 
@@ -53,10 +47,3 @@ def label_colors(count: int) -> UInt8[ndarray, "k 3"]:
     rgb = np.array([colorsys.hsv_to_rgb(h, 0.6, 0.88) for h in hue])
     rgb[0] = 0.6
     return (255 * rgb).astype(np.uint8)
-
-
-def image_url(pixels: UInt8[ndarray, "h w *c"]) -> str:
-    """Return the data URL of a JPEG of grey (h,w) or RGB (h,w,3) pixels."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "JPEG", quality=JPEG_QUALITY)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -13,10 +13,7 @@ NOTICEABLE = 1.05
 
 
 def residuals_section(result: RunResult) -> Content:
-    """Return the section on residuals of gripper poses against camera poses (mm, degrees).
-
-    Its content: residuals of each image as numbers and bars, those of the whole fit, and the robot pose noise.
-    """
+    """Return residuals of gripper poses against camera poses (mm, degrees), each and in total, and robot pose noise."""
     fit = result.found
     named = zip(shown_names(fit.images), fit.images, strict=True)
     rows = [(name, one) for name, one in named if one.translation_residual_mm is not None]

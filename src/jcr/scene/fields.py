@@ -200,10 +200,7 @@ class Field(nn.Module):
 
     @property
     def tables(self) -> nn.ParameterList:
-        """Trainable features: for each grid a table with a row per selected node, after a row 0 for all others.
-
-        The columns are the features of a node.
-        """
+        """Trainable features: a table (nodes + 1, features) for each grid; row 0 is for nodes that are not selected."""
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:

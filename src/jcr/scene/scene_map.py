@@ -137,10 +137,7 @@ class Sample:
         return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
-        """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
-
-        `ask` maps points (n,3) m to tensors with n rows.
-        """
+        """Return results of `ask` (points (n,3) m to tensors) at the query's points; arrays if the points are arrays."""
         answers = in_chunks(ask, self._x)
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 

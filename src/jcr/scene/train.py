@@ -84,10 +84,7 @@ def workspace_box(
 
 
 def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
-    """Return the indices of the cloud's points inside `box`, the lower and upper corner (m, base frame).
-
-    Raises InputError if fewer than 100 points are inside.
-    """
+    """Return the indices of the cloud's points inside `box` (two corners, m); raise InputError for fewer than 100."""
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
     if len(inside) < 100:

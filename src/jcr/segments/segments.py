@@ -57,10 +57,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Return the name of each label in the file `path`, names.json; an empty dict if there is no such file.
-
-    Raises InputError if the file has another format.
-    """
+    """Return the names of the labels in names.json at `path`, empty without it; raise InputError for another format."""
     if not path.is_file():
         return {}
     try:

@@ -88,10 +88,7 @@ class LiveMap:
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:
-        """Return the map as a reconstruction; None with fewer than two registered images.
-
-        Its `image_index` counts the rows of the capture.
-        """
+        """Return the map's reconstruction, with rows of the capture as `image_index`; None for fewer than two images."""
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None

@@ -75,10 +75,7 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Int
 def write_database(
     folder: Path, camera: pycolmap.Camera, x_px: Sequence[Float[ndarray, "_ 2"]], geometries: Geometries
 ) -> Path:
-    """Write `database.db` for COLMAP to `folder`: images of one camera, keypoints and verified matches; return its path.
-
-    `x_px` has the keypoints (x, y) of each image, in pixels of the images of `camera`.
-    """
+    """Write COLMAP's `database.db` to `folder`: keypoints (pixels of `camera`) and matches; return its path."""
     with closing(pycolmap.Database.open(folder / "database.db")) as db:
         db.write_camera(camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)

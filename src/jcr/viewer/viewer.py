@@ -32,6 +32,7 @@ from jcr.report.verdict import head
 from jcr.result import RunResult
 from jcr.scene.scene_map import SceneMap, Unknown
 from jcr.scene.surface import sample_surface
+from jcr.segments.measure import Measurement
 
 if TYPE_CHECKING:
     import yourdfpy
@@ -81,10 +82,7 @@ class LocalServer(viser.ViserServer):
 
 
 def open_server(port: int, title: str) -> LocalServer:
-    """Start a server at a port of 127.0.0.1 (0: any free one) and return it; `title` is the title of its page.
-
-    Raises InputError if the port is invalid or in use.
-    """
+    """Start a server at a port of 127.0.0.1 (0: any free one); raise InputError if the port is invalid or in use."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
     with redirect_stdout(io.StringIO()):
@@ -168,7 +166,7 @@ class Viewer:
             self._surface = sample_surface(self.scene, MAP_POINTS)
             self._palette, self._solid = label_colors(len(self.scene.label_names)), self._surface[0]
             report("view", 0.6)
-            self._add_map(self.scene)
+            self._add_map(self.scene, run.measured)
         self.show_points()
         self.choose_image()
         # The initial view is obliquely from above, and far enough to show the points and the cameras.
@@ -237,14 +235,14 @@ class Viewer:
             """Show the values at the clicked point."""
             self.click(np.array(event.ray_origin), np.array(event.ray_direction))
 
-    def _add_map(self, map: SceneMap) -> None:
+    def _add_map(self, map: SceneMap, measured: Measurement | None) -> None:
         """Add a slice of the map, the border of unknown space (hidden), and a sphere to move, with their controls.
 
-        The slice is horizontal. The sphere begins 0.15 m above the table: the most frequent height of surface points.
+        The slice is horizontal. The sphere begins 0.15 m above the support plane of `measured`, or above the floor.
         """
         gui, scene, (low, high) = self.server.gui, self.server.scene, map.box
-        counts, edges = np.histogram(self._solid[:, 2], bins=100)
-        table_m = float(np.clip(edges[counts.argmax()], low[2], high[2] - 0.02))
+        height = low[2] if measured is None else measured.support.base_from_support[2, 3]
+        table_m = float(np.clip(height, low[2], high[2] - 0.02))
         with gui.add_folder("Map", expand_by_default=False):
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *SLICE_LEGENDS), initial_value="none")

@@ -55,10 +55,7 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 
 def read_intrinsics(file: Path) -> IntrinsicsEntry:
-    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics".
-
-    Raises InputError if the file is missing or holds no valid intrinsics.
-    """
+    """Read intrinsics from a JSON file that holds them, alone or as "intrinsics"; raise InputError if there are none."""
     content = read_json(file)
     if isinstance(content, dict):
         content = content.get("intrinsics", content)
@@ -251,10 +248,7 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
-    """Write the capture.json of a capture whose images are in `folder` already, and copy the arm's URDF beside it.
-
-    `remarks` are further entries of the file, which readers of captures ignore.
-    """
+    """Write the capture.json and URDF of a capture to `folder`, which has the images; readers ignore `remarks`."""
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}

@@ -155,10 +155,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 def _read_table(
     path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
-    """Read columns of one episode from a Parquet table: a list of values for each name in `columns`.
-
-    `rows` are the frame indices to read; None: all frames of the episode.
-    """
+    """Read columns of an episode from a Parquet table: a list of values by name; `rows`: frame indices, None: all."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
@@ -216,10 +213,7 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield the RGB frames at n ascending times (s) since the start of a video.
-
-    Raises InputError if the file is no video, or if a time has no frame within `tolerance_s`.
-    """
+    """Yield the video's RGB frames at n ascending times (s); raise InputError if one has none within `tolerance_s`."""
     av = extra("av", "lerobot", "a video")
     due = time_s.tolist()
     try:

@@ -64,10 +64,7 @@ def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[st
 
 
 def _entries(content: Any) -> list[Any]:
-    """Return the entries (one per image) of the content of a YAML or JSON file; empty if it has none.
-
-    The content is a list, an object that contains a list, or an object that maps image names to poses.
-    """
+    """Return the entries of YAML or JSON: a list, an object with a list, or poses by image name; empty without any."""
     if isinstance(content, list):
         return content
     if not isinstance(content, dict):
@@ -79,10 +76,7 @@ def _entries(content: Any) -> list[Any]:
 
 
 def _entry(entry: Any, where: str) -> Entry:
-    """Return one entry of a list of poses as a dictionary from column name to number; a row of bare numbers as a list.
-
-    Raises InputError, begun with `where`, if the entry has no pose, or two values for one column.
-    """
+    """Return an entry of a list of poses as numbers by column name, or a row of bare numbers as a list."""
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
         return entry
     cells = dict[str, Any]()

@@ -275,10 +275,7 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm".
-
-    The unit is "" if the header has none.
-    """
+    """Return the name that jcr uses for a column, and its unit or "": "Pos_X (mm)" gives "x" and "mm"."""
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")

@@ -105,10 +105,7 @@ class ImageObservations:
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-    """Return the pointmaps of all pairs that contain `image`, at its `pixels`.
-
-    A pixel is given by its index row · width + column on the pointmaps' grid.
-    """
+    """Return the pointmaps of all pairs with `image`, at its `pixels` (index row · width + column on the grid)."""
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))
