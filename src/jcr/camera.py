@@ -208,8 +208,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
     """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
 
-    The unknown of Newton's method is the angle between ray and optical axis. Coordinates whose angle exceeds 84° get a
-    ray at 84°.
+    The unknown of Newton's method is the angle between ray and optical axis, limited to 84°.
     """
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
@@ -230,8 +229,7 @@ def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Flo
 def fold_distance_px(camera: Intrinsics) -> float | None:
     """Return the distance (px) from the principal point at which the distortion folds over; None if it never does.
 
-    At a fold the determinant of the distortion's Jacobian reaches zero inside the image: two rays share one pixel, and
-    pixels beyond have no ray.
+    At a fold the determinant of the distortion's Jacobian is zero: two rays share a pixel, pixels beyond have no ray.
     """
     edges = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     (left, top), (right, bottom) = unproject(without_distortion(camera), edges)[:, :2]

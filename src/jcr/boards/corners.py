@@ -124,8 +124,7 @@ def _triangulated(
 ) -> Float[ndarray, "c 3"]:
     """Return the c corners in the recon frame, triangulated from b images; NaN for one in fewer than FEWEST_IMAGES.
 
-    `x_px` are pixels of the distorted images, NaN where a corner was not detected. `cameras` are recon_from_camera of
-    the b images.
+    `x_px` are pixels of the distorted images, NaN where not detected; `cameras` are recon_from_camera.
     """
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])
@@ -146,8 +145,7 @@ def _with_corners(
 ) -> tuple[Tracks, Body]:
     """Return the tracks with a board's corners in some images added, and the record of the board in these tracks.
 
-    `images` holds the indices of these images among the m registered ones. `cameras` are recon_from_camera of all m
-    images.
+    `images` are the indices of these among the m registered images; `cameras` are recon_from_camera of all m.
     """
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])

@@ -70,8 +70,7 @@ def boards(spec: str) -> list[Board]:
 
     A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its marker
     length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word SIDE
-    stands for an unknown side, which is then the unit of length. Raises InputError, with the valid forms, for a name
-    that means no board.
+    stands for an unknown side, which is then the unit of length. Raises InputError for a name of no board.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:
@@ -270,8 +269,7 @@ def most_seen(
     """Return the board of the candidates `readings` with most points in the images, and its detections in each image.
 
     The images are RGB. The first board is tried first. The others are tried only while the best board is found in fewer
-    than half of the images. All boards are then tried in images whose strongly coloured pixels are filled in, under the
-    same condition.
+    than half of the images. Under the same condition, images whose strongly coloured pixels are filled in follow.
     """
     best, seen, points = readings[0], [], -1
     for fill in (False, True):

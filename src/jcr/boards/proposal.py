@@ -79,8 +79,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 def proposed(capture: Capture, board: str | None) -> tuple[Finding, ...]:
     """Return the finding that the capture's images show a board, with the value of --board that would use it.
 
-    The result is an empty tuple if they show none, if the option --board has a value (`board`), or if the camera is
-    fixed.
+    The result is empty if they show none, if --board has a value (`board`), or if the camera is fixed.
     """
     if board is not None or capture.mount == "base":
         return ()

@@ -20,8 +20,7 @@ from jcr.records import Capture
 from jcr.records.capture_json import other_size
 
 ROTATED = {3: "rotated by 180°", 6: "rotated by 90° clockwise", 8: "rotated by 90° counter-clockwise"}
-"""Rotation that shows an image upright, by its EXIF orientation (EXIF 2.32, tag 274). Orientations that are not listed
-mirror the image."""
+"""Rotation that shows an image upright, by its EXIF orientation (EXIF 2.32, tag 274); the others mirror it."""
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """Position (m) and rotation (rad) within which two gripper poses count as equal."""
 

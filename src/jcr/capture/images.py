@@ -34,8 +34,7 @@ ONE_VIEW = 0.25
 fourteen real captures the ratio is below 0.1 for images of one place with noise of 6 levels, 0.35 where the robot holds
 a board that fills a third of them, and above 0.75 between places."""
 USUAL_GREY = 2.0
-"""Smallest contrast (grey levels) by which details are normalised. Noise of 4 levels has a contrast of 0.6 after its
-Gaussian filter."""
+"""Smallest contrast (grey levels) by which details are normalised; noise of 4 levels has 0.6 after the filter."""
 DEPTH = "depth"
 """Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
 DARK, BRIGHT = 12, 243

@@ -43,8 +43,7 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
     """Pair the poses of a file with a folder's images by name, else by time stamp, else by order of the names.
 
     Return image paths relative to `folder`, base_from_gripper of each, messages by index for images without a usable
-    pose, and notes for the user. Poses paired by time are interpolated. Raises InputError if poses and images cannot be
-    paired.
+    pose, and notes for the user. Poses paired by time are interpolated. Raises InputError if that is impossible.
     """
     if table.images is not None:
         return _paired_by_name(folder, file, table)

@@ -22,8 +22,7 @@ a sample, NEVER outside of the recording."""
 NEVER = np.iinfo(np.int64).max
 """Gap (ns) of a time stamp before the first sample or after the last."""
 SPEED_OVER_NS = 50_000_000
-"""Half of the time (ns) over which speed is measured: long against the resolution of an encoder, short against a
-stop."""
+"""Half of the time (ns) over which speed is measured: long for an encoder's resolution, short against a stop."""
 
 
 def interpolated_poses(
@@ -67,8 +66,7 @@ def bracket(
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     """Return the speed (m/s) of a moving frame at n time stamps (ns), averaged over 0.1 s around each.
 
-    The speed is that of the translation plus 0.3 m times the angular speed (rad/s). `poses_at` is a function from time
-    stamps to poses and gaps.
+    The speed is that of the translation plus 0.3 m times the angular speed (rad/s).
     """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
@@ -104,8 +102,7 @@ class TfTree:
         """Return a function from time stamps (ns) to base_from_gripper and the gaps (ns) between samples around each.
 
         A gap is the largest of all transforms between the frames; static transforms have none. `base` and `gripper` are
-        names of frames. Raises InputError, begun with `source`, if one is None or unknown, or if they are not
-        connected.
+        names of frames. Raises InputError, begun with `source`, if they are unknown or not connected.
         """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
@@ -138,8 +135,7 @@ class TfTree:
     def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
         """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static.
 
-        Samples are in the order of the messages. Raises InputError, begun with `source`, for numbers that are no
-        transform.
+        Samples are in the order of the messages. Raises InputError for numbers that are no transform.
         """
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)

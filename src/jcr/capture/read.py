@@ -63,8 +63,7 @@ def read_source(
 ) -> Capture | PosePairs:
     """Return the capture at a path, or PosePairs if the file has camera poses but no images.
 
-    The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the frames of the same
-    files and options already.
+    The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the same frames.
     """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():

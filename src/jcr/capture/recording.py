@@ -28,8 +28,7 @@ by a tenth of a pixel in 20 ms."""
 LOOKS = 5
 """Number of frames of one stop whose sharpness is compared."""
 SAME_VIEW = 0.005
-"""Smallest distance (m) between two views; rotation counts as in motion_length. The sharpest of closer frames is
-kept."""
+"""Smallest distance (m) between two views, as by motion_length; the sharpest of closer frames is kept."""
 WEAK = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
 Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
@@ -56,8 +55,7 @@ class Recording:
     intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics | None] = lambda _: None
     """Function from an image size (width, height) to the recorded intrinsics; used without `options.camera_info`."""
     joints: Float[ndarray, "n j"] | None = None
-    """Joint angles (rad) of the arm in `options.urdf`, one row per frame, one column per joint; None if they are
-    unknown."""
+    """Joint angles (rad) of the arm in `options.urdf`, one row per frame; None if they are unknown."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
     """Function from a row to the depth image (mm) aligned with its frame; None without depth."""
 

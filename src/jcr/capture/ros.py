@@ -22,8 +22,7 @@ _ROS_MODELS: dict[str, DistortionModel] = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
-"""Distortion models of jcr by their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write
-fisheye)."""
+"""Distortion models of jcr by their names in ROS (sensor_msgs/distortion_models.hpp; depthai writes fisheye)."""
 _Numbers = Annotated[
     list[float], BeforeValidator(lambda array: list(array) if hasattr(array, "__iter__") else array)
 ]
@@ -115,8 +114,7 @@ def read_ros_camera_info(message: Any) -> Intrinsics | None:
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """Return the image in a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth and for
-    encodings that jcr does not read.
+    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError for depth and unknown encodings.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)

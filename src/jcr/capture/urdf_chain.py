@@ -26,8 +26,7 @@ ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 def load_urdf(file: Path) -> "yourdfpy.URDF":
     """Read the robot of a URDF file, without its meshes.
 
-    Raises InputError if the file is no URDF, if a joint's origin is not rigid or its axis or limits are invalid, and if
-    joints form a loop.
+    Raises InputError if the file is no URDF, if a joint's origin, axis or limits are invalid, or if joints form a loop.
     """
     import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy

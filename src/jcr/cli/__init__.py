@@ -160,8 +160,7 @@ def command(name: str) -> Any:
 def dispatch(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit status; print an error as one line on stderr.
 
-    The status is 0 for success, 2 for invalid input or a lack of disk or memory, 3 for a rejected result, and 130 after
-    Ctrl-C.
+    The status is 0 for success, 2 for invalid input or lack of disk or memory, 3 if rejected, 130 after Ctrl-C.
     """
     try:
         status = _dispatched(arguments)

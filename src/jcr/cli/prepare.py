@@ -17,8 +17,7 @@ from jcr.reconstruct import BACKENDS, weights_command
 
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
-"""Folders of the manual's pages. Pages in `results` are named with their folder, because other pages have the same
-names."""
+"""Folders of the manual's pages; pages in `results`, whose names others have, are named with their folder."""
 SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 

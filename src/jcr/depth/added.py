@@ -19,8 +19,7 @@ NEIGHBOURS = 6
 REACH = 1.5
 """Factor by which the searched range of inverse depth is widened: a new object may be taller than all others."""
 CONTRADICTION = 0.015
-"""Relative difference of depth from which one surface counts as nearer than another; noise of depth and poses is
-smaller."""
+"""Relative difference of depth from which one surface counts as nearer than another, above depth and pose noise."""
 LEAST_SHARE = 0.005
 """Least share of a new image's pixels that must get a depth; with less, the image is taken to show another scene."""
 
@@ -115,8 +114,7 @@ def _contradicted(
 
     `earlier` and `later` are image indices; all images are on the pixel grid of `pinhole`. `known` marks pixels with
     depth. The later image contradicts a point if its surface, within two pixels of the projection, is 1.5 % or more
-    behind (depth z). The later image also contradicts a pixel if two of its points project within one pixel and are
-    that much in front.
+    behind (depth z). So does a later image if two of its points project within one pixel and are that much in front.
     """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
@@ -158,8 +156,7 @@ def _with_projections(
 ) -> Tracks:
     """Return the tracks with the projections of all points into the images from index `first` on as more observations.
 
-    Each projection is the nearest pixel on the grid of `pinhole`. Points outside of an image are left out; points that
-    are hidden by others are not.
+    Each projection is the nearest pixel on the grid of `pinhole`, also of hidden points; points outside are left out.
     """
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row in range(first, len(recon_from_camera)):

@@ -71,8 +71,7 @@ def undistorted(
 ) -> UInt8[ndarray, "m h w 3"]:
     """Read the RGB images `names` in `folder`; return them without distortion, on the pixel grid of `pinhole`.
 
-    `intrinsics` are those of the files' images. Colours are interpolated bilinearly, and averaged over areas if
-    `pinhole` has fewer pixels.
+    `intrinsics` are those of the files. Colours are bilinear, or averages over areas if `pinhole` has fewer pixels.
     """
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])

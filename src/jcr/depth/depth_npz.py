@@ -35,8 +35,7 @@ class DepthHeader(BaseModel):
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
     """Write depth z, its std and origin, and confidence of a reconstruction's pointmaps to a file depth.npz.
 
-    After an error there is no incomplete file. `made_from` is the fingerprint of reconstruction and options that
-    `is_made_from` compares.
+    An error leaves no incomplete file. `made_from` is the fingerprint that `is_made_from` compares.
     """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None

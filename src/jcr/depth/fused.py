@@ -30,8 +30,7 @@ MATCHING_STD_PX = 0.6
 """Standard deviation of a matched pixel in a neighbour, px. Fitted to simulated scenes; it is larger than the scatter
 of single pixels because the errors of adjacent windows are correlated."""
 PRIOR_FLOOR = 0.002
-"""Relative standard deviation of the depth of a plane, added in quadrature to the scatter of the pixels that support
-it."""
+"""Relative standard deviation of a plane's depth, added in quadrature to the scatter of its supporting pixels."""
 PAIR_CORRELATION = 0.5
 """Least correlation of a depth that only one other image agrees with, and that the plane of its region confirms.
 Without the confirmation, a third of such depths are off by 5 mm."""

@@ -40,8 +40,7 @@ class Lanes:
     def gathered(self, start: Any, used: int) -> "Lanes":
         """Load 64 bits for each of the first `used` lanes; later lanes of the result are 0.
 
-        The lanes of this vector are indices of elements, counted from the LLVM pointer `start`, at which the 64 bits
-        begin.
+        The lanes are the indices, counted from the LLVM pointer `start`, of the elements at which the 64 bits begin.
         """
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
         for lane in range(used):

@@ -18,12 +18,10 @@ from jcr.records import Intrinsics
 COMPARED = 5
 """Number of neighbours that an image is matched with at half resolution: the first ones of its list."""
 ASKED = 3
-"""Number of neighbours that a pixel is matched with at full resolution: those of highest correlation at half
-resolution."""
+"""Number of neighbours matched with at full resolution: those of highest correlation at half resolution."""
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
-"""Passes of PatchMatch at half (`_COARSE`) and at full resolution: relative change of inverse depth, and number of
-trials."""
+"""Passes of PatchMatch at half (`_COARSE`) and full resolution: relative change of inverse depth, and trials."""
 _PEAK = 0.003
 """Relative change of inverse depth, to either side, at which the parabola of the last refinement is sampled."""
 LEAST = 0.25

@@ -21,8 +21,7 @@ from jcr.records import Intrinsics
 ON_PLANE = 0.006
 """Largest relative difference of inverse depth at which a matched pixel counts as lying on a plane."""
 SAME_COLOUR = 0.1
-"""Distance of colours (RGB, each 0 to 1, exposure and vignetting compensated) below which two pixels may show one
-point."""
+"""Distance of colours (RGB, 0 to 1, exposure and vignetting compensated) below which two pixels may show one point."""
 FARTHEST = 3.5
 """Distance up to which a plane is continued, in standard deviations of the positions of its supporting pixels. The
 support plane is continued without limit."""

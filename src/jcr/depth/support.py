@@ -9,8 +9,7 @@ PLANES, SAMPLE = 400, 20_000
 LEAST_SHARE, FEWEST = 0.1, 10
 """Least share and least number of the points tested that must lie on the plane."""
 LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
-"""Smallest cosine between the normal of a level plane and the z axis, and factor by which the points of level planes
-count."""
+"""Smallest cosine between a level plane's normal and the z axis, and weight of the points of level planes."""
 
 
 def support_plane(

@@ -74,8 +74,7 @@ def blocks_of(columns: int) -> int:
 def _write_windows(typing, rows, image, v, block):
     """Write to `rows`, the result of `windows`, the weights and weighted greys of the 16 pixels of a block of row v.
 
-    `typing` is numba's typing context, which is not used. `image` is that of `windows`; `block` counts the blocks of 16
-    columns.
+    numba's `typing` context is not used. `image` is that of `windows`; `block` counts the blocks of 16 columns.
     """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:

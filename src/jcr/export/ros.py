@@ -29,8 +29,7 @@ _DISTORTIONS = {
     "fisheye": "equidistant",
 }
 ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
-"""Transform from a camera's optical frame (z forward, x right, y down) to its root link (x forward, y left, z up), as
-in REP-103; both have one origin."""
+"""Transform from a camera's optical frame (z forward, x right) to its root link (x forward, z up), as in REP-103."""
 
 _FRAME_NAME = re.compile(r"(?!.*--)[A-Za-z0-9_][A-Za-z0-9_/.\-]*")  # two hyphens would end an XML comment
 

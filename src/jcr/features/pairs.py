@@ -28,8 +28,7 @@ PRIOR_STD_M = 0.2
 """Standard deviation, m, of the camera's position about the flange: a camera is mounted on the flange or near it."""
 ROBOT_STD_M = 2e-3
 LEAST_DIRECTION_STD = 0.01
-"""Least standard deviation, rad, of the direction of a two-view translation; forward motion and plane scenes determine
-it weakly."""
+"""Least standard deviation, rad, of a two-view translation's direction, which plane scenes determine weakly."""
 ROUNDS = 15
 POINTS_OF_PAIR = 60
 

@@ -55,8 +55,7 @@ FOCALS = np.geomspace(0.35, 2.5, 40)
 FOCAL_TOLERANCE = math.radians(1.5)
 """Standard deviation, rad, of the angles' difference by which a pair supports a focal length."""
 LEAST_SUPPORT = 3.0
-"""Least sum of the pairs' supports (0 to 1 each) for the best focal length; with less, the focal length is
-undetermined."""
+"""Least sum of the pairs' supports (0 to 1 each) with which the best focal length is determined."""
 FOCAL_MATCHES = 200
 """Largest number of matches of a pair by which points in front of both cameras are counted."""
 

@@ -29,8 +29,7 @@ MEET_WITHIN = (0.1, 2.0)
 AGREED = 0.5
 """Largest cost (0 to 1) of a point whose depth and colour are used."""
 IMAGES_AT_FULL = 10
-"""Largest number of images that each get all points; with more images each gets fewer, because more images see each
-point."""
+"""Largest number of images that each get all points; more images see each point more often and get fewer."""
 STEPS, ENOUGH = 8, 3e-4
 """Largest number of damped steps in a round, and the relative change of the cost below which the round ends."""
 SETTLED = 0.995

@@ -20,8 +20,7 @@ from jcr.records import Intrinsics
 BLUR_PX = 1.0
 """Standard deviation, px, of the blur of every level, which turns an edge into a slope for linear steps."""
 SEEN_BY = 0.6
-"""Share of the other images, those of least cost, that the cost of a depth counts; an object may hide the point from
-others."""
+"""Share of the other images, those of least cost, that the cost of a depth counts; others may not see the point."""
 NEAREST = 0.05
 """Least depth of a point in front of a camera, m."""
 FAINT = 2.0 / 255

@@ -121,8 +121,7 @@ def prepare_images(
 ) -> PreparedImages:
     """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
 
-    `grid_of` returns the resize and crop for an image's width and height. Raises InputError for an image that cannot be
-    read.
+    `grid_of` returns the resize and crop for a width and height. Raises InputError for an unreadable image.
     """
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics

@@ -20,8 +20,7 @@ from jcr.records import Capture, Reconstruction
 POINTMAPS = {"confidence": "N H W", "recon_from_camera": "N 4 4", "points_in_recon": "N H W 3"}
 """Required arrays of pointmaps in one frame, and their shapes; N images of H x W pixels."""
 LARGEST_MISFIT = 0.02
-"""Largest median distance of the points' projections from their pixels, as a share of the width; above it the poses are
-wrong."""
+"""Largest median distance of projections from their pixels, as a share of the width; beyond it poses are wrong."""
 
 
 def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:

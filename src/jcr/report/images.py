@@ -20,8 +20,7 @@ from jcr.result import RunResult
 from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
-"""Largest and smallest width (px) of the images in the report, and largest number of pixels of all together, which is
-about a megabyte."""
+"""Largest and smallest width (px) of the images in the report, and largest number of all their pixels, about 1 MB."""
 JPEG_QUALITY = 80
 MARKS, MAGNIFIED = 120, 20
 """Largest number of features drawn over an image, and factor by which their reprojection errors are magnified."""

@@ -23,8 +23,7 @@ TRACK_SIZE = 0.006
 
 
 PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
-"""Layer of points that can be shown or hidden: name, points (m, base frame), RGB, and side (m) of the squares as which
-points are drawn."""
+"""Layer of points that can be shown or hidden: name, points (m, base frame), RGB, and side (m) of their squares."""
 
 
 def scene_section(result: RunResult) -> Content:

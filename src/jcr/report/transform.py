@@ -141,8 +141,7 @@ def _projection(
 ) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
     """Return a function that projects points (k,3) m to pixels (k,2) of the sketch, in parallel projection.
 
-    The points are in the parent frame. The scale is such that all points `x` are visible; `down`: the z axis is drawn
-    downwards, else upwards.
+    The points are in the parent frame. All points `x` are visible; `down`: the z axis is drawn downwards.
     """
     azimuth, elevation = np.radians(EYE_DEG)
     up_z = -1.0 if down else 1.0

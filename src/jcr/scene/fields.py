@@ -79,8 +79,7 @@ class Interpolate(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
         """Return the sum of 8 weighted rows of `table` (k, features) for each of n points, shape (features, n).
 
-        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights; `ctx` is torch's context of the
-        operation.
+        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights; `ctx` is torch's context.
         """
         ctx.save_for_backward(table, rows, weight)
         return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
@@ -114,8 +113,7 @@ def interpolate_grid(
     """Return k quantities of a regular grid, interpolated trilinearly at n points (m), shape (k,n).
 
     `table` (k,nz,ny,nx) has the k quantities at each node. `lower` is the position (m) of the first node in the frame
-    of the points; `cell` is the spacing (m). A point outside of the grid has the values of the nearest point on its
-    border.
+    of the points; `cell` is the spacing (m). Points outside have the values of the border.
     """
     cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
     at = ((x_in_base - lower) * (2.0 / (cell * cells)) - 1.0).view(1, 1, 1, -1, 3)

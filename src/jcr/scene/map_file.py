@@ -18,8 +18,7 @@ PACKAGES = "torch", "safetensors", "skimage"
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     """Load the map of a run folder, or a map file, onto a device such as "cpu" or "cuda".
 
-    Raises InputError if there is no map, if it is damaged, if it has the format of another version of jcr, or if a
-    package is not installed.
+    Raises InputError if the map is missing, damaged or of another version of jcr, or if a package is not installed.
     """
     path = Path(folder)
     path = path / FILE if path.is_dir() else path
@@ -59,8 +58,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 def require_packages(what: str, otherwise: str = "") -> None:
     """Raise InputError if one of the `PACKAGES` of the map is not installed.
 
-    In the message, `what` is the part of jcr that needs the package; `otherwise` is added at the end, such as another
-    remedy.
+    In the message, `what` is the part of jcr that needs the package; `otherwise` is another remedy.
     """
     for package in PACKAGES:
         extra(package, "map", what, otherwise)

@@ -141,8 +141,7 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
 def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
     """Return the joints of a robot, parents before children; a joint names its two links by their indices in `links`.
 
-    `links` are the names of the links. Raises InputError, begun with `path`, for an unsupported type of joint, or a
-    joint that mimics a dependent one.
+    `links` are their names. Raises InputError for an unsupported type of joint, or one that mimics a dependent joint.
     """
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):

@@ -339,8 +339,7 @@ class SceneMap:
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
         """Return points (n,3) m as a tensor on the map's device.
 
-        Raises InputError for another shape, values that are not finite, or an invalid `unknown`; `what` is the name of
-        the points in the message.
+        Raises InputError, naming them `what`, for another shape, infinite values, or an invalid `unknown`.
         """
         if unknown not in get_args(Unknown):
             raise InputError(f"unknown={unknown!r}: choose occupied, free or report")

@@ -54,8 +54,7 @@ def sample_surface(
 ) -> tuple[Float[ndarray, "n 3"], UInt8[ndarray, "n 3"], Int[ndarray, " n"]]:
     """Return positions (n,3) m in the base frame, RGB (n,3) and label (n,) of `count` points of the seen surface.
 
-    The points are drawn uniformly over the area of `surface_mesh`; there are none if the map has no surface. Labels are
-    indices into the map's `label_names`.
+    The points are uniform over the area of `surface_mesh`, if there is any; labels are indices into `label_names`.
     """
     try:
         vertices, faces, color = surface_mesh(scene)

@@ -15,8 +15,7 @@ from jcr.segments.tabletop import FEWEST, Support, fit_support
 SHARPEST = 0.0005
 """Smallest width (m) over which heights are smoothed; twice the roughness of the plane if that is larger."""
 TOP_SHARE = 0.25
-"""Smallest density of points at a top, as a share of the object's mean density over its height; stray points are
-sparser."""
+"""Smallest density of points at a top, as a share of the object's mean density; stray points are sparser."""
 CELL = 0.003
 """Side (m) of the cells in which an object's points, seen from above, are counted."""
 EDGE_SHARE = 0.4
@@ -43,8 +42,7 @@ class ObjectSize:
     footprint_in_base: Float[ndarray, "k 3"]
     """Convex outline of the object on the plane: k corners (m) in order."""
     base_from_box: Float[ndarray, "4 4"]
-    """Pose of the object's smallest box that stands on the plane: origin at the centre, z up, x along the longer
-    horizontal side."""
+    """Pose of the object's smallest box on the plane: origin at the centre, z up, x along the longer side."""
     box_size: Float[ndarray, "3"]
     """Length, width and height (m) of the box, along its axes x, y, z."""
     box_std: Float[ndarray, "3"]
@@ -155,8 +153,7 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 
     `height` are the heights of the points above the plane (m), `roughness` the standard deviation (m) of their noise.
     The result is the median height around the highest peak in the density of heights. Peaks below a quarter (TOP_SHARE)
-    of the object's mean density are scatter. A high quantile would be 2 % and more too large for narrow tops with stray
-    points above them.
+    of the object's mean density are scatter. A high quantile would be 2 % too large for narrow tops.
     """
     width = max(2 * roughness, SHARPEST)
     step = width / 4

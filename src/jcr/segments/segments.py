@@ -78,8 +78,7 @@ def image_labels(
     """Return a label per pixel of the pointmaps, and label names; None for methods that label the cloud.
 
     The labels come from the capture's label images or Segment Anything, as set by `options`. With "auto" the result is
-    None if the capture has no label images. Raises InputError if requested label images are missing or Segment Anything
-    cannot be loaded.
+    None if the capture has no label images. Raises InputError if what is requested is missing.
     """
     if options.segments in ("auto", "labels"):
         labels = read_labels(capture, reconstruction)

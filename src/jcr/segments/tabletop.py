@@ -36,8 +36,7 @@ FEWEST, LEAST_SHARE = 30, 1e-3
 NOISE_REACH = 4.0
 """Largest height of a point on the plane, in standard deviations of the plane's noise."""
 CLEARLY = 1.5
-"""Multiple of the smallest height of an object that some of its points must exceed; noise reaches that height
-itself."""
+"""Multiple of the smallest height of an object that some of its points must exceed; noise reaches the height."""
 FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 """Smallest number of points of an occupied cell seen from above, and smallest share of the median cell's number. Cells
 with fewer points hold only stray points."""

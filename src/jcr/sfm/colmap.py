@@ -199,8 +199,7 @@ def _adjusted(
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
     """Return the initial intrinsics to try in turn, true if they are given rather than guessed, and warnings.
 
-    If the capture has usable intrinsics, they are the only ones. Otherwise each has a guessed focal length and no
-    distortion.
+    Usable intrinsics of the capture are the only ones; otherwise each has a guessed focal length and no distortion.
     """
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
@@ -262,8 +261,7 @@ def matcher_of(
 ) -> Matcher:
     """Return a matcher of the images by SIFT or XFeat (`features`); SIFT keypoints are found now, XFeat's later.
 
-    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`. `seed` is
-    that of RANSAC.
+    `camera` is COLMAP's camera at the size of matching, with given intrinsics if `known`; `seed` is RANSAC's.
     """
     if features != "xfeat":
         give_back()
@@ -282,8 +280,7 @@ def matcher_of(
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
     """Return the matches of features chosen at random by `seed`, so that at most _MOST_MATCHED keypoints remain.
 
-    A feature is a set of keypoints that matches connect; either all its matches are kept or none. `images` is the
-    number of images.
+    A feature is a set of keypoints that matches connect, all kept or none; `images` is the number of images.
     """
     rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
     ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]

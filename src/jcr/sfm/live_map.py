@@ -54,8 +54,7 @@ class LiveMap:
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
-        Images that are no longer in the capture are removed, and the map then begins anew. With FEW images or fewer,
-        every update begins anew.
+        Images that left the capture are removed. The map then begins anew, as in every update with FEW images or fewer.
         """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)

@@ -31,8 +31,7 @@ LEAST_POINTS = 15
 LEAST_MAPPED = 4
 """Least number of mapped cameras from which the others are predicted."""
 RADII_PX = (8.0, 4.0)
-"""Largest distance, px, of a keypoint from the projection of its point, one per pass; each pass ends with an adjustment
-of the cameras and points."""
+"""Largest distance, px, of a keypoint from the projection of its point in each pass, before an adjustment."""
 RATIO = 0.85
 """Largest ratio of the descriptor distances to the best and the second-best keypoint near the projection."""
 LARGEST_PX = 4.0

@@ -23,8 +23,7 @@ from jcr.geometry import inverse, transform
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 ENOUGH = 1e-6
-"""Relative change of the cost that ends an adjustment. COLMAP's 0 takes three times as long and moves cameras by only
-1e-5 of their distance."""
+"""Relative change of cost that ends an adjustment; COLMAP's 0 takes three times as long and changes 1e-5."""
 
 
 def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
@@ -144,8 +143,7 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
     """Return all observations of a model as (image, keypoint, point), point by point.
 
-    Image is a position in `image_ids`, keypoint a row among the image's keypoints, point a position among ascending
-    point ids.
+    Images are positions in `image_ids`, keypoints rows of their image, points positions among ascending ids.
     """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [

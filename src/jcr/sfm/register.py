@@ -74,8 +74,7 @@ def register(
 ) -> list[CameraPose | int]:
     """Return for each new image its camera pose in the recon frame; if it fails, the number of points that agree.
 
-    It fails with fewer than MIN_POINTS. `older` are the images of the reconstruction's rows, in their order. All images
-    are of one camera.
+    It fails with fewer than MIN_POINTS. `older` are the images of the reconstruction's rows. All are of one camera.
     """
     camera = reconstruction.intrinsics
     known = KnownImages.of(older, camera, reconstruction.recon_from_camera)

@@ -2,8 +2,7 @@
 
 Method: Gruen, "Adaptive least squares correlation", 1985, with derivatives of the reference (inverse composition; Baker
 and Matthews, IJCV 2004). The warp is that of a plane that faces the cameras, with a free affine part, gain and offset.
-Three sizes of the patch are tried; the one with the smallest variance is used (Förstner, "On the geometric precision of
-digital correlation", 1982).
+Of three sizes of the patch, the one with the smallest variance is used (Förstner 1982, geometric precision).
 """
 
 import os
@@ -29,8 +28,7 @@ LEAST_CORRELATION = 0.9
 KEYPOINT_STD_PX = 0.3
 """Standard deviation of a keypoint, px, and the largest one of an aligned observation."""
 _REDUCED = (4, 2, 1)
-"""Factors by which the images are reduced, which set the size of the patch; each level starts from the result of the one
-before."""
+"""Factors by which the images are reduced, and so the patch enlarged; each level starts from the one before."""
 _RADIUS, _WINDOW = 7, 4.5
 """Half of the patch's side, and standard deviation of its weights, in pixels of the reduced image."""
 _STEPS, _SETTLED_PX = 15, 0.01

@@ -100,8 +100,7 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
     """Return the robot of a URDF with its visual meshes, and its joint values (n,dof) at the n images (rad or m).
 
     The joint values of the capture are those of the first movable joints in the URDF; other joints, such as fingers,
-    are at 0. Raises InputError if the URDF cannot be read or has fewer movable joints, or the capture has no joint
-    values.
+    are at 0. Raises InputError for an unreadable URDF, fewer movable joints, or no joint values.
     """
     import yourdfpy
 
@@ -135,8 +134,7 @@ class Viewer:
     ) -> None:
         """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
 
-        There is no robot if `urdf` is None and the capture has no URDF or no joint values. Raises InputError as
-        `read_robot` does.
+        There is no robot without joint values or a URDF. Raises InputError as `read_robot` does.
         """
         report = progress or silent
         self.server, self._lock = server, threading.Lock()

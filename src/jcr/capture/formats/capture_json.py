@@ -196,9 +196,8 @@ def _stated_intrinsics(
 ) -> dict[str, Any]:
     """Return the intrinsics of an entry in a capture.json as the fields `intrinsics` and `intrinsics_std` of Capture.
 
-    `stated` is the entry, and `size` the width and height of the images (px). `intrinsics` is None, and
-    `intrinsics_std` is missing, where the entry has none. Raises InputError, begun with `where`, for invalid
-    intrinsics.
+    `size` is the width and height of the images (px). `intrinsics` is None, and `intrinsics_std` is missing, where the
+    entry `stated` has none. Raises InputError, begun with `where`, for invalid intrinsics.
     """
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")

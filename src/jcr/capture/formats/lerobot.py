@@ -118,8 +118,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """Read the episode number `index` (from 0) of the data set at `path`, whose meta/info.json is `info`.
 
-    `camera` and `key` are the names of the image column and of the column of robot states. Raises InputError if the
-    episode is missing or damaged.
+    `camera` and `key` name the columns of images and robot states. Raises InputError for a missing or damaged episode.
     """
     has_video = info.features[camera].dtype == "video"
     fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}

@@ -28,8 +28,7 @@ _IMAGE = (
 )  # fmt: skip
 _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
-"""Conventions that column names identify. Columns rx, ry, rz identify none, as they may be a rotation vector or
-angles."""
+"""Conventions that column names identify; rx, ry, rz, which may be a rotation vector or angles, identify none."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 _ALIASES = {
     re.compile(r"(?:[tp]_?|pos_|position_|translation_)([xyz])"): r"\1",
@@ -40,8 +39,7 @@ _ALIASES = {
 _EXPLICIT: dict[str, ConventionName] = {
     "ur_x": "ur", "rvec_x": "rotation-vector", "rotvec_x": "rotation-vector",
 }  # fmt: skip
-"""Conventions that the first rotation column identifies; `ur_x` is the name that is given to the columns of UR's
-p[…]."""
+"""Conventions that the first rotation column identifies; `ur_x` is that of UR's p[…]."""
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 
@@ -228,8 +226,7 @@ def _named_columns(
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
     """Read the header of a pose file (None without one) and the cells of every row.
 
-    The file is a text table, UR's p[…], YAML, JSON or .npy. Matrices of a .npy file become rows of numbers, matrix row
-    by matrix row.
+    The file is a text table, UR's p[…], YAML, JSON or .npy. Matrices of a .npy file are read row by row.
     """
     if file.suffix in pose_lists.SUFFIXES:
         return pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
@@ -256,8 +253,7 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
 def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
     """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp.
 
-    The header has "image" or "timestamp" if present, then x, y, z, ur_x, ur_y, ur_z. Raises InputError for a line that
-    differs.
+    The header has "image" or "timestamp" if present, then x, y, z, ur_x, ur_y, ur_z. Other lines raise InputError.
     """
     rows = list[list[str]]()
     for number, line in enumerate(lines, start=1):

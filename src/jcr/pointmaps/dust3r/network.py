@@ -117,8 +117,7 @@ class Dust3r(nn.Module):
     ) -> tuple[Pointmap, Pointmap]:
         """Return the pointmaps of both images of each pair, in the first camera's frame.
 
-        Colours are RGB, scaled to [-1, 1]. Height and width are multiples of 16, else ValueError is raised; portrait
-        images are accepted.
+        Colours are RGB, scaled to [-1, 1]. Raises ValueError unless height and width are multiples of 16.
         """
         return self.decode(self.encode(image1), self.encode(image2))
 

@@ -36,8 +36,7 @@ USELESS = 0.2
 class Alignment:
     """Camera pose and depth map of each image, and scale of each pair, from pairwise pointmaps.
 
-    The recon frame is the camera frame of image 0. Its unit is the geometric mean of the pairs' own units, so metric
-    predictions give metres.
+    The recon frame is camera 0. Its unit is the geometric mean of the pairs' own units: metres for metric predictions.
     """
 
     recon_from_camera: Float[ndarray, "n 4 4"]

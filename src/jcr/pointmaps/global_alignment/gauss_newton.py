@@ -90,8 +90,7 @@ class ImageEquations:
 def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
     """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image.
 
-    A first stage with COARSE_PIXELS pixels gives the initial estimate. Raises RejectedError where the pointmaps do not
-    determine the unknowns.
+    A first stage has COARSE_PIXELS pixels. Raises RejectedError where the pointmaps do not determine the unknowns.
     """
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
@@ -341,8 +340,7 @@ def _eliminated(
 def _selection(o: ImageObservations, state: AlignmentState) -> csr_array:
     """Return the matrix that maps a step of all unknowns to a step of the c unknowns of one image's ImageEquations.
 
-    A step of all unknowns has six numbers per camera, the log focal length and the log pair scales, as in
-    `_after_step`.
+    A step has six numbers per camera, the log focal length and the log pair scales, as in `_after_step`.
     """
     n, maps, focal = o.second_count, len(o.pair), 6 * len(state.recon_from_camera)
     observers, to_twist = o.observer[:n], twist_from_step(state.recon_from_camera)

@@ -15,8 +15,7 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
     """Return an initial estimate of all unknowns, accurate to a few per cent.
 
     Depths come from the pairs that have the image first, and cameras from a spanning tree of the pairs that agree best.
-    `edges` are the images (first, second) of each pair. Raises RejectedError where no first view has points in front of
-    its camera.
+    `edges` are the images (first, second) of each pair. Raises RejectedError if no first view has points.
     """
     # The median of pixel radius / tangent of the angle off the optical axis, of pointmaps in their own camera's frame.
     ratios = []

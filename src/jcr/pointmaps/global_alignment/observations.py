@@ -10,8 +10,7 @@ from jcr.errors import InputError
 from jcr.pointmaps.pairs import PairPredictions
 
 CELL_SIDE = 4
-"""Number of cells along each side of the image; residuals are correlated over an image, and their cell means measure by
-how much."""
+"""Number of cells along each side of the image, whose mean residuals measure the correlation of residuals."""
 POOR = 0.2
 """Least weight of a cell's best pixel, relative to the 90 % quantile over the cells; a cell below it is left out."""
 
@@ -83,8 +82,7 @@ class AlignmentProblem:
 class ImageObservations:
     """Pointmaps of one image at m chosen pixels, from k pairs, as float32 arrays with pixels as the last axis.
 
-    The first of the k are second views: pointmaps in the frame of another camera. The others are in the image's own
-    camera frame.
+    The first of the k are second views, in the frame of another camera; the others are in the image's own.
     """
 
     image: int
