@@ -106,8 +106,7 @@ def _row(v, n, a, b, k, width, height):
     """Return the coefficients that project the pixels of row v into the n-th other image; a, b, k as in `agreement`.
 
     The first three elements are (f, g, h) for x, y and z of the homogeneous pixel f·r + g + h·(inverse depth). Here r
-    is the x coordinate of the pixel's ray with z = 1. The last element is (largest x, largest y, cx, 1/fx) for images
-    of `width` times `height` pixels.
+    is the x coordinate of the pixel's ray with z = 1. The last element is (largest x, largest y, cx, 1/fx).
     """
     ry = (np.float32(v) - k[3]) / k[1]
     x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]

@@ -83,8 +83,7 @@ def choose_neighbours(
     """Return for each of m images the indices of `count` other images to match with, best first.
 
     There are fewer only if m - 1 is less than `count`. The score is the sum, over shared points, of a weight that
-    depends on the angle between the two rays. The weight is largest at 15°, as in MVSNet (Yao et al., ECCV 2018,
-    section 4.1).
+    depends on the angle between the two rays. The weight is largest at 15°, as in MVSNet (Yao et al. 2018).
     """
     m = len(recon_from_camera)
     seen = np.zeros((m, len(tracks.points_in_recon)), dtype=bool)
@@ -142,8 +141,7 @@ def dense_pointmaps(
     `sweep_planes`. The confidence of a match is its correlation times the number of images that agree, twice that on a
     fitted plane. With `priors`, fitted planes give depth where no match is found, with confidence 0.5 per image that
     agrees. The confidence is 0 without an estimate. `before` are pointmaps of the first images, from an earlier time.
-    With `before`, only later images are matched, the scene may have changed, and `priors` is ignored; the result has
-    all m images.
+    With `before`, only later images are matched, the scene may have changed, and `priors` is ignored.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth

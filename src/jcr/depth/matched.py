@@ -72,8 +72,7 @@ class _Level:
         """Return the arguments `packed`, `motions`, `windows` and `k` of patch_match.py to match image i with `others`.
 
         `others` are n image indices. `packed` are their greys, packed by `quads`; `motions` (n,12) are the rows of K R,
-        and K t, to each of them. `windows` are those of image i, which are written to the buffer `space`; `k` is (fx,
-        fy, cx, cy).
+        and K t, to each of them. `windows` are those of image i, in the buffer `space`; `k` is (fx, fy, cx, cy).
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)

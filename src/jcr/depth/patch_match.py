@@ -160,8 +160,7 @@ def random_planes(family, span, k, h, w, seed):
     """Return a random plane for each pixel, (4,h,w): rows 0 to 2 are the plane, and row 3 is the score UNKNOWN.
 
     Planes are vectors p in the camera frame with p·x = 1; `k` is fx, fy, cx, cy. About half of the planes are random
-    mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span` (lowest,
-    highest).
+    mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span`.
     """
     state = random_state(seed)
     lowest, highest = span

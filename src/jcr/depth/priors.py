@@ -54,8 +54,7 @@ def evened(
 
     `inverse_depth` is 1/z of the pixels; `views` are the projections of each image into its neighbours. The log
     brightness of one point differs between images 1 and 2 by the difference of their exposures plus a·(r₁² - r₂²). Here
-    r is the tangent of the angle off the optical axis, and a is common to all images. The fit uses least absolute
-    deviations.
+    r is the tangent of the angle off the optical axis. The fit of a uses least absolute deviations.
     """
     color = colors.astype(np.float32) / 255
     m, h, w = matched.shape

@@ -34,8 +34,7 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 
     The side of a voxel is `options.voxel_size` m, by default the map's cell. A voxel is occupied if its inscribed
     sphere touches a seen surface, and free if the sphere touches neither a surface nor unseen space. All other voxels
-    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap, and
-    if there would be too many voxels.
+    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, options.voxel_size)
@@ -119,8 +118,7 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
     """Return the centres (x,y,z,3) in m of a grid of cubic voxels of side `voxel` (m); the axes follow x, y, z.
 
-    `count` (3,) is the number of voxels along each axis. `lower` (3,) is the corner of the grid with the smallest
-    coordinates (m).
+    `count` (3,) is the number of voxels along each axis, and `lower` (3,) the grid's lowest corner (m).
     """
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
@@ -129,8 +127,7 @@ def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x 
 def _voxel(scene: SceneMap, side: float | None) -> float:
     """Return the side (m) of voxels: `side` or, if None, the map's cell.
 
-    Raises InputError if it is not positive, exceeds the shortest side of the workspace, or gives over 50 million
-    voxels.
+    Raises InputError unless it is positive, fits into the workspace, and gives at most 50 million voxels.
     """
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
@@ -152,8 +149,7 @@ def write_rrd(
 ) -> None:
     """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
 
-    All poses and points are in the base frame (m); `notes` are stored as text. Raises InputError if the package
-    rerun-sdk (500 MB) is not installed.
+    Poses and points are in the base frame (m); `notes` are stored as text. Raises InputError without rerun-sdk.
     """
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)

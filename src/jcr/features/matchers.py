@@ -213,8 +213,7 @@ def matrices(
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
     """Return a geometry's essential matrix and homography, from rays of image i to image j; None if COLMAP has none.
 
-    They apply to rays (x/z, y/z, 1): x_jᵀ E x_i = 0, and x_j is proportional to H x_i. `found` is in pixels of images
-    with `intrinsics`.
+    They apply to rays (x/z, y/z, 1): x_jᵀ E x_i = 0, and x_j ∝ H x_i. `found` is in pixels of `intrinsics`.
     """
     k = intrinsics.matrix + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     essential, homography = found.E, found.H
@@ -233,8 +232,7 @@ def still_cells(
 
     Such cells show the gripper's own fingers, a logo, or text drawn into the images. The cells have sides of CELL_PX,
     and many means LEAST_PAIRS and the share LEAST_SHARE. `x_px` are the keypoints of each image, and `raw` the matches
-    of each pair as rows of keypoints. `moving` are the pairs between which the gripper moved, and `size` is width and
-    height, px.
+    of each pair as rows of keypoints. `moving` are the pairs with motion, and `size` is width and height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)

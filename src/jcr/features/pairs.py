@@ -41,8 +41,7 @@ def all_pairs(n: int) -> list[Key]:
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
     """Return the pairs of each image with one image of each of its `neighbours` nearest viewpoints.
 
-    The distance is the length of the gripper's motion (geometry.motion_length). `motion[i, j]` is the gripper's
-    i_from_j.
+    The distance is the motion_length of `motion[i, j]`, the gripper's i_from_j.
     """
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
@@ -131,8 +130,7 @@ def _best(score: Float[ndarray, "n n"], count: int, viewpoint: Int[ndarray, " n"
     """Return pairs of each image with one image of each of the `count` other viewpoints with the highest finite `score`.
 
     `viewpoint` is the viewpoint of each image (`viewpoints`), and `score[i, j]` belongs to images i and j. Images of
-    one viewpoint are paired with different images of another one, so that all images are connected and their noise
-    averages.
+    one viewpoint are paired with different images of another one, so that their noise averages.
     """
     repeat = np.array([(viewpoint[:row] == of).sum() for row, of in enumerate(viewpoint)])
     pairs = set()

@@ -57,8 +57,7 @@ def camera_motions(
 ) -> list[CameraMotion]:
     """Return the motions that may explain matched rays (x/z, y/z) of cameras i and j, best first; empty without one.
 
-    The best has the smallest Sampson distances. The matrices map rays of image i to image j, each None if not found.
-    `focal_px` converts residuals to px.
+    The best has the smallest Sampson distances. The matrices, or None, map rays of image i to j; `focal_px` is in px.
     """
     found: list[CameraMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):

@@ -130,8 +130,7 @@ def match(
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
     """Return the matches of two images as rows of their keypoints (first image, second image), and each match's score.
 
-    `matcher` is LightGlue; its scores are 0 to 1. `x_px` and `descriptors` come from `detect`, and `sizes` are (width,
-    height) of the images, px.
+    `matcher` is LightGlue, with scores from 0 to 1; `x_px` and `descriptors` come from `detect`, `sizes` are in px.
     """
     images = [
         {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
@@ -145,8 +144,7 @@ def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Flo
     """Return pixels (x, y) of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
 
     The last two axes of `image` are height h and width w. A pixel x becomes 2x/(w-1) - 1, as in the network's training,
-    where -1 and 1 are the centres of the outermost pixels. grid_sample itself (align_corners=False) has them at the
-    outer edges; this offset is kept.
+    where -1 and 1 are the centres of the outermost pixels. grid_sample itself has them at the outer edges.
     """
     height, width = image.shape[-2:]
     return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]
@@ -168,8 +166,7 @@ class _Keypoints:
 class LearnedFeatures:
     """XFeat keypoints of a capture's images, and a LightGlue matcher for images that are rotated first.
 
-    XFeat is not invariant to rotation, so that every angle has keypoints of its own, and `x_px` grows with each new
-    angle.
+    XFeat is not invariant to rotation, so every angle has keypoints of its own; each new one extends `x_px`.
     """
 
     needs_upright = True
@@ -190,8 +187,7 @@ class LearnedFeatures:
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
 
-        The two images are first rotated by `rolls` (rad, `by_quarters`), clockwise on the screen; keypoints are added
-        to `x_px`.
+        The images are first rotated by `rolls` (rad, `by_quarters`), clockwise; keypoints are added to `x_px`.
         """
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]

@@ -107,8 +107,7 @@ class LiveCalibration:
         of the image (s). `depth_mm` (h,w) is the depth of its pixels along the optical axis (0: unknown). `color` is
         the order of the channels ("bgr" for OpenCV). Grey images are valid. Raises InputError for an array that is no
         image or no rigid pose, a pose that is not in metres, an image of another size than the others, and an image
-        that repeats another. The capture is then unchanged. Several threads may call this at the same time; the calls
-        are served one after the other.
+        that repeats another. The capture is then unchanged. Several threads may call this at the same time.
         """
         with self._lock:
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
@@ -117,8 +116,7 @@ class LiveCalibration:
     def remove(self, index: int) -> Progress:
         """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image.
 
-        Returns the new state of the calibration. A negative `index` counts from the end; InputError if there is no such
-        image.
+        Returns the new state. A negative `index` counts from the end; InputError if there is no such image.
         """
         with self._lock:
             names = self.live.names

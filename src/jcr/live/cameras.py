@@ -72,8 +72,7 @@ def _read_by(
 ) -> Iterator[Camera]:
     """Yield the camera whose next frame the function `read` waits for and returns; `read` returns None at the end.
 
-    A thread reads the device or stream called `name`, so that no old frames are buffered. `name` None: a recording,
-    which is read without a thread.
+    A thread reads the device or stream `name`, so that no old frames are buffered; None: a recording, without thread.
     """
     newest, arrived, is_closed = deque[Frame](maxlen=1), threading.Condition(), threading.Event()
 
@@ -123,8 +122,7 @@ def _read_by(
 def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[Camera]:
     """Open a camera: a V4L2 device (number), a stream (address with ://), `realsense[:SERIAL]`, or else a video file.
 
-    Raises InputError if the camera cannot be opened or does not accept the options. The camera is closed at the end of
-    the `with` statement.
+    Raises InputError if the camera cannot be opened or does not accept the options. The `with` statement closes it.
     """
     options = options or CameraOptions()
     if source.partition(":")[0] == REALSENSE:
@@ -308,8 +306,7 @@ def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None
 
     OpenCV's coefficients k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for
     a grid of pixels, because its distortion models differ ("Projection in Intel RealSense SDK 2.0"). None: the fit
-    deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its object rs.intrinsics of the colour
-    camera.
+    deviates by 0.05 px or more. `rs` is pyrealsense2, `stored` its rs.intrinsics.
     """
     intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):

@@ -98,8 +98,7 @@ class LiveFolder:
         """Check an image and its gripper pose, write both, and return the name of the image.
 
         The arguments are those of `LiveCalibration.add`; `joints` are written only if all images have them. Raises
-        InputError if the image or the pose does not fit the capture, and OSError if a file cannot be written. The
-        capture is then unchanged.
+        InputError, or OSError if a file cannot be written; the capture is then unchanged.
         """
         number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
         pixels = checked_image(image, color, number)

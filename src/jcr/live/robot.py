@@ -256,8 +256,7 @@ def typed_poses(
 ) -> Iterator[Float[ndarray, "4 4"]]:
     """Yield base_from_gripper (4,4) from each typed line of numbers, until an empty line or the end of the input.
 
-    The numbers have the pose convention and units given, "auto" as in `pose_of_numbers`. `show` prints the prompt, and
-    the reason why a line is refused.
+    The numbers are as in `pose_of_numbers`. `show` prints the prompt, and the reason why a line is refused.
     """
     while True:
         show(f"pose at rest ({pose_columns(convention, units)}; empty line ends):")

@@ -110,8 +110,7 @@ def align_photometrically(
     """Align cameras at one pyramid level by rounds of depth search and Gauss-Newton; return cameras and points.
 
     `stage` has the settings. The columns of `directions` are the free steps of the cameras (`tied_directions`,
-    `free_directions`); with p = 7 rows, all cameras move as one. The points are pixels at strong edges, with their
-    depths.
+    `free_directions`); with p = 7 rows, all cameras move as one. The points are pixels at edges.
     """
 
     def step(

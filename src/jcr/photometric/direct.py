@@ -131,8 +131,7 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
     """Return a factor per image that makes all images equally bright; all are 1 if no |log factor| exceeds LEAST_GAIN.
 
-    The brightness of two images is compared at points of one that the other shows within twice BEFORE_GAINS.sigma. The
-    logs of the factors have mean 0.
+    Brightness is compared at points that two images show within twice BEFORE_GAINS.sigma; the logs have mean 0.
     """
     factor, dark, images = np.ones(level.count), 10 * FAINT, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):

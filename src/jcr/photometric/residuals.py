@@ -89,8 +89,7 @@ class Points:
 class PhotometricEquations:
     """Normal equations of a Gauss-Newton step in p camera parameters; the log depths of k points are eliminated.
 
-    The parameters are six per camera, or six for all cameras, and last the log focal length. The log depths follow from
-    their step (Schur complement).
+    The parameters are six per camera, or six for all, and the log focal length; log depths are eliminated.
     """
 
     normal: Float[ndarray, "p p"]
@@ -201,8 +200,7 @@ def in_view(
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
     """Return per image and point: the point in the camera frame (m), its pixel u and v, and whether the image shows it.
 
-    The image shows a point in front of the camera and inside the image; occlusion is not tested. A host image does not
-    count as seeing its own points.
+    A point is seen in front of the camera and inside the image, also if occluded; not in its own host image.
     """
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
@@ -221,8 +219,7 @@ def sample(
 ) -> Float32[ndarray, "n k 3"]:
     """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation.
 
-    `stack` has the images of `level`, or their derivatives, one below the other. Pixels outside the image take the
-    colour of the nearest border pixel.
+    `stack` has the images of `level`, or derivatives, one below the other. Pixels outside take the border's colour.
     """
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
@@ -291,8 +288,7 @@ def _linearised(
 
     The derivatives are by the twist of the viewing camera, the twist of the point's host camera, the log focal length
     and the log depth. Residuals and derivatives are arrays (images, points, 3 colours); those by a twist have a last
-    axis of 6. The weight is the root of the Geman-McClure weight of scale `sigma`; it is 0 where an image does not show
-    an agreed point.
+    axis of 6. The weight is the root of the Geman-McClure weight of scale `sigma`, 0 for points not shown.
     """
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)

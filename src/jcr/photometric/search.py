@@ -47,8 +47,7 @@ def search(
     """Return the cameras (gripper poses times one hand-eye transform) for which the images agree best in colour.
 
     `levels` are the images by their height in pixels (those of SIZES); the focal length changes unless the intrinsics
-    are known. Raises RejectedError where a different hand-eye transform fits as well, or where the images have no
-    edges.
+    are known. Raises RejectedError where another transform fits as well, or without edges.
     """
     if not len(strong_edges(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(

@@ -1,8 +1,7 @@
 """Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of images.
 
 Conventions of the network: cameras are camera_from_recon, x right, y down, z forward; depth is along z; intrinsics have
-their origin at the image's corner; the unit is arbitrary. Only the network of its package is used, without the package's
-other requirements.
+their origin at the image's corner; the unit is arbitrary. Only the network of its package is used.
 """
 
 import json

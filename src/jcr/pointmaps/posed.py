@@ -82,8 +82,7 @@ def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
     """Return the covariance (6n,6n) of n camera poses relative to the first, from errors published for a network.
 
     Each camera has six rows: translation (recon units) and rotation (rad) in recon axes; those of the first are 0.
-    Every camera has an independent error (PREDICTED_STD); the first camera's error also moves all others relative to
-    it.
+    Every camera has an independent error (PREDICTED_STD); the first camera's moves all others.
     """
     poses = maps.recon_from_camera
     count = len(poses)

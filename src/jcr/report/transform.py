@@ -91,8 +91,7 @@ def sketch(
     """Return a sketch of the camera, as a pyramid with axes, in the gripper frame (z drawn downwards) or the base frame.
 
     The frame is that of `mount`. `intrinsics` give the shape of the pyramid; None: those of a usual camera. "shapes"
-    are tag, attributes and text of SVG elements. "width" and "height" are the size (px), "label" is the text for screen
-    readers.
+    are tag, attributes and text of SVG elements. "width" and "height" are in px, "label" is for screen readers.
     """
     down = mount == "gripper"
     away = float(np.linalg.norm(parent_from_camera[:3, 3]))

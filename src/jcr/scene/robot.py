@@ -172,8 +172,7 @@ def spheres_of_shape(
     """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
     `shape` is in metres, and `link_from_shape` is its pose in the link's frame. The spheres exceed the shape by at most
-    `excess` (m) plus half a voxel. Half a voxel is a sixth of the excess for shapes up to 15 cm. A sphere is returned
-    as it is.
+    `excess` (m) plus half a voxel. Half a voxel is at most a sixth of the excess for shapes up to 15 cm.
     """
     from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 
@@ -197,8 +196,7 @@ def cover_with_spheres(
 
     `distance` d is the signed distance (m), negative inside, from solid space at the centres of voxels with side `step`
     (m). A sphere with centre c and radius excess - d(c) exceeds solid space by at most `excess`. The cover is greedy:
-    the deepest voxel that is not yet covered becomes the next centre. A voxel is covered if its whole cube is inside a
-    sphere.
+    the deepest voxel that is not yet covered becomes the next centre. Covered voxels are inside a sphere.
     """
     half = 0.5 * np.sqrt(3.0) * step
     left = distance <= half

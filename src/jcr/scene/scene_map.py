@@ -203,8 +203,7 @@ class SceneMap:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
 
         `unknown` selects how unseen space counts in `occupancy` and `distance`: "occupied" as solid, "free" as empty,
-        and "report" as occupancy 0.5 and, in the distance, as empty. Raises InputError for a wrong shape or a value that
-        is not finite.
+        and "report" as occupancy 0.5 and, in the distance, as empty. Raises InputError for other points.
         """
         x, tensors = self._points(x_in_base, "points", unknown), isinstance(x_in_base, Tensor)
         return Sample(self, x, unknown=unknown, tensors=tensors)

@@ -173,8 +173,7 @@ def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
     """Set `crossed` (z,y,x) for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
 
     `crossed` is the mask of the blocks, which is changed in place. `nearest`, `rotation`, `corner` and `pitch` are the
-    results of `_depth_image`. `start` is the centre (m) of the first block, relative to the camera, in the axes of the
-    depth image.
+    results of `_depth_image`. `start` is the centre (m) of the first block in the axes of the depth image.
     """
     per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
     rows, columns = nearest.shape

@@ -240,8 +240,7 @@ def total_loss(field: Field, rays: Rays, samples: Samples) -> Tensor:
     """Return the training loss: the sum over the properties of `field` of the weighted mean loss of each.
 
     `samples` come from `draw_samples` for `rays`. The loss is binary cross-entropy for occupancy and cross-entropy for
-    labels. For other properties it is the squared error divided by the variance of the property, so that units do not
-    matter.
+    labels. For other properties it is the squared error over the variance of the property.
     """
     (x, occupied, of_samples), losses = samples, []
     for name, out in field(x).items():

@@ -166,8 +166,7 @@ def _adjusted(
     """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
     All cameras and points are adjusted before and after; `model` is changed. Points beyond _MOST_OBSERVATIONS, chosen
-    at random by `seed`, are deleted first. `images` are all images by row. `like` are the intrinsics at the images'
-    size, held if `known`.
+    at random by `seed`, are deleted first. `images` are all images by row. `like` are intrinsics, held if `known`.
     """
     if model.compute_num_observations() > _MOST_OBSERVATIONS:
         order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -228,8 +227,7 @@ def map_images(
     The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size, `cameras`
     COLMAP's initial cameras at the working size, and `names` the images' names for messages. The mapper tries the
     cameras in turn, after intrinsics estimated from the gripper's angles if there are any. A model `begun` is continued
-    with the images that it lacks. Images that the mapper leaves out are added near cameras predicted from the gripper
-    poses.
+    with the images that it lacks. Images that the mapper leaves out are added near predicted cameras.
     """
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
     found = match_with_robot(matcher, base_from_gripper, working, names, report)

@@ -104,8 +104,7 @@ def registrations(
 
     The registration is None if fewer than MIN_POINTS agree. Matches of the image with the known images are triangulated
     from the known images; the pose is the one on which most points agree. The focal length of the new image's
-    intrinsics (`camera`) is held (`given`) or estimated (`free`). `gate_px` is the largest reprojection error (px) of a
-    point that agrees.
+    intrinsics (`camera`) is held (`given`) or estimated (`free`). `gate_px` is the largest error (px) of a point.
     """
     new = features(image, camera)
     of_row = [matches(new.descriptors, others.descriptors) for others in known.features]

@@ -54,8 +54,7 @@ def align_tracks(
     """Return the tracks with observations aligned to one reference observation per track by least-squares matching.
 
     The result has standard deviations in px (`std_px`). `greys` are the images in the order of the cameras. Images,
-    tracks and `intrinsics` are of one size. The reference is the observation that shows the surface at the median
-    scale, and keeps its pixel.
+    tracks and `intrinsics` are of one size. The reference is the observation at the median scale, and keeps its pixel.
     """
     order = np.lexsort((tracks.image, tracks.point))
     image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
@@ -290,8 +289,7 @@ def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pul
     The correlation is that of patch and template, weighted by `window`. The result is -1 without convergence, if the
     patch leaves the image `grey`, or if its centre `x_px` moves more than `most_px` from `keypoint_px`. `bend` is the
     fixed part of the warp (`_warps`), `offsets` and `window` come from `_window`, and `patch` (n) is overwritten.
-    `template`, `pull` and `deviation` come from `_template`: a step is the sum over the patch of (grey −
-    template)·pull.
+    `template`, `pull` and `deviation` come from `_template`: a step is Σ (grey − template)·pull.
     """
     step = np.empty(_FREE)
     for _ in range(_STEPS):

@@ -176,8 +176,7 @@ def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: 
     """Return cosines and sines (RoPE, Su et al. 2021) of the angle p · base^(−2k/D), shape (2, n, 2, D/2).
 
     The axes are cosine and sine; the n tokens, row by row; the coordinate p (row, then column) of the token; the
-    frequency k. `grid` is rows and columns of tokens. `head_dim` is the number of channels of an attention head, and D
-    = head_dim/2.
+    frequency k. `grid` is rows and columns of tokens. An attention head has `head_dim` = 2 D channels.
     """
     position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
     exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)

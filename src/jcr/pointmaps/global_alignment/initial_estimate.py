@@ -87,8 +87,7 @@ def _similarities(
 
     Returns three arrays with an entry per pair: first_from_second in the first image's unit; the log ratio of the
     second image's unit to the first's; the median residual relative to the distance of the points. `focal` is fx in px,
-    and `depth` the z of the image's m pixels in its unit. `unit` is for each pair the log scale of `_own_depth`, that
-    of its first image.
+    and `depth` the z of the image's m pixels in its unit. `unit` has the pairs' log scales of `_own_depth`.
     """
     n = o.second_count
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth

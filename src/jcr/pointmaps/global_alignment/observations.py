@@ -31,8 +31,7 @@ class AlignmentProblem:
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
         """Return the problem of aligning these predictions.
 
-        Without intrinsics, the principal point is the middle of the grid, and fy / fx is 1. Confidences count as those
-        of DUSt3R (`weigh`) if any is above 1.
+        Without intrinsics, pixels are square and centred. Confidences are those of DUSt3R (`weigh`) if any is above 1.
         """
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
