@@ -34,11 +34,7 @@ from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
 from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct import ReconstructOptions
-from jcr.records import (
-    Attempt,
-    Capture,
-    Intrinsics,
-)
+from jcr.records import Attempt, Capture, Intrinsics
 from jcr.records.npz import read_reconstruction, write_reconstruction
 from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud, write_cloud

@@ -17,10 +17,7 @@ from scenes import center_errors, reference_of
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "max_mm", "max_deg", "count"),
-    [
-        pytest.param("franka_wood_table", 4.0, 0.5, 12, marks=pytest.mark.long),
-        ("doosan_bench", 5.0, 0.7, 15),
-    ],
+    [pytest.param("franka_wood_table", 4.0, 0.5, 12, marks=pytest.mark.long), ("doosan_bench", 5.0, 0.7, 15)],
 )
 def test_within_reach_of_the_marker_reference(
     real_captures: Path, name: str, max_mm: float, max_deg: float, count: int

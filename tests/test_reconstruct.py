@@ -20,14 +20,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
 from jcr.pipeline import selection
 from jcr.pipeline.stages import begun
-from jcr.reconstruct import (
-    BACKENDS,
-    Backend,
-    ReconstructOptions,
-    candidates,
-    tries,
-    with_cameras_of,
-)
+from jcr.reconstruct import BACKENDS, Backend, ReconstructOptions, candidates, tries, with_cameras_of
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of, reconstruction_of

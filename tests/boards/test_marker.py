@@ -117,10 +117,7 @@ def capture_of(folder: Path, sheet: Callable[[], np.ndarray], count: int = 8, kn
     return capture, problem.gripper_from_camera
 
 
-BOARDS = {
-    "circles:4x11:0.020": circles,
-    "apriltag:0.050:36h11": tags,
-}
+BOARDS = {"circles:4x11:0.020": circles, "apriltag:0.050:36h11": tags}
 
 
 @pytest.mark.parametrize("spec", BOARDS)

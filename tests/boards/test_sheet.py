@@ -37,11 +37,7 @@ def mm_of_page(data: bytes) -> tuple[ndarray, ndarray]:
 
 
 @pytest.mark.parametrize(
-    "spec",
-    [
-        "charuco:8x5:0.030:0.022:DICT_4X4_50",
-        "charuco:7x5:0.031:0.0233:DICT_5X5_50",
-    ],
+    "spec", ["charuco:8x5:0.030:0.022:DICT_4X4_50", "charuco:7x5:0.031:0.0233:DICT_5X5_50"]
 )
 def test_a_printed_board_is_found_whole_and_at_its_size(spec: str):
     pixels, px_per_mm = board_sheet(spec)

@@ -291,10 +291,7 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
         (["run", "a", "b", "--requre", "1", "1"], "did you mean --require? (jcr run --help)"),
         (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
         (["export", "a", "octomapp"], "did you mean octomap?"),
-        (
-            ["run", "a", "b", "--require", "2"],
-            "--require takes MM DEG, not '2' (jcr run --help)",
-        ),
+        (["run", "a", "b", "--require", "2"], "--require takes MM DEG, not '2' (jcr run --help)"),
         (["run", "a", "b", "--known-length", "0.jpg", "1"], "takes IMAGE X1 Y1 X2 Y2 MM, not '0.jpg', '1'"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),

@@ -12,24 +12,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
 from jcr.capture.images import encode_png
-from jcr.depth.densify import (
-    choose_neighbours,
-    dense_pointmaps,
-    densify,
-    sweep_planes,
-)
+from jcr.depth.densify import choose_neighbours, dense_pointmaps, densify, sweep_planes
 from jcr.depth.depth_npz import is_made_from, read_depth, write_depth
 from jcr.depth.options import DepthOptions
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import (
-    BOTH,
-    MATCHED,
-    NO_DEPTH,
-    PRIOR,
-    Intrinsics,
-    Pointmaps,
-    Tracks,
-)
+from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics, Pointmaps, Tracks
 from scenes import capture_of, reconstruction_of
 
 pytestmark = pytest.mark.slow

@@ -19,14 +19,7 @@ from jcr.capture.images import read_image
 from jcr.live import robot
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
-from jcr.live.robot import (
-    MOVED_ON,
-    RobotState,
-    next_rest,
-    pose_of_numbers,
-    typed_poses,
-    without_commands,
-)
+from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers, typed_poses, without_commands
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from scripted_capture import RATE, Scripted, a_capture, poses, still, still_frames, take_all, video
 from simulation.ur import SimulatedUr

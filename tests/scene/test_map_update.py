@@ -18,12 +18,7 @@ from jcr.depth.added import extend
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, scale_translation, transform
-from jcr.records import (
-    Capture,
-    Reconstruction,
-    Tracks,
-    Uncertainty,
-)
+from jcr.records import Capture, Reconstruction, Tracks, Uncertainty
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import CloudOptions, MapOptions
 from scenes import hand_eye_of, maps_of, reconstruction_of

@@ -15,12 +15,7 @@ import scenes
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import (
-    Capture,
-    Intrinsics,
-    PointCloud,
-    Reconstruction,
-)
+from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
 from jcr.segments.segments import label_cloud, read_labels

@@ -141,11 +141,7 @@ def _voxel(scene: SceneMap, side: float | None) -> float:
 
 
 def write_rrd(
-    path: Path,
-    views: "PosedImages",
-    cloud: PointCloud,
-    scene: SceneMap,
-    notes: dict[str, str],
+    path: Path, views: "PosedImages", cloud: PointCloud, scene: SceneMap, notes: dict[str, str]
 ) -> None:
     """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
 

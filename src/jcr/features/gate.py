@@ -161,9 +161,7 @@ def _common_rotation(
 
 
 def rotation_of_x(
-    gripper: Float[ndarray, "p 3 3"],
-    camera: Float[ndarray, "p 3 3"],
-    tolerance: Float[ndarray, " p"],
+    gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"], tolerance: Float[ndarray, " p"]
 ) -> RotationOfX | None:
     """Return the hand-eye rotation R_X from relative rotations i_from_j of gripper and camera, p of each.
 

@@ -78,11 +78,7 @@ class SiftFeatures:
     farthest = FARTHEST
 
     def __init__(
-        self,
-        images: Sequence[UInt8[ndarray, "h w 3"]],
-        size: tuple[int, int],
-        threads: int,
-        report: Progress,
+        self, images: Sequence[UInt8[ndarray, "h w 3"]], size: tuple[int, int], threads: int, report: Progress
     ) -> None:
         """Find the features of all images (RGB), resized to `size` (width, height), in `threads` threads."""
         self._size = size

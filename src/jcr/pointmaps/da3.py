@@ -21,14 +21,7 @@ from torch import nn
 from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.hub import Weights
-from jcr.pointmaps.any_view import (
-    Predict,
-    Views,
-    normalised,
-    output,
-    reconstruct_any_view,
-    rigid,
-)
+from jcr.pointmaps.any_view import Predict, Views, normalised, output, reconstruct_any_view, rigid
 from jcr.pointmaps.grid import ImageGrid
 from jcr.pointmaps.posed import PosedPointmaps
 from jcr.progress import Progress

@@ -209,10 +209,7 @@ class SceneMap:
         return Sample(self, x, unknown=unknown, tensors=tensors)
 
     def check_spheres(
-        self,
-        centers_in_base: ArrayLike,
-        radii: ArrayLike | float,
-        unknown: Unknown = "occupied",
+        self, centers_in_base: ArrayLike, radii: ArrayLike | float, unknown: Unknown = "occupied"
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether spheres collide: centres (…,3) m in the base frame, radii (m) that broadcast to (…).
 

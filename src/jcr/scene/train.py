@@ -180,12 +180,7 @@ def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samp
 
 
 def train(
-    field: Field,
-    rays: Rays,
-    seen: SeenGrid,
-    seed: int,
-    max_seconds: float,
-    report: Callable[[float], None],
+    field: Field, rays: Rays, seen: SeenGrid, seed: int, max_seconds: float, report: Callable[[float], None]
 ) -> int:
     """Train the network `field` until the loss on 2 % validation rays no longer falls; return the number of steps.
 

@@ -102,12 +102,7 @@ def test_a_folder_or_its_file_loads_to_the_same_network(
 def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: "Dust3r") -> None:
     import torch
 
-    config = {
-        **CONFIG,
-        "head_type": "catmlp+dpt",
-        "output_mode": "pts3d+desc24",
-        "two_confs": True,
-    }
+    config = {**CONFIG, "head_type": "catmlp+dpt", "output_mode": "pts3d+desc24", "two_confs": True}
     matching = {
         f"downstream_head{head}.head_local_features.fc{layer}.{leaf}": torch.zeros(4)
         for head in (1, 2)

@@ -34,11 +34,7 @@ _ANNOUNCED = set[str]()
 
 
 def reconstruct_dust3r(
-    capture: Capture,
-    weights: Weights,
-    device: str,
-    backend: str,
-    progress: Progress | None = None,
+    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress | None = None
 ) -> Reconstruction:
     """Return camera poses and pointmaps of a capture, in metres with MASt3R and in an arbitrary unit with DUSt3R.
 
@@ -128,10 +124,7 @@ def predict_pairs(
 
 
 def _in_batches(
-    work: Callable[[Int[ndarray, " b"]], None],
-    count: int,
-    sizes: list[int],
-    report: Callable[[float], None],
+    work: Callable[[Int[ndarray, " b"]], None], count: int, sizes: list[int], report: Callable[[float], None]
 ) -> None:
     """Call `work` on batches of the integers 0 to `count` − 1; the batch size is the last number in `sizes`.
 

@@ -202,9 +202,7 @@ def _least_squares(
     return at, latest
 
 
-def _normal_equations(
-    equations: list[ImageEquations],
-) -> tuple[Float[ndarray, "q q"], Float[ndarray, " q"]]:
+def _normal_equations(equations: list[ImageEquations]) -> tuple[Float[ndarray, "q q"], Float[ndarray, " q"]]:
     """Return matrix and gradient of the equations of all images, without the rows of the first camera, which is fixed.
 
     The q unknowns are the steps of the other cameras (six each), the log focal length and the log pair scales. A

@@ -128,10 +128,7 @@ def residual_weights(
     robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * geman_mcclure_weights(r, noise)
     across, along = (
         robust / (std**2 * inflation)[:, None]
-        for std, inflation in (
-            (noise.across, noise.across_inflation),
-            (noise.along, noise.along_inflation),
-        )
+        for std, inflation in ((noise.across, noise.across_inflation), (noise.along, noise.along_inflation))
     )
     return across, along
 
