@@ -166,10 +166,7 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 def _slopes(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y.
-
-    `x` and `y` are the undistorted coordinates of rays (x, y, 1).
-    """
+    """Return derivatives of `_distorted` at rays (x, y, 1): of its x by x, x by y, y by x, and y by y."""
     r2 = x * x + y * y
     radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y

@@ -64,10 +64,7 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """Return the speed (m/s) of a moving frame at n time stamps (ns), averaged over 0.1 s around each.
-
-    The speed is that of the translation plus 0.3 m times the angular speed (rad/s).
-    """
+    """Return the speed (m/s, plus 0.3 m · rad/s) of a frame at n time stamps (ns), averaged over 0.1 s around each."""
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
 

@@ -24,10 +24,7 @@ ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 
 
 def load_urdf(file: Path) -> "yourdfpy.URDF":
-    """Read the robot of a URDF file, without its meshes.
-
-    Raises InputError if the file is no URDF, if a joint's origin, axis or limits are invalid, or if joints form a loop.
-    """
+    """Read a URDF without its meshes; raise InputError for invalid origins, axes or limits, and for joints in a loop."""
     import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy
 

@@ -230,10 +230,7 @@ def _run(
 
 
 def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
-    """Print the summary of a calibration, and the notes from reading the capture.
-
-    With --json nothing is printed here, because `show` prints the whole result.
-    """
+    """Print the summary of a calibration and the capture's notes; nothing with --json, for which `show` prints all."""
     from jcr.calibration.words import MOST_LINES, summary
 
     if not output.json:

@@ -55,10 +55,7 @@ def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> N
 
 
 def is_made_from(path: Path, made_from: str) -> bool:
-    """Test whether the file exists and was made from the input with the fingerprint `made_from`.
-
-    Raises InputError for a damaged file.
-    """
+    """Test whether the file was made from the input with this fingerprint; raise InputError for a damaged file."""
     if not path.is_file():
         return False
     with read_npz(path, FORMAT) as (text, _):

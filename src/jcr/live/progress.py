@@ -122,10 +122,7 @@ def faults(state: Progress) -> list[Finding]:
 
 
 def finding_lines(state: Progress) -> list[str]:
-    """Return each finding of `faults` as a sentence; one about a single image has the commands to retake or remove it.
-
-    Images are numbered from 1 in the commands.
-    """
+    """Return `faults` as sentences; those about one image with commands, whose image numbers count from 1."""
     retake = {name: f" (retake {k}, or remove {k})" for k, name in enumerate(state.images, start=1)}
     return [
         sentence(one) + (retake.get(one.images[0], "") if len(one.images) == 1 else "")

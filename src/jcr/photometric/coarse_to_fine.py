@@ -56,10 +56,7 @@ def axes_intersection(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
-    """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth.
-
-    `stage` sets the number of points and the scale of the cost (`search_depths`).
-    """
+    """Return the mean robust cost (0 to 1) of colour differences at each point's best depth, as set by `stage`."""
     host, x_px = strong_edges(level, _per_image(level, stage))
     return search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 

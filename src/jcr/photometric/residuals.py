@@ -227,10 +227,7 @@ def sample(
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
-    """Return the mean robust cost, 0 to 1, of the agreed points over all images that see them.
-
-    The cost of a colour difference r (RGB, 0 to 1) is r²/(r² + sigma²).
-    """
+    """Return the mean robust cost r²/(r² + sigma²) of colour differences r of agreed points, in images that see them."""
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     weight = seen & points.agreed

@@ -85,10 +85,7 @@ def cameras_section(cameras: CamerasFile) -> Content:
 def _matrix(
     matrix: Float[ndarray, "4 4"] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, str | None]:
-    """Return texts of a transform (m): "matrix" to read, "copied" to copy, and "std" with its standard deviations.
-
-    Without a transform or its uncertainty, "matrix" is None and the only entry.
-    """
+    """Return texts of a transform (m): "matrix", "copied", and "std"; only "matrix", None, if it is unknown."""
     if matrix is None or uncertainty is None:
         return {"matrix": None}
     return {

@@ -40,10 +40,7 @@ class DistanceGrid:
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the signed distance (n,) m at points (n,3) m of the base frame, interpolated trilinearly.
-
-        A point outside of the grid has the value of the nearest point on its border.
-        """
+        """Return the signed distance (n,) m at points (n,3) m, base frame, interpolated; outside, that of the border."""
         return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 

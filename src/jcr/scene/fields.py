@@ -121,10 +121,7 @@ def interpolate_grid(
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a linear layer whose initial weights are drawn from `generator`, uniformly from ±1/√inputs.
-
-    torch.nn.Linear has the same distribution. None uses torch's own generator.
-    """
+    """Return a linear layer with weights drawn from `generator` (None: torch's), uniformly from ±1/√inputs."""
     # torch.nn.utils.skip_init would import SymPy, which takes 0.3 s; the caller's random numbers must not advance.
     with torch.random.fork_rng([]):
         layer, bound = nn.Linear(inputs, outputs), inputs**-0.5
@@ -217,10 +214,7 @@ class Field(nn.Module):
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Return the network's outputs (n, outputs) at points (n,3) m of the base frame, by name of the property.
-
-        Occupancy and label are logits; other properties are plain values.
-        """
+        """Return outputs (n, outputs) at points (n,3) m, base frame, by property; logits for occupancy and label."""
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
@@ -244,10 +238,7 @@ class Fields(nn.Module):
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`.
-
-        Occupancy and label are logits; other properties are plain values.
-        """
+        """Return outputs (n, outputs) at points (n,3) m, base frame, of `names`; logits for occupancy and label."""
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):

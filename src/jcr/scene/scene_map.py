@@ -177,10 +177,7 @@ class SceneMap:
 
     @property
     def cell(self) -> float:
-        """Spacing (m) of the nodes of the distance grid, and of the features near surfaces.
-
-        Cells of the grid of seen space have half this side.
-        """
+        """Spacing (m) of the distance grid's nodes and of features near surfaces; cells of seen space have half."""
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
@@ -289,10 +286,7 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
-        """Return True for each of n spheres that collides; `unknown` is "occupied" or "free", as in `check_spheres`.
-
-        `x` are the centres (m, base frame) and `radius` the radii (m).
-        """
+        """Return True for each of n spheres (centres x, radii in m) that collides; `unknown`: as in `check_spheres`."""
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -333,10 +327,7 @@ class SceneMap:
             return self._distance[unknown]
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
-        """Return points (n,3) m as a tensor on the map's device.
-
-        Raises InputError, naming them `what`, for another shape, infinite values, or an invalid `unknown`.
-        """
+        """Return points (n,3) m as a tensor; raise InputError, naming them `what`, unless they are finite and fit."""
         if unknown not in get_args(Unknown):
             raise InputError(f"unknown={unknown!r}: choose occupied, free or report")
         x = x if isinstance(x, Tensor) else np.asarray(x)

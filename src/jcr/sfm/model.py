@@ -141,10 +141,7 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return all observations of a model as (image, keypoint, point), point by point.
-
-    Images are positions in `image_ids`, keypoints rows of their image, points positions among ascending ids.
-    """
+    """Return all observations as (row in `image_ids`, keypoint of the image, rank of the point's id), point by point."""
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [
         (row_of[element.image_id], element.point2D_idx, point)

@@ -132,10 +132,7 @@ class Viewer:
         urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
-
-        There is no robot without joint values or a URDF. Raises InputError as `read_robot` does.
-        """
+        """Fill the server with the scene and controls of a run, with the robot of `urdf` or of the capture, if any."""
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()

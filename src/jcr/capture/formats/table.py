@@ -224,10 +224,7 @@ def _named_columns(
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
-    """Read the header of a pose file (None without one) and the cells of every row.
-
-    The file is a text table, UR's p[…], YAML, JSON or .npy. Matrices of a .npy file are read row by row.
-    """
+    """Read header (None without one) and cells of a table, UR's p[…], YAML, JSON or .npy (matrices row by row)."""
     if file.suffix in pose_lists.SUFFIXES:
         return pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     if file.suffix == ".npy":

@@ -115,17 +115,11 @@ class Dust3r(nn.Module):
     def forward(
         self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Return the pointmaps of both images of each pair, in the first camera's frame.
-
-        Colours are RGB, scaled to [-1, 1]. Raises ValueError unless height and width are multiples of 16.
-        """
+        """Return both pointmaps of each pair of images (RGB, -1 to 1; sides multiples of 16) in the first camera."""
         return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
-        """Return the encoder tokens of images (RGB, -1 to 1); each image is encoded once for all its pairs.
-
-        Raises ValueError unless height and width are multiples of 16.
-        """
+        """Return the encoder tokens of images (RGB, -1 to 1), whose height and width must be multiples of 16."""
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
                 f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
@@ -140,10 +134,7 @@ class Dust3r(nn.Module):
             return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
-        """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame.
-
-        Swapped arguments give other predictions.
-        """
+        """Return the first and second image's pointmaps of each pair, in the first camera's frame; the order matters."""
         with self._autocast(features1.tokens):
             rotary1, rotary2 = (
                 rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
@@ -235,10 +226,7 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the attention of tokens x to tokens y of the other image, with the shape of x.
-
-        `rotary_x` and `rotary_y` are the position embeddings of the tokens (`rotary_embedding`).
-        """
+        """Return the attention of tokens x to the other image's y, with x's shape; `rotary_x`, `rotary_y`: positions."""
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
@@ -286,10 +274,7 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the tokens x after self-attention, cross-attention to the other image's tokens y, and perceptron.
-
-        `rotary_x` and `rotary_y` are the position embeddings of the tokens.
-        """
+        """Return x after self-attention, cross-attention to the other image's y, and perceptron; `rotary`: positions."""
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
@@ -381,10 +366,7 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
     def forward(self, levels: list[Tensor]) -> FeatureMap:
-        """Return the fused feature map, at twice the resolution of the finest one.
-
-        `levels` are four feature maps (b,c,h,w), finest first, each with about half the resolution of the one before.
-        """
+        """Return the fused map, twice the finest of four `levels` (b,c,h,w), each half as large as the one before."""
         level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]

@@ -93,10 +93,7 @@ def global_align(
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the result of the alignment with depth and confidence of every pixel, not only of those used to solve it.
-
-    The poses, focal length and pair scales of `solution` do not change.
-    """
+    """Return the alignment with depth and confidence of every pixel, for the poses, focal length and scales found."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

@@ -29,10 +29,7 @@ class AlignmentProblem:
 
     @classmethod
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
-        """Return the problem of aligning these predictions.
-
-        Without intrinsics, pixels are square and centred. Confidences are those of DUSt3R (`weigh`) if any is above 1.
-        """
+        """Return the problem of these predictions; confidences count as DUSt3R's if any is above 1."""
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
         middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)
