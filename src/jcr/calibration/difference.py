@@ -11,13 +11,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.calibration.record import (
-    AnyCalibration,
-    Calibration,
-    FailedCalibration,
-    read_content,
-    validated,
-)
+from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, read_content, validated
 from jcr.distributions import chi2
 from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between

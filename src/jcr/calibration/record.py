@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+import jcr
 from jcr.capture.plain_files import read_json, shown
 from jcr.errors import InputError, RejectedError, first_fault
 from jcr.estimation.point_uncertainty import point_in_base
@@ -80,17 +81,6 @@ FindingJson = Annotated[Finding, PlainSerializer(as_json)]
 """Finding whose JSON also holds text and remedy, for people; reading ignores both."""
 
 
-def derived(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return the JSON fields `findings`, `verdict`, `converged` and `warnings` that these findings determine."""
-    verdict = verdict_of(findings)
-    return {
-        "findings": list(findings),
-        "verdict": verdict,
-        "converged": verdict != "rejected",
-        "warnings": list(warnings_of(findings)),
-    }
-
-
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
     """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file.
 
@@ -103,13 +93,6 @@ def require_one_verdict(findings: Sequence[Finding], verdict: object, converged:
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
     """Return a translation (m) and a rotation (rad) as the JSON fields translation_mm and rotation_deg."""
     return {"translation_mm": rounded(1e3 * metres), "rotation_deg": rounded(np.degrees(radians))}
-
-
-def _version() -> str:
-    """Return the version of the installed distribution."""
-    import jcr
-
-    return jcr.__version__
 
 
 AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
@@ -151,7 +134,7 @@ class Outcome:
     """Reconstructions that were tried, first to last; empty for a calibration from given poses."""
     timings_s: dict[str, float] = field(default_factory=dict)
     """Seconds of each stage."""
-    version: str = field(default_factory=_version)
+    version: str = field(default_factory=lambda: jcr.__version__)
 
     @computed_field
     @property
@@ -304,12 +287,8 @@ class Calibration(Outcome):
         if offsets is not None:
             degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
             joints = [{"offset_deg": offset, "std_deg": std} for offset, std in degrees]
-        systematic = rounded(np.degrees(self.robot_noise.systematic))
-        return {
-            "systematic_deg": systematic,
-            **mm_and_deg(*self.robot_noise.systematic_left),
-            "joints": joints,
-        }
+        systematic, left = rounded(np.degrees(self.robot_noise.systematic)), self.robot_noise.systematic_left
+        return {"systematic_deg": systematic, **mm_and_deg(*left), "joints": joints}
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -359,13 +338,8 @@ class Calibration(Outcome):
         `self` must be calibrated from gripper_from_base in place of base_from_gripper; its gripper_from_camera is then
         base_from_camera, and its base_from_recon is gripper_from_object.
         """
-        transforms = {
-            "on_gripper": None,
-            "on_base": self.on_gripper,
-            "resting": None,
-            "carried": self.resting,
-        }
-        return replace(self, mount="base", with_given_intrinsics=None, **transforms)
+        own = {"on_gripper": None, "on_base": self.on_gripper, "resting": None, "carried": self.resting}
+        return replace(self, mount="base", with_given_intrinsics=None, **own)
 
     def with_uncertainty(self, uncertainty: Uncertainty) -> "Calibration":
         """Return the calibration with another uncertainty, also as standard deviations of its intrinsics."""
@@ -424,10 +398,8 @@ class Calibration(Outcome):
 
     def as_html(self, note: str = "") -> str:
         """Return an HTML table of transform, standard deviations, verdict and warnings, with `note` below it."""
-        mm, degrees = (
-            1e3 * self.parent_from_camera[:3, 3],
-            np.degrees(rotation_log(self.parent_from_camera[:3, :3])),
-        )
+        x = self.parent_from_camera
+        mm, degrees = 1e3 * x[:3, 3], np.degrees(rotation_log(x[:3, :3]))
         std_mm, std_deg = self.uncertainty.translation_std_mm, self.uncertainty.rotation_std_deg
         rows = [("", "translation", "rotation vector")] + [
             (axis, f"{mm[k]:.2f} ± {std_mm[k]:.2f} mm", f"{degrees[k]:.3f} ± {std_deg[k]:.3f}°")
@@ -454,11 +426,6 @@ class FailedCalibration(Outcome):
         advice = remedy(self.findings[0]) or text(self.findings[0])
         kind, motion = FindingKind.UNOBSERVABLE, "no camera poses"
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
-
-    @property
-    def parent_from_camera(self) -> None:
-        """None, because a failed calibration has no transform."""
-        return None
 
     def __getattr__(self, name: str) -> Any:
         """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
@@ -493,12 +460,12 @@ def failed_calibration(
     `backend` is the name of the last back end, `timings_s` the seconds of each stage by name. `attempts` are the
     reconstructions that were tried.
     """
-    unregistered = (ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images)
+    why = "not registered"
     return FailedCalibration(
         mount=capture.mount,
         backend=backend,
-        images=tuple(unregistered),
-        intrinsics=None if capture.intrinsics is None else capture.intrinsics.with_std(None),
+        images=tuple(ImageVerdict(image=name, used=False, reason=why) for name in capture.images),
+        intrinsics=capture.intrinsics and capture.intrinsics.with_std(None),
         findings=tuple(findings),
         attempts=tuple(attempts),
         timings_s=timings_s,

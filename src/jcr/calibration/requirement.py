@@ -82,13 +82,9 @@ def predictions(
 
     `base_from_gripper` and `robot` are the present gripper poses and the prior of their errors.
     """
-
-    def predicted(count: int) -> Uncertainty:
-        """Return the predicted uncertainty with the first `count` added poses."""
-        together = np.concatenate([base_from_gripper, added[:count]])
-        return predict(assumptions, together, robot.with_poses(base_from_gripper, added[:count]))
-
-    return cache(predicted)
+    now = base_from_gripper
+    poses = np.concatenate([now, added])
+    return cache(lambda k: predict(assumptions, poses[: len(now) + k], robot.with_poses(now, added[:k])))
 
 
 def next_poses(

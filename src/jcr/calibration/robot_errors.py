@@ -64,8 +64,12 @@ def robot_errors(
     if later is not None:
         gripper = np.concatenate([gripper, later.base_from_gripper])
         joints = None if joints is None or later.joints is None else np.concatenate([joints, later.joints])
+    name = options.robot or capture.robot
     try:
-        return errors_of(gripper, _arm(capture, options), joints)
+        arm = None if name is None else arm_named(name)
+        if name is None and capture.urdf is not None and capture.joints is not None:
+            arm = read_chain(capture.urdf, capture.joints.shape[1])
+        return errors_of(gripper, arm, joints)
     except LengthError:
         raise
     except InputError as error:
@@ -86,16 +90,6 @@ def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = No
         return RobotErrorPrior(smooth_errors(gripper))
     arm, joints = posed(arm, joints, gripper)
     return RobotErrorPrior(arm_errors(arm, joints), arm, joints)
-
-
-def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
-    """Return the arm named by the options or the capture, or that of the capture's URDF; None: unknown."""
-    name = options.robot or capture.robot
-    if name is not None:
-        return arm_named(name)
-    if capture.urdf is None or capture.joints is None:
-        return None
-    return read_chain(capture.urdf, capture.joints.shape[1])
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:

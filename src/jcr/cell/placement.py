@@ -10,11 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field, ValidationError, model_validator
 
-from jcr.calibration.record import FindingJson, derived, require_one_verdict
+from jcr.calibration.record import FindingJson, require_one_verdict
 from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_text
-from jcr.findings import Finding, Verdict, doubt_of, strongest_first
+from jcr.findings import Finding, Verdict, doubt_of, strongest_first, verdict_of, warnings_of
 from jcr.geometry import skew
 from jcr.records import CellCamera, IntrinsicsAndStd, Mount
 from jcr.records.json_fields import Covariance6, Matrix, Part, Spread, Spread3
@@ -132,7 +132,14 @@ class CameraPlacement(Part):
             )
             for k, image in enumerate(camera.images)
         ]
-        content = {"pictures": images, **placed, **derived(strongest_first(findings))}
+        found, verdict = strongest_first(findings), verdict_of(findings)
+        content = {
+            "pictures": images,
+            "findings": list(found),
+            "warnings": list(warnings_of(found)),
+            **placed,
+        }
+        content |= {"verdict": verdict, "converged": verdict != "rejected"}
         return cls(name=camera.name, mount=camera.mount, arm=camera.arm, **content)
 
     @model_validator(mode="after")

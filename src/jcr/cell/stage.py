@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.calibration.case import Case
-from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
+from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, effects
 from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -176,8 +176,9 @@ def _examined(
         if (free := state.combinations) is not None:
             images = images.with_freed(one.number, free)
             solution = images.solved()
+            adopted = {"shift": None, "intrinsics_shift": None}
             faults = tuple(
-                as_adopted(fault) if fault.kind.row.group == "camera" else fault for fault in faults
+                replace(one, **adopted) if one.kind.row.group == "camera" else one for one in faults
             )
         found.append(faults)
     return solution, found

@@ -49,8 +49,7 @@ def closed_form(
 
 
 def initial_estimate(
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    recon_from_camera: Float[ndarray, "n 4 4"],
+    base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
 ) -> tuple[Transform, float, Transform]:
     """Return gripper_from_camera, scale and base_from_recon of `closed_form`, with a positive scale.
 
@@ -78,9 +77,7 @@ def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
 
 
 def rotations(
-    gripper: Float[ndarray, "*#batch n 3 3"],
-    camera: Float[ndarray, "*#batch n 3 3"],
-    rounds: int = ROUNDS,
+    gripper: Float[ndarray, "*#batch n 3 3"], camera: Float[ndarray, "*#batch n 3 3"], rounds: int = ROUNDS
 ) -> tuple[Rotations, Rotations]:
     """Return R_X and R_Z, the rotations of gripper_from_camera and base_from_recon, from R_G · R_X = R_Z · R_C.
 

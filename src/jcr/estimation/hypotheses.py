@@ -31,12 +31,7 @@ from jcr.estimation.problem import (
     rows_of,
     with_free,
 )
-from jcr.estimation.robot_noise import (
-    Equations,
-    most_likely,
-    over_sizes,
-    solve_equations,
-)
+from jcr.estimation.robot_noise import Equations, most_likely, over_sizes, solve_equations
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, Transform, skew, step_between
@@ -393,20 +388,15 @@ def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
     strain[:, :3] = np.einsum("kab,nb->nak", STRAINS, position)
-    yield Row(kind=FindingKind.LENGTHS, columns=_flat(strain), unit=0.1)
+    yield Row(kind=FindingKind.LENGTHS, columns=strain.reshape(6 * n, -1), unit=0.1)
     # The base leans towards the gripper by 1 rad per metre of horizontal distance.
     lean = np.cross(position, UP)
-    columns = _flat(np.concatenate([np.cross(lean, position), lean], axis=1)[..., None])
+    columns = np.concatenate([np.cross(lean, position), lean], axis=1).reshape(6 * n, 1)
     yield Row(kind=FindingKind.BASE_LEANS, columns=columns, unit=0.2)
     # The gripper rotates under a weight on a lever along each of its axes, by 1 rad for a horizontal lever.
     sag = np.zeros((n, 6, 3))
     sag[:, 3:] = -rotation @ skew(rotation[:, 2])
-    yield Row(kind=FindingKind.TOOL_SAGS, columns=_flat(sag), unit=0.1)
-
-
-def _flat(columns: Float[ndarray, "n 6 d"]) -> Float[ndarray, "s d"]:
-    """Return the columns (n,6,d) of n poses as a matrix (s,d) with s = 6n rows, pose by pose."""
-    return columns.reshape(-1, columns.shape[2])
+    yield Row(kind=FindingKind.TOOL_SAGS, columns=sag.reshape(6 * n, -1), unit=0.1)
 
 
 def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffsets:
@@ -420,7 +410,7 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
     size = float(np.sqrt(poses.equations.variances(sizes)[2]))
-    columns = _flat(error_jacobian(arm, joints)[:, :, : arm.dof])
+    columns = error_jacobian(arm, joints)[:, :, : arm.dof].reshape(-1, arm.dof)
     columns = columns - poses.region.by_unknown @ (poses.region.fit @ columns)
     offset = size**2 * columns.T @ solution.weighed_left
     known = np.diag(columns.T @ solution.projection @ columns)

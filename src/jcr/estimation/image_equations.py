@@ -19,12 +19,7 @@ from jcr.estimation.elimination import Normal, cholesky, inverse_of, over, with_
 from jcr.estimation.intrinsics_prior import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
 from jcr.estimation.problem import Problem, State, similarities_of_rigs, stepped
-from jcr.estimation.projection import (
-    ProjectedObservations,
-    by_points,
-    derivatives,
-    view_of,
-)
+from jcr.estimation.projection import ProjectedObservations, by_points, derivatives, view_of
 from jcr.geometry import step_between
 from jcr.least_squares import damped_gauss_newton, one_blas_thread
 

@@ -13,13 +13,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.estimation.closed_form import closed_form
-from jcr.estimation.kinematics import (
-    Arm,
-    Joints,
-    forward_kinematics,
-    kinematic_jacobian,
-    with_tool,
-)
+from jcr.estimation.kinematics import Arm, Joints, forward_kinematics, kinematic_jacobian, with_tool
 from jcr.estimation.pose_equations import expected_covariance, fit_known_scale, pose_residuals
 from jcr.geometry import (
     ARM,
@@ -128,10 +122,7 @@ def _error(
 
 
 def _posture(
-    arm: Arm,
-    base_from_tool: Float[ndarray, "n 4 4"],
-    flange_from_tool: Transform,
-    rng: np.random.Generator,
+    arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform, rng: np.random.Generator
 ) -> Posture:
     """Return the posture for n poses `base_from_tool` of a tool that is fixed on the flange by `flange_from_tool`.
 
@@ -200,9 +191,7 @@ def _with_tool(
     poses, n, dof = base_from_tool[some], len(some), arm.dof
     weight = 1e-3 / np.repeat(TOOL_STD, 3)
 
-    def linearised(
-        at: tuple[Joints, Transform],
-    ) -> tuple[Float[ndarray, "r 1"], Float[ndarray, "r 1 p"]]:
+    def linearised(at: tuple[Joints, Transform]) -> tuple[Float[ndarray, "r 1"], Float[ndarray, "r 1 p"]]:
         joints, tool = at
         error, by_joints = _error(arm, joints, poses @ inverse(tool))
         rotation = poses[:, :3, :3] @ tool[:3, :3].T

@@ -10,14 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import (
-    NORMALIZED,
-    by_parameters,
-    by_point,
-    parameters,
-    unproject,
-    with_thin_prism,
-)
+from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, over, point_blocks
 from jcr.estimation.intrinsics_prior import second_moment_px2

@@ -24,14 +24,7 @@ from jcr.estimation.elimination import Sightings
 from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, displacements
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
-from jcr.geometry import (
-    Poses,
-    Transform,
-    retract,
-    scale_translation,
-    skew,
-    step_between,
-)
+from jcr.geometry import Poses, Transform, retract, scale_translation, skew, step_between
 from jcr.records import Intrinsics, Tracks
 
 TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
@@ -675,11 +668,7 @@ def wrist_problem(
     bodies = None if arm is None else tracks.boards
     boards, world_from_board = shapes_of(bodies, points_in_world, twice, n)
     problem = Problem(
-        arms=arms,
-        n_rigs=n + len(world_from_board),
-        cameras=(camera,),
-        boards=boards,
-        robot_noise_floor=noise,
+        arms=arms, n_rigs=n + len(world_from_board), cameras=(camera,), boards=boards, robot_noise_floor=noise
     )
     state = State(
         x=x[None][: len(arms)],

@@ -6,7 +6,7 @@ last rounds (Anderson acceleration, J. ACM 12, 1965; Walker and Ni, SIAM J. Nume
 averaged over the sizes of the robot's errors (covariance.py).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,7 +39,6 @@ from jcr.estimation.pose_equations import (
 )
 from jcr.estimation.problem import (
     SCALE,
-    LinearPrior,
     Problem,
     ReportedPoses,
     Start,
@@ -49,7 +48,6 @@ from jcr.estimation.problem import (
     step_to,
     stepped,
     transferred,
-    with_free,
     wrist_arm,
     wrist_problem,
 )
@@ -211,11 +209,7 @@ class Solution:
 
 @one_blas_thread
 def solve(
-    problem: Problem,
-    start: State,
-    *,
-    averaged: bool = True,
-    start_noise: tuple[float, float] = START_NOISE,
+    problem: Problem, start: State, *, averaged: bool = True, start_noise: tuple[float, float] = START_NOISE
 ) -> Solution:
     """Solve a problem from an initial state; return the estimate with its covariance.
 
@@ -304,15 +298,6 @@ def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
         weight = 1 / (1 + (gap / max(float(np.median(gap)), 1e-9)) ** 2)
         base_from_recon, scale = fit_similarity(points, recon, weight)
     return float(scale), base_from_recon
-
-
-def with_priors(solution: Solution, priors: Sequence[LinearPrior]) -> Solution:
-    """Return the solution with `priors` in place of its linear priors on X, scale and cameras.
-
-    The arms' unknowns, error sizes and covariance are estimated anew; the images are not adjusted again.
-    """
-    problem = with_free(solution.problem, priors=tuple(priors))
-    return with_covariance(problem, solution.most_likely, solution.evidence, True)
 
 
 def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:

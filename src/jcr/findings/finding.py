@@ -1,5 +1,6 @@
 """Record of a finding; text and remedy of a finding; order and verdict of several findings."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -111,49 +112,35 @@ class _Images(tuple[str, ...]):
         return joined([*self[:3], *[f"{len(self) - 3} more"] * (len(self) > 3)])
 
 
-class Quantities(dict[str, Any]):
-    """Values by name for the templates of a finding's message and remedy: its details and numbers.
+def quantities(finding: Finding) -> defaultdict[str, Any]:
+    """Return the values for the templates of a finding's message and remedy, by name: its details and numbers.
 
-    Numbers are also given in mm, degrees and percent. A name without a value gives an empty text.
+    Each number is also given in mm (m times 1000), degrees and percent, under names such as `mm` or `std_percent`. A
+    name without a value gives an empty text.
     """
-
-    def __missing__(self, name: str) -> _Text:
-        """Return an empty text for a name without a value."""
-        return _Text("")
-
-    @staticmethod
-    def of(finding: Finding) -> "Quantities":
-        """Return the values that the templates of a finding's message and remedy use, by name.
-
-        Each number is also given in mm (m times 1000), degrees and percent, under names such as `mm` or `std_percent`.
-        """
-        named = Quantities(images=_Images(finding.images), concerns=_Text(finding.concerns))
-        for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
-            if isinstance(one, str):
-                named[name] = _Text(LENGTHS.get(one, one))
-            elif one is not None:
-                of, units = (
-                    "" if name == "value" else f"{name}_",
-                    {"mm": 1e3, "deg": 180 / np.pi, "percent": 100.0},
-                )
-                named |= {name: _Number(one)} | {
-                    f"{of}{unit}": _Number(per * one) for unit, per in units.items()
-                }
-                if name.endswith("_mm"):
-                    named[name.removesuffix("m")] = _Number(1e-3 * one)
-        if "x" in named:
-            at, frame = np.array([named[name] for name in "xyz"], float), finding.details["frame"]
-            k = int(np.abs(at).argmax())
-            along = abs(at[k]) > np.cos(np.radians(10))
-            numbers = ", ".join(f"{x:.2f}" for x in at)
-            named["axis"] = (
-                f"the {frame}'s {'xyz'[k]} axis" if along else f"the axis ({numbers}) of the {frame}"
-            )
-            named["point"] = ", ".join(f"{1e3 * x:.0f}" for x in at)
-        if "motion" in named:
-            direction, move = MOTIONS[named["motion"]]
-            named |= {"direction": direction.format_map(named), "move": move.format_map(named)}
-        return named
+    named: defaultdict[str, Any] = defaultdict(
+        _Text, images=_Images(finding.images), concerns=_Text(finding.concerns)
+    )
+    for name, one in {"value": finding.value, "std": finding.std, **finding.details}.items():
+        if isinstance(one, str):
+            named[name] = _Text(LENGTHS.get(one, one))
+        elif one is not None:
+            of = "" if name == "value" else f"{name}_"
+            units = {name: 1.0, f"{of}mm": 1e3, f"{of}deg": 180 / np.pi, f"{of}percent": 100.0}
+            named |= {unit: _Number(per * one) for unit, per in units.items()}
+            if name.endswith("_mm"):
+                named[name.removesuffix("m")] = _Number(1e-3 * one)
+    if "x" in named:
+        at, frame = np.array([named[name] for name in "xyz"], float), finding.details["frame"]
+        k = int(np.abs(at).argmax())
+        along = abs(at[k]) > np.cos(np.radians(10))
+        numbers = ", ".join(f"{x:.2f}" for x in at)
+        named["axis"] = f"the {frame}'s {'xyz'[k]} axis" if along else f"the axis ({numbers}) of the {frame}"
+        named["point"] = ", ".join(f"{1e3 * x:.0f}" for x in at)
+    if "motion" in named:
+        direction, move = MOTIONS[named["motion"]]
+        named |= {"direction": direction.format_map(named), "move": move.format_map(named)}
+    return named
 
 
 def joined(words: Iterable[str]) -> str:
@@ -164,23 +151,23 @@ def joined(words: Iterable[str]) -> str:
 
 def text(finding: Finding) -> str:
     """Return the message of a finding: the fault in one sentence."""
-    return finding.kind.row.message.format_map(Quantities.of(finding))
+    return finding.kind.row.message.format_map(quantities(finding))
 
 
 def remedy(finding: Finding) -> str:
     """Return the remedy of a finding in one sentence; empty if there is none or none is needed."""
-    return finding.kind.row.remedy.format_map(Quantities.of(finding))
+    return finding.kind.row.remedy.format_map(quantities(finding))
 
 
 def unobservable(finding: Finding) -> str:
     """Return the direction of a finding of kind UNOBSERVABLE in words, with "nearly unobservable" before a weak one."""
-    return "{nearly:nearly unobservable: |}{direction}".format_map(Quantities.of(finding))
+    return "{nearly:nearly unobservable: |}{direction}".format_map(quantities(finding))
 
 
 def reached_in_words(required: Requirement) -> str:
     """Return a sentence with the reached bound on 95 % of the errors and the required one."""
     short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "informs", "none", **required.details)
-    return REACHED.format_map(Quantities.of(short))
+    return REACHED.format_map(quantities(short))
 
 
 def sentence(finding: Finding) -> str:

@@ -99,7 +99,7 @@ class KindRow:
     group: str
     """Group of the kind in the documentation, a key of GROUPS."""
     message: str
-    """Template of the message in one sentence, filled with the values of finding.Quantities."""
+    """Template of the message in one sentence, filled with the values of finding.quantities."""
     remedy: str = ""
     """Template of the remedy in one sentence; empty if there is none or none is needed."""
     explains: tuple[str, ...] = ()

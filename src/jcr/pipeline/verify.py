@@ -185,11 +185,7 @@ def _new_images(
 
 
 def _in_old_scene(
-    run: RunResult,
-    new: Capture,
-    located: Mapping[int, CameraPose],
-    notes: list[str],
-    options: VerifyOptions,
+    run: RunResult, new: Capture, located: Mapping[int, CameraPose], notes: list[str], options: VerifyOptions
 ) -> Verification:
     """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 

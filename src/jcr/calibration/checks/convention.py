@@ -121,7 +121,7 @@ def better_reading(
     rows = np.arange(len(base_from_gripper)) if rows is None else rows
     n = len(rows)
     given, *others = _candidates(base_from_gripper, by_name or {}, rows)
-    as_given = _solved(given, recon_from_camera, solved)
+    as_given = _reading(given, recon_from_camera, solved)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
     worth = _congruent(others, recon_from_camera)
@@ -132,7 +132,7 @@ def better_reading(
         return None
     near = min(ROUGHLY * min(rough), enough)
     readings = [
-        _solved(one, recon_from_camera) for one, error in zip(worth, rough, strict=True) if error <= near
+        _reading(one, recon_from_camera) for one, error in zip(worth, rough, strict=True) if error <= near
     ]
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
@@ -153,28 +153,23 @@ def _better_adjusted(
     given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
     if not case.is_adjustable or case.tracks.from_pointmaps or poses_agree(case.hand_eye.robot_noise):
         return None
-    worth = _congruent(others, case.recon_from_camera)
-    rough = [_rough_error(candidate, case.recon_from_camera) for candidate in worth]
-    limit = _rough_error(given, case.recon_from_camera)
+    camera = case.recon_from_camera
+    worth = _congruent(others, camera)
+    rough, limit = [_rough_error(candidate, camera) for candidate in worth], _rough_error(given, camera)
     for k in np.argsort(rough, kind="stable")[:ADJUSTED]:
-        name, remedy, poses, image = worth[k]
+        _, _, poses, image = worth[k]
         if rough[k] >= limit:
             break
         reported, every = case.base_from_gripper.copy(), case.capture.base_from_gripper.copy()
         reported[image] = poses
         every[rows] = reported
-        systematic = errors_of(reported)
-        fit = solve_hand_eye(
-            reported,
-            case.recon_from_camera,
-            systematic=systematic.systematic,
-            camera_errors="none",
-            names=case.names,
-        )
+        robot = errors_of(reported)
+        known = {"systematic": robot.systematic, "names": case.names}
+        fit = solve_hand_eye(reported, camera, camera_errors="none", **known)
         tried = replace(
             case,
             capture=replace(case.capture, base_from_gripper=every),
-            robot=systematic,
+            robot=robot,
             hand_eye=replace(fit, intrinsics=case.pose_fit.intrinsics),
             fit=None,
             chosen_tracks=None,
@@ -182,7 +177,7 @@ def _better_adjusted(
         )
         found = with_adjusted_images(tried).hand_eye
         if found.converged and found.inliers.sum() >= MIN_SHARE * (len(reported) - 2):
-            readings = (_reading(name, remedy, found), _reading(given[0], given[1], case.hand_eye))
+            readings = _reading(worth[k], camera, found), _reading(given, camera, case.hand_eye)
             return readings if readings[0].misfit * BETTER < readings[1].misfit else None
     return None
 
@@ -200,20 +195,15 @@ def convention_finding(
     return Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=size, **details)
 
 
-def _solved(
-    candidate: _Candidate, recon_from_camera: Poses, solved: Calibration | None = None
+def _reading(
+    candidate: _Candidate, recon_from_camera: Poses, fit: Calibration | None = None
 ) -> PoseConvention:
-    """Return the record of a candidate convention, with the misfit of its hand-eye fit to the camera poses.
+    """Return the record of a candidate convention, with the robot errors and the image count of its calibration `fit`.
 
-    `recon_from_camera` are the camera poses of all registered images. `solved` is that fit; None: it is computed.
+    `recon_from_camera` are the camera poses of all registered images. `fit` None: the hand-eye fit to them is computed.
     """
     name, remedy, base_from_gripper, image = candidate
-    fit = solved or solve_hand_eye(base_from_gripper, recon_from_camera[image], camera_errors="none")
-    return _reading(name, remedy, fit)
-
-
-def _reading(name: str, remedy: str, fit: Calibration) -> PoseConvention:
-    """Return the record of a convention: name, remedy in words, and robot errors of its calibration `fit`."""
+    fit = fit or solve_hand_eye(base_from_gripper, recon_from_camera[image], camera_errors="none")
     metres, radians = fit.robot_noise.together
     return PoseConvention(name, remedy, 1e3 * metres, float(np.degrees(radians)), int(fit.inliers.sum()))
 

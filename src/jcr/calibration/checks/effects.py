@@ -231,12 +231,17 @@ def effects(
         best = of_camera or of_poses
         if best is None:
             break
-        if (
-            of_camera is not None
-            and of_poses is not None
-            and _explains(model, of_poses[0], of_camera[0], passed)
-        ):
-            best = of_poses
+        if of_camera is not None and of_poses is not None:
+            # Each is tested again with the other one estimated. The cause is the effect that stays significant; if both
+            # or neither does, it is the one with the smaller p-value.
+            (camera, _), (pose, _) = of_camera, of_poses
+            assert camera.after is not None
+            left = _best(camera.after, passed, False)
+            poses_remain = left is not None and left[0].row.kind is pose.row.kind
+            ((_, log_p),) = rank(model.with_rows((*model.rows, pose.row)), [camera.row])
+            camera_remains = log_p <= np.log(POLICIES[camera.row.kind].alpha)
+            is_pose = pose.log_p < camera.log_p if poses_remain == camera_remains else poses_remain
+            best = of_poses if is_pose else of_camera
         test, found = best
         findings.append(found)
         passed.add(test.row.kind)
@@ -262,8 +267,14 @@ def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -
         kind, log_p = test.row.kind, test.log_p
         if kind is FindingKind.INTRINSICS:
             test = replace(test, log_p=(log_p := min(log_p, log_p_of_given(model))))
-        if log_p > _log_alpha(kind, model) or _has_simpler_cause(test, tests):
+        if log_p > _log_alpha(kind, model):
             continue
+        if kind is FindingKind.FOCUS_BY_IMAGE:
+            # A focal length that follows the distance or changes once replaces one that explains hardly more.
+            focal = test.row.columns @ test.estimate
+            simple = [one.row.columns[:, 0] for one in tests if one.row.kind in FOCUS - {kind}]
+            if any((one @ focal) ** 2 > NEARLY_ALL * (one @ one) * (focal @ focal) for one in simple):
+                continue
         is_motion = test.row.motion is not None
         sizes = np.linalg.norm(test.estimate.reshape(1 + is_motion, -1), axis=1)
         if (sizes > POLICIES[kind].largest).any() or not poses_agree(test.noise):
@@ -310,34 +321,6 @@ def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
     """
     is_given = kind is FindingKind.INTRINSICS and model.is_given
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
-
-
-def _has_simpler_cause(test: Test, tests: Sequence[Test]) -> bool:
-    """Return whether `test` is one focal length per image, and a simpler effect of `tests` explains nearly as much.
-
-    The simpler effect is a focal length that follows the distance or changes once. It must explain a fraction
-    NEARLY_ALL of the squared focal-length differences.
-    """
-    if test.row.kind is not FindingKind.FOCUS_BY_IMAGE:
-        return False
-    focal = test.row.columns @ test.estimate
-    simple = [one.row.columns[:, 0] for one in tests if one.row.kind in FOCUS - {test.row.kind}]
-    return any((along @ focal) ** 2 > NEARLY_ALL * (along @ along) * (focal @ focal) for along in simple)
-
-
-def _explains(model: Adjustment, of_poses: Test, of_camera: Test, passed: Collection[FindingKind]) -> bool:
-    """Return True if the effect on the poses is the cause of the misfit, False if the effect on the camera is.
-
-    Both are significant; each is tested again with the other one estimated. The cause is the effect that stays
-    significant; if both or neither does, it is the one with the smaller p-value. Effects on the poses of the kinds
-    `passed` are not tested.
-    """
-    assert of_camera.after is not None
-    left = _best(of_camera.after, passed, False)
-    poses_remain = left is not None and left[0].row.kind is of_poses.row.kind
-    ((_, log_p),) = rank(model.with_rows((*model.rows, of_poses.row)), [of_camera.row])
-    camera_remains = log_p <= np.log(POLICIES[of_camera.row.kind].alpha)
-    return of_poses.log_p < of_camera.log_p if poses_remain == camera_remains else poses_remain
 
 
 def log_p_of_given(model: Adjustment) -> float:
@@ -552,7 +535,7 @@ def with_effects(
     adjusted, remaining = adjust_case(case, combinations=free, confirmed_errors=bent), list[Finding]()
     for one in findings:
         if one.kind.row.group == "camera":
-            one = as_adopted(one)
+            one = replace(one, shift=None, intrinsics_shift=None)  # the calibration includes the effect
         elif bent is not None and one.kind in (row.kind for row in strains):
             # The shift due to all effects of the arm together belongs to the first finding.
             straight = np.zeros(7)
@@ -567,11 +550,6 @@ def with_effects(
             one = replace(one, shift=tuple(straight.tolist()))
         remaining.append(one)
     return adjusted, tuple(remaining)
-
-
-def as_adopted(found: Finding) -> Finding:
-    """Return the finding of an effect that the calibration includes: its shifts (also of the intrinsics) are removed."""
-    return replace(found, shift=None, intrinsics_shift=None)
 
 
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:

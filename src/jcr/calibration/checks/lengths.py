@@ -20,8 +20,8 @@ from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_depth_images
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
-from jcr.estimation.problem import SCALE, LinearPrior
-from jcr.estimation.solve import Solution, size_of_boards, with_priors
+from jcr.estimation.problem import SCALE, LinearPrior, with_free
+from jcr.estimation.solve import Solution, size_of_boards, with_covariance
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruction
@@ -206,7 +206,9 @@ def _fused(
             value = float(row @ adjusted.problem.coordinates(adjusted.state)) - size
             std = boards.size_std
         known.append(LinearPrior(row, value, float(np.hypot(std, ROBOT_STD))))
-    adjusted = with_priors(adjusted, known)
+    # The arms' unknowns, error sizes and covariance are estimated anew; the images are not adjusted again.
+    problem = with_free(adjusted.problem, priors=tuple(known))
+    adjusted = with_covariance(problem, adjusted.most_likely, adjusted.evidence)
     refined = refined_by(case, adjusted)
     refined = refined.with_uncertainty(refined.uncertainty.with_error(fault))
     for one in hand_eye.findings:
