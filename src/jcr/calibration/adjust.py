@@ -108,8 +108,7 @@ def adjust_case(
     None: none. `confirmed_errors` (s,b) are b patterns of gripper pose errors of one standard deviation each; None:
     none. Their rows, s = 6 per used image, are translation (m) and rotation vector (rad) in base axes.
 
-    The initial robot pose noise is taken from the residuals of the fit. A smaller one needs ten times the steps if
-    poses and images contradict.
+    The initial robot pose noise is that of the fit; a smaller one needs ten times the steps if images contradict poses.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)

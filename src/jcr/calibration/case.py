@@ -156,8 +156,7 @@ class Case:
         """Whether bundle adjustment can refine the fit to camera poses.
 
         It needs MIN_OBSERVATIONS observations and MIN_IMAGES used images. Camera poses with a covariance (`evidence`)
-        are not adjusted. Cases with a known scale or height (`priors`) are not adjusted either, because the bundle
-        adjustment does not model these.
+        are not adjusted, nor are cases with a known scale or height (`priors`), which the bundle adjustment lacks.
         """
         return (
             self.reconstruction.evidence is None
@@ -193,8 +192,7 @@ class Case:
     ) -> "Case":
         """Return the case with the findings of a check added, and with a new calibration or adjustment if given.
 
-        A finding's shift is also added to the covariance (`with_findings`). None for `hand_eye` or `adjusted` keeps the
-        case's own.
+        A finding's shift is also added to the covariance (`with_findings`). None keeps the case's own.
         """
         found = with_findings(hand_eye or self.hand_eye, findings)
         fit = self.pose_fit if found.source == "images" else self.fit
@@ -204,9 +202,8 @@ class Case:
 def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
     """Return the calibration with `findings` added; the shift s of each finding adds s·sᵀ to the covariance.
 
-    The shift is the change of the calibration that the finding states (`Finding.shift`, in COVARIANCE_ORDER). A finding
-    with a shift gets the severity "rejects" in two cases: the calibration is rejected already, or the shift makes it
-    too uncertain (hand_eye.MAX_STD).
+    The shift (`Finding.shift`, in COVARIANCE_ORDER) is the change of the calibration that the finding states. A finding
+    with a shift gets the severity "rejects" if the calibration is rejected, or too uncertain with the shift (MAX_STD).
     """
     named: list[Finding] = []
     for finding in findings:

@@ -62,7 +62,6 @@ from jcr.records import (
     Uncertainty,
 )
 from jcr.records.json_fields import Matrix, Positive, rounded
-from jcr.records.notebook import table
 
 FORMAT = "jcr.calibration/2"
 NAMES = {
@@ -70,6 +69,11 @@ NAMES = {
     "base": ("base_from_camera", "gripper_from_object"),
 }
 """Names of the two transforms of a calibration, for a camera on the gripper and for one fixed in the base frame."""
+HTML = """\
+<p><b>{{ heading }}</b></p><table>
+{%- for row in rows %}<tr><th>{{ row[0] }}</th>{% for cell in row[1:] %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor -%}
+</table><p>{{ note }}</p>"""
+"""Template of the table that notebooks display; all texts are escaped."""
 
 
 def as_json(finding: Finding) -> dict[str, Any]:
@@ -200,10 +204,7 @@ class Outcome:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings in words, without a missed accuracy, the reason of a rejection, and warnings that follow from it.
-
-        Further findings that reject are included.
-        """
+        """Warnings and further rejections in words, without a missed accuracy, the first reason and its consequences."""
         first = self.short if self.converged else self.findings[0]
         said = without_consequences(self.findings)
         return [sentence(one) for one in said if one.severity != "informs" and one is not first]
@@ -264,10 +265,7 @@ class Calibration(Outcome):
 
     @model_validator(mode="after")
     def _is_of_one_mount(self) -> "Calibration":
-        """Return the calibration; raise ValueError unless exactly the two transforms of the camera's mount are set.
-
-        These are on_gripper and resting for mount "gripper", on_base and carried for mount "base".
-        """
+        """Return the calibration; raise ValueError unless exactly the two transforms of the camera's mount are set."""
         own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
         own, other = (own, other) if self.mount == "gripper" else (other, own)
         if any(one is None for one in own) or any(one is not None for one in other):
@@ -280,8 +278,7 @@ class Calibration(Outcome):
         """Systematic robot errors as JSON: `systematic_deg`, `translation_mm` and `rotation_deg`, and `joints`.
 
         `systematic_deg` is their size (`RobotNoise.systematic`); `translation_mm` and `rotation_deg` are the part per
-        axis that the fit leaves. `joints` lists the offset and standard deviation of each joint (degrees); null for an
-        unknown arm.
+        axis that the fit leaves. `joints`: offset and standard deviation of each (degrees); null for an unknown arm.
         """
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
@@ -310,10 +307,7 @@ class Calibration(Outcome):
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance of the translation (m), rotation vector (rad) and log scale, as in records.COVARIANCE_ORDER.
-
-        Axes are those of the gripper, or of the base for a fixed camera.
-        """
+        """Covariance of translation (m), rotation vector (rad), log scale; axes of the gripper, or base if fixed."""
         return self.uncertainty.covariance
 
     @property
@@ -398,6 +392,8 @@ class Calibration(Outcome):
 
     def as_html(self, note: str = "") -> str:
         """Return an HTML table of transform, standard deviations, verdict and warnings, with `note` below it."""
+        from jinja2 import Template  # which no command needs for its help
+
         x = self.parent_from_camera
         mm, degrees = 1e3 * x[:3, 3], np.degrees(rotation_log(x[:3, :3]))
         std_mm, std_deg = self.uncertainty.translation_std_mm, self.uncertainty.rotation_std_deg
@@ -408,7 +404,8 @@ class Calibration(Outcome):
         used = f"{self.images_used} of {len(self.images)} images used"
         verdict = ": ".join(filter(None, (self.verdict, "; ".join(self.warnings))))
         heading = f"{self.mount}_from_camera, {verdict}; {used}"
-        return table(heading, rows, f"1σ, {self.mount} axes. {note}")
+        page = Template(HTML, autoescape=True)
+        return page.render(heading=heading, rows=rows, note=f"1σ, {self.mount} axes. {note}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -457,8 +454,7 @@ def failed_calibration(
 ) -> FailedCalibration:
     """Return the result for a capture that could not be reconstructed; `findings` are the reasons.
 
-    `backend` is the name of the last back end, `timings_s` the seconds of each stage by name. `attempts` are the
-    reconstructions that were tried.
+    `backend` is the last one tried, `timings_s` the seconds of each stage by name, `attempts` all reconstructions tried.
     """
     why = "not registered"
     return FailedCalibration(

@@ -98,8 +98,7 @@ def next_poses(
 
     `names` are the images of the poses in `base_from_gripper`; `predicted` is the function that `predictions` returns.
     With the `reported` uncertainty of the calibration, the expected one is `reported` times the predicted ratio of
-    after to before. The reason is that images and robot may differ from the assumptions of the prediction. None: the
-    predicted uncertainty is used as it is.
+    after to before, because images and robot may differ from the assumptions. None: the prediction is used as it is.
     """
     found = []
     for count, pose in enumerate(added, start=1):

@@ -82,9 +82,8 @@ def robot_errors(
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
     """Return the prior covariance of systematic errors of gripper poses, for an arm or (None) an unknown robot.
 
-    The covariance is that for an error size of 1 rad (`RobotErrorPrior.systematic`). `gripper` holds base_from_gripper
-    (m). `joints` (n,dof) are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the
-    poses do not fit the arm and the angles.
+    The covariance is that for an error size of 1 rad. `gripper` holds base_from_gripper (m), `joints` (n,dof) the joint
+    angles (rad); None: by inverse kinematics. Raises InputError if the poses do not fit the arm and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))

@@ -159,9 +159,8 @@ def fit_poses(
 def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
     """Calibrate from given pairs of gripper and camera poses, without images.
 
-    For metric camera poses, an estimated scale other than 1 shows a wrong marker size. If the motions do not determine
-    the scale, it is assumed to be 1. Raises InputError for invalid options, and for poses that do not fit the option
-    `robot`.
+    For metric camera poses, an estimated scale other than 1 shows a wrong marker size; a scale that the motions do not
+    determine is assumed to be 1. Raises InputError for invalid options, and for poses that do not fit the named arm.
     """
     check_options(options := options or CalibrateOptions())
     gripper = pairs.base_from_gripper
@@ -179,8 +178,7 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
     """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention.
 
-    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`, which
-    needs images.
+    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`.
     """
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")

@@ -47,9 +47,8 @@ GROWN, SOFT = 0.012, 0.008
 def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
     """Return the capture of a fixed camera as a capture of a camera that moves around the carried object.
 
-    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses.
-    `moving` is a folder to which images without the static background are written, which are then used; None: the
-    original images are used.
+    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses. Images
+    without the static background are written to the folder `moving` and used; None: the original images are used.
     """
     if moving is not None:
         images = moving_parts([read_image(capture.folder / name) for name in capture.images])
@@ -122,8 +121,7 @@ def refined(
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
     """Return the images of a fixed camera with the static background faded to grey; moving parts keep their colour.
 
-    The background of a pixel is its most frequent colour over the images; a pixel without a frequent colour counts as
-    moving.
+    The background of a pixel is its most frequent colour over the images; without a frequent colour the pixel moves.
     """
     height, width = images[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))

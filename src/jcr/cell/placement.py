@@ -44,8 +44,7 @@ class TransformUncertainty(Part):
     ) -> "TransformUncertainty":
         """Return the record of the covariance (translation in m, then rotation in rad; parent axes) of a transform.
 
-        With `parent_from_camera` and `scene_distance_m` from the camera, the record includes the uncertainty of a point
-        on the optical axis.
+        With `parent_from_camera` and `scene_distance_m`, the record has the uncertainty of a point on the optical axis.
         """
         std, at_scene = np.sqrt(np.diag(covariance)), None
         if parent_from_camera is not None and scene_distance_m is not None:
@@ -214,8 +213,7 @@ class CamerasFile(Part):
     ) -> list[Float[ndarray, "4 4"]]:
         """Return base_from_camera of every used image of `camera` (placement `found`), if its gripper pose is known.
 
-        `base_from_gripper` has poses of the capture's own arm by image number of the capture. The list is empty if the
-        camera was not placed.
+        `base_from_gripper` has the own arm's poses by image number of the capture. The list is empty if not placed.
         """
         parent_from_camera = found.parent_from_camera
         names = {image.image for image in found.images if image.used}

@@ -50,8 +50,7 @@ def localise(
     """Return the registration (pose and inliers) of an image in the reconstruction, and the number of inliers.
 
     The pose is recon_from_camera in metres. The registration is None if the inliers are too few. The focal length is
-    estimated if none is given, or if another value gives CLEARLY_MORE (1.1) times the inliers, because wrong intrinsics
-    give a wrong pose with fewer inliers.
+    estimated if none is given, or if another value gives CLEARLY_MORE (1.1) times the inliers.
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
@@ -245,10 +244,7 @@ class Rigs:
         return replace(kept, rig=rig, arm=len(self.arms))
 
     def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
-        """Return the reported poses of each arm, and initial (gripper_from_camera, base_from_world) of each.
-
-        The capture's own arm is the first.
-        """
+        """Return the reported poses and initial (gripper_from_camera, base_from_world) of each arm, own arm first."""
         case = self.case
         poses = case.capture.base_from_gripper[self.rows]
         kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
@@ -274,9 +270,8 @@ def fit_views(
 ) -> tuple[Calibration, tuple[Finding, ...]]:
     """Return the hand-eye calibration of a camera from its images and the poses of its gripper or rig.
 
-    `carrier` are these poses: base_from_gripper or recon_from_rig of each used image. All poses are in metres;
-    `scale_std` is the relative standard deviation of the scale between them. The second result is the findings on
-    effects such as a slip.
+    `carrier` are these poses (m): base_from_gripper or recon_from_rig of each used image. `scale_std` is the relative
+    standard deviation of the scale between them. The second result is the findings on effects such as a slip.
     """
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, camera_errors="none")
     known = (scale_prior(1.0, scale_std),)

@@ -116,8 +116,8 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
     """Return a finding if the images of a fixed camera have different poses; an empty tuple if the poses agree.
 
     Poses differ if their squared Mahalanobis distance exceeds APART and a step exceeds MATERIAL standard deviations.
-    Each image is adjusted with a pose of its own. The difference of two poses is compared with its covariance, in which
-    common errors, as of the intrinsics, cancel.
+    Each image is adjusted with its own pose; common errors, as of the intrinsics, cancel in the covariance of a
+    difference.
     """
     alone = Rigs(rigs.case, rigs.known)
     alone.poses += list(views.places)
@@ -146,8 +146,7 @@ def _examined(
 
     `mounted` are the cameras other than the capture's own. Confirmed effects on the camera's parameters are adopted in
     the solution. Findings are in the order of `mounted`, and empty for a camera with exact intrinsics or one that is
-    known to have moved. Another arm's poses are tested with its camera; those of the capture's own arm were tested in
-    its calibration.
+    known to have moved. Another arm's poses are tested with its camera.
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:

@@ -22,8 +22,7 @@ _solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float
 def cholesky(matrix: Matrices) -> Matrices:
     """Return the lower Cholesky factors L (...,n,n) of positive semidefinite matrices (...,n,n): L Lᵀ = `matrix`.
 
-    A matrix that is singular up to rounding, as of degenerate motions, is allowed; its diagonal is then increased
-    slightly.
+    The diagonal of a matrix that is singular up to rounding, as of degenerate motions, is increased slightly.
     """
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None] / size[..., None, :]
@@ -108,8 +107,7 @@ class Sightings:
     def of(point: Int[ndarray, " k"], image: Int[ndarray, " k"], images: int) -> "Sightings":
         """Return the index of observations from the point and the image (or rig) of each, sorted by point, then image.
 
-        Points are numbered from 0, and every point has at least one observation. `images` is the number of images (or
-        rigs).
+        Points are numbered from 0, each with one observation or more. `images` is the number of images (or rigs).
         """
         rows = [np.flatnonzero(image == i) for i in range(images)]
         return Sightings(image, np.flatnonzero(np.diff(point, prepend=-1)), rows)
@@ -210,8 +208,7 @@ def without_points(
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
     """Return the 3x3 block JᵀJ of each of n points, with a small increase of the diagonal that makes it invertible.
 
-    J is `by_point`, the weighted derivative of k observations by their points, sorted by point. `starts` are the
-    indices of the points' first observations.
+    J is `by_point`, weighted derivatives of k observations by their points, sorted by point; `starts` the first of each.
     """
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 

@@ -110,8 +110,7 @@ class Scores:
     def gain(self, free: Float[ndarray, "c r"]) -> tuple[float, int]:
         """Return the decrease of the cost (squared standard deviations) by the best step along the columns of `free`.
 
-        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information. The second result is
-        the rank of S.
+        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient (A `free`, P the information); the second is the rank of S.
         """
         information, right = free.T @ self.information @ free, free.T @ self.gradient
         scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
@@ -211,9 +210,38 @@ class Adjustment:
 
     @cached_property
     def camera_scores(self) -> Scores:
-        """Quadratic cost of the e parameters (`Row`) of the tested camera, as by the function `camera_scores`."""
+        """Quadratic cost of changes of the tested camera's e parameters (`Row`) from their values in `solution`.
+
+        Units and weak prior are those of problem.rows_of. All other unknowns are eliminated, also the freed directions.
+        """
         assert self.camera is not None
-        return camera_scores(self.solution, self.camera)
+        solution, state = self.solution, self.solution.images.state
+        problem, likely = solution.problem, solution.most_likely
+        rows, units, weak = _rows_of(problem, self.camera)
+        first = problem.columns.cameras.stop
+        each = np.zeros((len(problem.directions), len(rows)))
+        each[rows] = np.diag(units)
+        freed = np.concatenate([problem.directions[:, first - len(problem.freed_std) :], each], axis=1)
+        wider = image_evidence(
+            with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std, weak]),
+            replace(state, camera_steps=np.insert(state.camera_steps, first, np.zeros(len(rows)))),
+        )
+        # The arms are at the most likely state, the images at the state of the evidence.
+        at = replace(wider.state, x=likely.x, scale=likely.scale, z=likely.z)
+        equations = pose_equations(wider.problem, at, wider).equations
+        found = solve_equations(equations, solution.log_sizes)
+        hessian = equations.jacobian.T @ found.weighed + equations.prior_information
+        right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
+        rest = problem.arm_unknowns + first + np.arange(len(rows))
+        kept = np.setdiff1d(np.arange(len(hessian)), rest)
+        coupling = hessian[np.ix_(kept, rest)]
+        by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
+        return Scores(
+            information=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
+            gradient=right[rest] - by_column.T @ right[kept],
+            freedom=max(len(equations.residual) - problem.arm_unknowns, 1),
+            dispersion=_dispersion(solution.images),
+        )
 
     def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
         """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
@@ -274,10 +302,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
 
 
 def mean_square(estimate: Float[ndarray, " d"], covariance: Float[ndarray, "d d"]) -> float:
-    """Return eᵀC⁻¹e / d of an estimate e of d parameters with covariance C: the statistic of Wald's test.
-
-    C⁻¹ is the pseudo-inverse if C is singular.
-    """
+    """Return Wald's statistic eᵀC⁻¹e / d of d parameters e with covariance C (pseudo-inverse if C is singular)."""
     size = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
     inverse = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9)
     return float((estimate / size) @ inverse @ (estimate / size)) / len(estimate)
@@ -322,8 +347,7 @@ def explains_by_order(scores: Scores, row: Row) -> bool:
     """Return whether at most the share BY_CHANCE of random orders of the images reach the score gain of a motion.
 
     `row` must have `motion` and `share`. ORDERS permutations of the share among the poses that move are compared by
-    `Scores.gain` of motion times share. This permutation test allows for errors with heavy tails and single wrong
-    poses.
+    `Scores.gain` of motion times share, which allows for errors with heavy tails and single wrong poses.
     """
     assert row.motion is not None and row.share is not None
     rng, own = np.random.default_rng(0), row.motion[::6].any(axis=1)
@@ -404,8 +428,7 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
 
     `joints` (n,dof) are the reported angles (rad) of the n used poses; the systematic errors of `poses` must be those
     of `arm_errors`. The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at
-    the most likely error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation:
-    the size σ_s of the systematic errors.
+    the most likely error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation.
     """
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
@@ -445,9 +468,8 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
     Effects on images are focal lengths, shears (rolling shutter) and offsets by gravity. They include a zoom, with one
-    row for each image at which it may happen. Each has the common error of the focal length as nuisance; offsets and
-    prism also have the principal point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
-    prism is tested only if there is one camera.
+    row for each possible image. Each has the common error of the focal length as nuisance; offsets and prism (only of a
+    single camera) also the principal point. With fewer than `min_images` images there are intrinsics alone.
     """
     problem, state = model.solution.problem, model.solution.state
     observations, view = problem.observations, model.solution.images.view
@@ -496,40 +518,6 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
         yield Row(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
     if len(problem.cameras) == 1:  # all images have the same lens
         yield Row(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
-
-
-def camera_scores(solution: Solution, camera: int) -> Scores:
-    """Return the quadratic cost of changes of the e parameters (`Row`) of the camera with index `camera`.
-
-    The changes are from the values in `solution`, in the units of problem.rows_of and with its weak prior. All other
-    unknowns are eliminated, including the directions that the solution has freed.
-    """
-    problem, likely, state = solution.problem, solution.most_likely, solution.images.state
-    rows, units, weak = _rows_of(problem, camera)
-    first = problem.columns.cameras.stop
-    each = np.zeros((len(problem.directions), len(rows)))
-    each[rows] = np.diag(units)
-    freed = np.concatenate([problem.directions[:, first - len(problem.freed_std) :], each], axis=1)
-    wider = image_evidence(
-        with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std, weak]),
-        replace(state, camera_steps=np.insert(state.camera_steps, first, np.zeros(len(rows)))),
-    )
-    # The arms are at the most likely state, the images at the state of the evidence.
-    at = replace(wider.state, x=likely.x, scale=likely.scale, z=likely.z)
-    equations = pose_equations(wider.problem, at, wider).equations
-    found = solve_equations(equations, solution.log_sizes)
-    hessian = equations.jacobian.T @ found.weighed + equations.prior_information
-    right = -(found.weighed.T @ equations.residual + equations.prior_gradient)
-    rest = problem.arm_unknowns + first + np.arange(len(rows))
-    kept = np.setdiff1d(np.arange(len(hessian)), rest)
-    coupling = hessian[np.ix_(kept, rest)]
-    by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
-    return Scores(
-        information=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
-        gradient=right[rest] - by_column.T @ right[kept],
-        freedom=max(len(equations.residual) - problem.arm_unknowns, 1),
-        dispersion=_dispersion(solution.images),
-    )
 
 
 def _rows_of(

@@ -78,8 +78,7 @@ class ImageEvidence:
     def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
         """Conditional distribution of the steps r of the arms' rigs, given steps f of the columns `Problem.free`.
 
-        Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b. Steps are in the order of
-        `Problem.by_arm`.
+        Matrix A (s,e), vector b (s,) and covariance (s,s): r has the mean −A f − b, in the order of `Problem.by_arm`.
         """
         by_arm, free = self.problem.by_arm, self.problem.free
         root = cholesky(self.information[np.ix_(by_arm, by_arm)])
@@ -137,8 +136,7 @@ def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> F
 def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
     """Return the state after bundle adjustment with constant weights, those of the observations at the initial `state`.
 
-    The arms' X, scale and Z stay. `known` is information about the rigs in addition to that of the images and
-    `problem.known_rigs`.
+    The arms' X, scale and Z stay. `known` is more information about the rigs than images and `problem.known_rigs` have.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
@@ -224,10 +222,7 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
 
 
 def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Float[ndarray, " n"]:
-    """Return the median length (px) of the reprojection errors of each of n images; NaN for one without observations.
-
-    `view` has the residuals.
-    """
+    """Return the median reprojection error (px) of each of n images, from residuals in `view`; NaN if none observed."""
     assert problem.observations is not None
     length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
     out = np.full(problem.n_images, np.nan)
@@ -237,10 +232,7 @@ def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Flo
 
 
 def cost_of_images(images: ImageEvidence, state: State) -> float:
-    """Return the cost of a state: squared residuals of images, priors and boards in units of their standard deviations.
-
-    Weights and priors are those of `images`.
-    """
+    """Return the cost of a state in squared standard deviations, with the weights and priors of `images`."""
     view, sizes = view_of(images.problem, state), images.state.model_error_std
     state = replace(state, model_error_std=sizes)
     return _cost(images.problem, state, view, images.weight, _known_rigs(images.problem))
@@ -280,10 +272,7 @@ def _cost(
 
 
 def _known_rigs(problem: Problem) -> list[RigInformation]:
-    """Return the normal distribution `Problem.known_rigs` as a list with one quadratic cost; an empty list if None.
-
-    The distribution must have a covariance.
-    """
+    """Return the distribution `Problem.known_rigs`, which needs a covariance, as a list of one cost; empty if None."""
     if problem.known_rigs is None:
         return []
     poses, covariance = problem.known_rigs

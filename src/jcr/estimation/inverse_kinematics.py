@@ -69,8 +69,7 @@ class Posture:
 def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return joint angles (n,dof) within the limits for n poses, with little change between poses, and the misfits.
 
-    Angles are in rad. If the arm does not reach all poses (misfits above FITS), a constant tool (flange_from_tool) is
-    estimated together with the angles.
+    Angles are in rad. If misfits exceed FITS, a constant tool (flange_from_tool) is estimated together with the angles.
     """
     rng = np.random.default_rng(0)
     tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
@@ -87,8 +86,7 @@ def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> 
 def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints) -> Joints:
     """Return joint angles (n,dof) within the limits that bring the gripper nearest to each pose, from `start`.
 
-    `start` (n,dof) are the initial angles (rad). An angle counts as 0.3 m (geometry.ARM) per rad. Redundant joints move
-    towards the rest posture.
+    `start` (n,dof) are initial angles (rad). An angle counts as 0.3 m per rad. Redundant joints move towards rest.
     """
     low, high = arm.limits.T
 
@@ -220,8 +218,7 @@ def _with_tool(
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
     """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof; rad).
 
-    `joints` None: angles and tool by inverse kinematics; the base stays. Raise InputError if poses, joints and arm do
-    not agree.
+    `joints` None: angles and tool by inverse kinematics; the base stays. Raise InputError if they do not agree.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints

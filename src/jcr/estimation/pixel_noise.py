@@ -168,8 +168,7 @@ def _common_share(
 ) -> float:
     """Return the likeliest value of `PixelNoise.common` among COMMON, under the t distribution of the Cauchy loss.
 
-    `left` is the share of each observation's variance that the fit leaves in its residual; `ratio` is that of
-    `pixel_noise`.
+    `left` is the share of each observation's variance that the fit leaves in its residual; `ratio` as in `pixel_noise`.
     """
     if not layout.states_variances:
         return 1.0

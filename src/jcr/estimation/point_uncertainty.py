@@ -47,8 +47,7 @@ def point_covariance(
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
-    of the distorted image. `distance_m` (...) is the distance (m) along the ray; its relative error is that of the
-    scale.
+    of the distorted image, `distance_m` (...) distances (m) along the ray; their relative error is that of the scale.
     """
     return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
 
@@ -118,8 +117,7 @@ def seen_points(
     """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` along the ray.
 
     The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
-    gripper_from_camera. `camera` None (given camera poses): the point is on the optical axis, without errors of
-    intrinsics.
+    gripper_from_camera. `camera` None (given camera poses): a point on the optical axis, without errors of intrinsics.
     """
     if camera is None:
         at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)

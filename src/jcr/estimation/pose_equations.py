@@ -67,8 +67,7 @@ class Region:
     def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
         """Return the fit for residuals with the derivative `by_unknown` (s,u) by X and Z of each arm.
 
-        The s = 6n rows are m, then rad, pose by pose. `unknowns` is the number of all unknowns of the problem, with the
-        scale and cameras.
+        The s = 6n rows are m, then rad, pose by pose. `unknowns` counts all unknowns, with scale and cameras.
         """
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
@@ -77,8 +76,7 @@ class Region:
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
 
-        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error (`fit`), J the derivative
-        `by_unknown`.
+        `systematic` (s,s) is the covariance of e; A is `fit` (change of X and Z by the error), J is `by_unknown`.
         """
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
         half = systematic - self.by_unknown @ (self.fit @ systematic)
@@ -203,9 +201,8 @@ def paper_residuals(
 ) -> tuple[float, float]:
     """Return the residuals δ_t (m) and δ_R of AX = XB: mean norms of A·X − X·B(λ) over consecutive used images.
 
-    A and B are the motions of gripper and camera from one used image to the next; X is gripper_from_camera. B(λ) has
-    its translation multiplied by `scale`. δ_R is the Frobenius norm of the rotation part. The method paper defines them
-    in eq. 16.
+    A and B are the motions of gripper and camera from one used image to the next; X is gripper_from_camera. B(λ) has its
+    translation multiplied by `scale`. δ_R is the Frobenius norm of the rotation part (method paper, eq. 16).
     """
     a, b = (inverse(of[used][:-1]) @ of[used][1:] for of in (base_from_gripper, recon_from_camera))
     gap = a @ gripper_from_camera - gripper_from_camera @ scale_translation(b, scale)

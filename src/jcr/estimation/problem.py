@@ -37,8 +37,7 @@ UNKNOWNS = 13
 def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
     """Return the 12 columns of an arm's X (gripper_from_camera) and Z (base_from_world) among the unknowns.
 
-    X and Z have six columns each: translation, then rotation. `arm` counts from 0; column 6 is the log scale, which all
-    arms share.
+    X and Z have six columns each: translation, then rotation. `arm` counts from 0; column 6 is the shared log scale.
     """
     first = 12 * arm
     return np.r_[:6, 7:13] if arm == 0 else np.arange(first + 1, first + 13)

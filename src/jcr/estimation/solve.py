@@ -284,8 +284,7 @@ def uncertainty_of(found: Solution) -> Uncertainty:
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
     """Return scale (metres per unit) and base_from_recon (metres) of the reconstruction that `tracks` belong to.
 
-    They are the robust least-squares similarity from the reconstruction's points to the adjusted points in the base
-    frame.
+    They are the robust least-squares similarity from the reconstruction's points to the adjusted ones (base frame).
     """
     state, observations = solution.state, solution.problem.observations
     assert observations is not None and observations.point_rows is not None
@@ -485,10 +484,7 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`.
-
-    Steps are those of `step_to`.
-    """
+    """Return n numbers: steps of `step_to` (arms, `Problem.columns`), steps of points, log of `model_error_std`."""
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 

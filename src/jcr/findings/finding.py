@@ -219,10 +219,7 @@ def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def is_explained(findings: Sequence[Finding]) -> bool:
-    """Test whether the first of the findings, sorted by `strongest_first`, rejects and explains others.
-
-    More images do not help then.
-    """
+    """Test whether the first finding (sorted by `strongest_first`) rejects and explains others: no images would help."""
     return bool(findings) and findings[0].severity == "rejects" and is_cause(findings[0])
 
 

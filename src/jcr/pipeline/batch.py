@@ -89,9 +89,8 @@ def batch(
 ) -> list[BatchRow]:
     """Run every capture into its own folder inside `out`; write summary.csv and summary.html, best calibration first.
 
-    A capture that fails does not stop the others. A capture that was finished with the same inputs and options is not
-    run again. Each episode that `read` names is run as a separate capture, and the cameras of the episodes are compared.
-    Raises InputError for invalid options.
+    A capture that fails does not stop the others; one that was finished with the same inputs and options is not run
+    again. Each episode that `read` names is run as a separate capture, and the cameras of the episodes are compared.
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")

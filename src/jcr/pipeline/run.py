@@ -142,8 +142,7 @@ def build_map(
     """Build cloud, map and report of the run folder `out` again, from its capture and calibration.
 
     `add` are captures of later images of the scene, oldest first, which are read with the options `read`. They change
-    the map but not the calibration, and are used in every later map of the folder. Dense depth is estimated if the
-    folder has none.
+    the map of this and later calls, but not the calibration. Dense depth is estimated if the folder has none.
     """
     before, report = RunResult(out), progress or silent
     options = replace(

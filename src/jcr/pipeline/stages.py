@@ -124,8 +124,7 @@ def is_unchanged(result: RunResult) -> bool:
 def finished_state(result: RunResult) -> RunState:
     """Return the state of a run with the fingerprint of all its inputs and options, and those of the folder's files.
 
-    Fingerprints of calibration.json and of images added later are hashes of their content; that of another file is an
-    empty text.
+    Fingerprints of calibration.json and of images added later are hashes; that of another file is an empty text.
     """
     capture, folder, out = result.capture, result.capture.folder, result.out
     depths = [folder / name for name in capture.depths or () if name is not None]
@@ -309,8 +308,7 @@ def _with_depth_kept(result: RunResult) -> RunResult:
 def _map(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with cloud, map and measured objects, and write cloud and map.
 
-    Images that were added later are included. Raises InputError if no point is confident enough, or the options leave
-    no points for a map.
+    Images that were added later are included. Raises InputError if no points are left for a map.
     """
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added import extend

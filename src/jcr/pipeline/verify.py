@@ -162,8 +162,7 @@ def _new_images(
     """Return the images of a camera's calibration, and its new images.
 
     `then` is the camera in the capture `capture` of the calibration, `now` the same one in the capture `new`. Raises
-    InputError if the new images have another size, or if one of them was used for the calibration, which it would
-    confirm.
+    InputError if the new images have another size, or if one of them was used for the calibration.
     """
     if now.image_size != then.image_size:
         (width, height), (wide, high) = now.image_size, then.image_size
@@ -189,9 +188,8 @@ def _in_old_scene(
 ) -> Verification:
     """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 
-    `located` maps indices of images in `new` to these poses (recon frame); `notes` are warnings about new images
-    without one. Gripper and camera poses of the calibration are fitted again, because calibration.json lacks the joint
-    covariance that the test needs.
+    `located` maps indices of images in `new` to these poses (recon frame); `notes` are warnings about new images without
+    one. The poses of the calibration are fitted again for their joint covariance, which calibration.json lacks.
     """
     calibration, capture, reconstruction = run.of_wrist_camera()
     calibrate_options, rows = run.state.options.calibrate, list(located)
@@ -272,9 +270,8 @@ def _fixed_cameras(
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
     """Return the drift of a camera from its old to its new pose, with a χ² test of the step between both.
 
-    `offset` is that step (`step_between`; translation in m, then rotation vector in rad), `covariance` its covariance.
-    Its axes are those of the gripper, or of the base for a fixed camera. `options.alpha` is the probability of a false
-    alarm.
+    `offset` is that step (translation in m, then rotation vector in rad; axes of the gripper, or of the base for a fixed
+    camera), `covariance` its covariance. `options.alpha` is the probability of a false alarm.
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, options.alpha)
@@ -287,9 +284,8 @@ def _judged(
 ) -> Verification:
     """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
 
-    Significant is a p-value below `options.alpha`. `options.tolerance` (mm, degrees) is exceeded if translation or
-    rotation is larger. `notes` are warnings to include, `images` are the new images that were used, `how` is the method
-    in words.
+    Significant is a p-value below `options.alpha`; translation or rotation must exceed `options.tolerance` (mm,
+    degrees). `notes` are warnings to include, `images` are the new images that were used, `how` is the method in words.
     """
     notes = list(notes)
     if found.is_noisier:

@@ -41,8 +41,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     """Return a value as JSON that refers to arrays by name, and add these arrays to `arrays`.
 
-    `value` is a dataclass, tuple, array or plain value. The names of its arrays begin with `name`, followed by the path
-    of fields and indices.
+    `value` is a dataclass, tuple, array or plain value. Names of arrays are `name` and the path of fields and indices.
     """
     if isinstance(value, np.ndarray):
         arrays[name] = value
@@ -94,8 +93,7 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
 def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
     """Open an npz file of `write_npz`: yield its JSON text and its arrays by name.
 
-    Raises InputError if the file is missing or damaged, if its `format` is not `expected`, or if the block under `with`
-    fails for a value of the file.
+    Raises InputError for a missing or damaged file, a `format` that is not `expected`, or a failure under `with`.
     """
     require_file(path)
     try:

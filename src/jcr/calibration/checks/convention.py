@@ -211,9 +211,8 @@ def _reading(
 def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> list[_Candidate]:
     """Return the candidates whose rotation angles between poses agree best with those of the camera poses.
 
-    The measure is the 60 % quantile of the angle differences over all image pairs. Candidates up to twice the smallest
-    value, plus SAME_ANGLE, are returned, at most SOLVED. Usual mistakes come first (the first USUAL candidates), then
-    the others by this measure.
+    The measure is the 60 % quantile of the angle differences over all image pairs. At most SOLVED candidates, up to
+    twice the smallest value plus SAME_ANGLE, are returned: the first USUAL ones first, then others by this measure.
     """
     camera_angle, gaps = _angles(recon_from_camera), []
     for _, _, gripper, image in candidates:

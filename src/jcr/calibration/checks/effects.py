@@ -128,8 +128,7 @@ def check_effects(case: Case) -> Case:
     """Return the case with findings on effects that the model lacks, such as rolling shutter, camera slip or arm sag.
 
     With adjusted images, the calibration then includes the effects as parameters. Only the findings are added if the
-    tests also use consecutive rejected images (`with_rejected_runs`). A fit to camera poses is tested only for effects
-    that depend on the image order.
+    tests also use consecutive rejected images (`with_rejected_runs`). A fit to camera poses has tests of the order only.
     """
     if not case.is_open:
         return case
@@ -222,8 +221,7 @@ def effects(
     """Return the adjustment with the confirmed effects on its camera and arm, and one finding for each effect.
 
     Each round adds the most significant effect on the camera or on the poses; of two, the one that explains the other.
-    The rounds end if no effect is significant or `at_most` are found. Effects of the kinds `passed`, and of kinds that
-    `model` includes already, are not tested.
+    The rounds end if no effect is significant or `at_most` are found. Kinds `passed` or in `model` are not tested.
     """
     findings, passed = list[Finding](), {*passed, *(row.kind for row in model.rows)}
     while len(findings) < at_most:
@@ -292,9 +290,8 @@ def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bo
     `of_camera` True selects effects on the camera, False effects on the reported poses. At most CONFIRMED_AT_MOST are
     returned. Kinds in `passed` are left out.
 
-    An effect on the camera must be significant in the score test. Given intrinsics that are wrong are compared with the
-    adjusted ones instead, because the model includes their errors. Effects on the poses are only ranked by the score
-    test.
+    An effect on the camera must be significant in the score test; effects on the poses are only ranked by it. Wrong
+    given intrinsics are compared with the adjusted ones instead, because the model includes their errors.
     """
     if of_camera and model.camera is not None:
         passed = {*passed, *(FOCUS if FOCUS & {*passed} else ())}
@@ -393,9 +390,8 @@ def finding_of(test: Test, model: Adjustment) -> Finding | None:
 def _size_of_strain(test: Test) -> dict[str, Any]:
     """Return the fields of a finding for the size of an effect of the arm: keyword arguments of `Finding.of`.
 
-    They are `value` and its standard deviation `std`. A strain is a relative length error, a lean is in rad per metre
-    of reach, and a sag is in rad. Strain and sag also have a unit axis `x`, `y`, `z` in the `frame` "base" or
-    "gripper".
+    They are `value` and its standard deviation `std`: a relative length error (strain), rad per metre of reach (lean) or
+    rad (sag). Strain and sag also have a unit axis `x`, `y`, `z` in the `frame` "base" or "gripper".
     """
     estimate, covariance = test.estimate, test.covariance
     if test.row.kind is FindingKind.BASE_LEANS:
@@ -470,9 +466,8 @@ def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]
 def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Case:
     """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
-    `model` includes the effects, which were found with a subset of the points. They are now estimated from all points
-    that memory permits. Camera effects are dropped if the calibration then changes by at most half a standard deviation
-    (MATERIAL) on each axis.
+    `model` includes the effects, which were found with a subset of the points and are now estimated from all that memory
+    permits. Camera effects are dropped if the calibration then changes by at most MATERIAL standard deviations per axis.
     """
     free = model.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))

@@ -181,10 +181,7 @@ def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: 
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
-    """Return the correction (COVARIANCE_ORDER) of a calibration from robot positions too large by a factor exp(off).
-
-    Translation and scale shrink by that factor.
-    """
+    """Return the correction (COVARIANCE_ORDER) for robot positions too large by exp(off): translation, scale shrink."""
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
