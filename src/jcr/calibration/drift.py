@@ -41,8 +41,7 @@ class Drift:
     """Motion of the camera on the gripper since the calibration, its test, and the more likely cause."""
 
     offset: Float[ndarray, "6"]
-    """Step from the calibrated to the present gripper_from_camera: translation (m), rotation vector (rad), gripper
-    axes."""
+    """Step from calibrated to present gripper_from_camera: translation (m), rotation vector (rad); gripper axes."""
     covariance: Float[ndarray, "6 6"]
     """Covariance of `offset`."""
     p_value: float

@@ -29,8 +29,7 @@ class TransformUncertainty(Part):
     translation_std_mm: Spread3
     rotation_std_deg: Spread3
     covariance: Covariance6
-    """Covariance of the step (geometry.retract) to the true transform: translation (m), then rotation vector (rad), in
-    axes of the parent frame."""
+    """Covariance of the step (geometry.retract) to the true transform: m, then rad, in axes of the parent frame."""
     at_scene_mm: Spread | None = None
     """One sigma, along the worst axis, of a point on the optical axis at `scene_distance_m`."""
     scene_distance_m: Spread | None = None

@@ -157,8 +157,7 @@ class Adjustment:
 
     solution: Solution
     adjust: Callable[[Float[ndarray, "e p"] | None, Float[ndarray, "s b"] | None], Solution]
-    """Function that adjusts again with p free directions of the camera, and b error patterns of the arm's poses (one
-    standard deviation each)."""
+    """Function that adjusts again with p free directions of the camera and b errors (1σ) of the arm's poses."""
     names: Sequence[str]
     """Names of the images."""
     std: Float[ndarray, "6"]

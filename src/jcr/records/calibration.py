@@ -83,8 +83,7 @@ class Excitation:
     value: Float[ndarray, "7"]
     """Excitation of each direction, weakest first."""
     direction: Float[ndarray, "7 7"]
-    """Directions as rows: unit vectors of translation (m), rotation times the length ARM, and log scale times
-    `spread`."""
+    """Directions as rows: unit vectors of translation (m), rotation times ARM, and log scale times `spread`."""
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
 
@@ -288,8 +287,7 @@ class SceneUncertainty:
     middle_in_base: Numbers3
     """Centre of the scene (m)."""
     covariance: PartCovariance7
-    """Covariance of the scene's similarity: translation and rotation (geometry.retract about `middle_in_base`, base
-    axes), log scale."""
+    """Covariance of the scene's similarity about `middle_in_base`: m, rad (geometry.retract, base axes), log scale."""
     shape_m: Spread
     """Standard deviation per axis of a point's remaining error, the deformation of the scene (m)."""
     within_95_m: Spread
@@ -318,8 +316,7 @@ class GivenIntrinsicsResult:
     seen: PointUncertainty
     """Point uncertainty with the given intrinsics, including the effect of their errors."""
     differs_mm: Spread
-    """Distance (mm) between the positions of one point at the image centre by the given and the estimated intrinsics,
-    each with its own transform."""
+    """Distance (mm) of one central point's positions by given and estimated intrinsics, each with its transform."""
 
 
 @dataclass(frozen=True, kw_only=True)

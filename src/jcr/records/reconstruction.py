@@ -147,8 +147,7 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()
     """Warnings of the back end, for example on a gripper pose that the images contradict."""
     evidence: CameraEvidence | None = None
-    """Camera poses from the images alone in the same frame, with covariance, to be used for the calibration; None if
-    `recon_from_camera` is to be used."""
+    """Camera poses from the images alone, in the same frame, for the calibration; None: use `recon_from_camera`."""
 
     predicted_focal: tuple[float, float] | None = None
     """Focal length that a network predicted (px of the original image), and its relative standard deviation; None: the

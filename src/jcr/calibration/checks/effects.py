@@ -55,8 +55,7 @@ MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
 """Largest size (bytes) of the Jacobian by the parameters of each image, and its size per observation and image: 58 000
 observations of 200 images would need 740 MB, and the equations several times that."""
 LARGE_MOTION = GRASPING[0] * 1e-3, float(np.radians(GRASPING[1]))
-"""Motion of the camera or the base (m, rad) above which the calibration is rejected; a smaller motion is added to the
-uncertainty."""
+"""Motion of camera or base (m, rad) above which the calibration is rejected; a smaller one adds to the uncertainty."""
 TINY_PX, TINY = 0.5, 0.1
 """Displacement in the corner of the image (px), and change of the calibration in units of LARGE_MOTION, up to which
 different focal lengths are a remark and no warning."""

@@ -49,8 +49,7 @@ WORTH = 10.0
 exact one hardly changes the scale and is only compared."""
 
 OF_NETWORK = 1.64
-"""Difference of a network's focal length from the given one, in standard deviations, from which it is reported; one in
-ten correct focal lengths exceeds it."""
+"""Reported difference of a network's from the given focal length (standard deviations); one in ten correct ones."""
 MIN_IMAGES, MIN_FEATURES = 3, 60
 """Fewest images and features with which depth images are compared with the robot."""
 OUTSIDE = 0.3
