@@ -122,7 +122,7 @@ class Outcome:
     resting: Annotated[Matrix | None, Field(alias="base_from_recon")] = None
     """Rigid transform of recon coordinates times `scale` (m) to the base frame; None for a fixed camera."""
     carried: Annotated[Matrix | None, Field(alias="gripper_from_object")] = None
-    """As base_from_recon, of the carried object to the gripper frame (m); None for a camera on the gripper."""
+    """Rigid transform of the carried object's scaled recon coordinates (m) to the gripper; None for a camera on it."""
     backend: str = ""
     """Name of the back end that reconstructed the images."""
     images: tuple[ImageVerdict, ...]
