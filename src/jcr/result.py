@@ -23,7 +23,7 @@ from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
 from jcr.files import read_bytes
-from jcr.reconstruct import ReconstructOptions, with_cameras_of
+from jcr.reconstruct import ReconstructOptions
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
@@ -55,11 +55,6 @@ class RunOptions:
     """Options of the map; None: neither map, point cloud nor dense depth is made."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
-
-    def for_capture(self, capture: Capture, backend: str | None = None) -> "RunOptions":
-        """Return the options with `backend` if it is not None, and with the capture's COLMAP model if it has one."""
-        reconstruct = self.reconstruct if backend is None else replace(self.reconstruct, backend=backend)
-        return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
 class RunState(BaseModel):

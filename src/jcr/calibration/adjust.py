@@ -174,10 +174,7 @@ def with_intrinsics_considered(
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
-    """Return the calibration that the adjustment `found` of a case gives, with the findings of the fit to camera poses.
-
-    The findings of the kinds JUDGED still describe the fit; `judged` derives them again.
-    """
+    """Return the calibration of a case's adjustment `found`, with the fit's findings, which `judged` derives again."""
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]

@@ -68,10 +68,7 @@ class Case:
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
-        """Camera poses of the registered images in the recon frame, in units of the reconstruction.
-
-        They are those from the images alone (`evidence`) if the reconstruction has them, else its camera poses.
-        """
+        """Camera poses of the registered images in the recon frame and unit: those of `evidence` if there is any."""
         evidence = self.reconstruction.evidence
         return self.reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
 
@@ -117,10 +114,7 @@ class Case:
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS.
-
-        Their image indices count the used images, from 0.
-        """
+        """Observations to adjust, by used image: `chosen_tracks`, or those in used images, at most MOST_OBSERVATIONS."""
         if self.chosen_tracks is not None:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
@@ -178,10 +172,7 @@ class Case:
 
     @property
     def is_open(self) -> bool:
-        """Whether the motions are observable and no known cause, such as static images, rejects the calibration.
-
-        A known cause is a finding that explains others (`is_explained`).
-        """
+        """Whether the motions are observable and no finding that explains others (`is_explained`) is a known cause."""
         return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
 
     def after(
@@ -220,10 +211,7 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """Return the observations in the used images; their image indices count the used images only, from 0.
-
-    `used` is a mask of the m registered images. All points are kept.
-    """
+    """Return the observations in the images of the mask `used`, the only ones counted by image; all points are kept."""
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])

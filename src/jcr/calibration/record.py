@@ -86,10 +86,7 @@ FindingJson = Annotated[Finding, PlainSerializer(as_json)]
 
 
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
-    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file.
-
-    The values are of any type, because they are read from JSON.
-    """
+    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file."""
     if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 
@@ -298,10 +295,7 @@ class Calibration(Outcome):
 
     @property
     def gripper_from_object(self) -> Similarity:
-        """Similarity from recon coordinates (any unit) of the carried object to the gripper frame (m).
-
-        Raises InputError for a camera on the gripper.
-        """
+        """Similarity of the carried object's recon coordinates to the gripper (m); InputError for a camera on it."""
         return Similarity(self._require(self.carried, "base"), self.scale)
 
     @property
@@ -424,10 +418,7 @@ class FailedCalibration(Outcome):
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 
     def __getattr__(self, name: str) -> Any:
-        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
-
-        Raises AttributeError for a name that a Calibration does not have.
-        """
+        """Return None or () for a field of Calibration; raise RejectedError for its methods, else AttributeError."""
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
             return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):
@@ -479,10 +470,7 @@ def write_calibration(path: Path, content: Outcome) -> None:
 
 
 def read_calibration(path: Path) -> AnyCalibration:
-    """Read a calibration.json, given as a file or as its run folder.
-
-    Raises InputError if the file is missing, damaged, or of another format.
-    """
+    """Read a calibration.json or that of a run folder; raise InputError if missing, damaged, of another format."""
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
@@ -502,10 +490,7 @@ def read_content(file: Path) -> dict[str, object]:
 
 
 def validated(content: dict[str, object], file: Path) -> AnyCalibration:
-    """Return the calibration that the content of `file` describes.
-
-    Raises InputError, whose message names the file, if the content is invalid or of another format.
-    """
+    """Return the calibration that the content of `file` describes; raise InputError, naming the file, if invalid."""
     kind = content.get("format")
     if kind != FORMAT:
         raise InputError(

@@ -92,9 +92,6 @@ def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = No
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the part of a covariance of poses for the poses of these indices, in their order.
-
-    Both matrices have six rows and columns per pose.
-    """
+    """Return the part of a covariance, six rows per pose, for the poses of these indices, in their order."""
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

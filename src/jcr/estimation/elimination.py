@@ -128,10 +128,7 @@ class Normal:
     L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """Return the p points after their Gauss-Newton step, in the same frame as `points`.
-
-        `step` (d,) is the step of all other unknowns, which determines that of the points.
-        """
+        """Return `points` after their Gauss-Newton step, which `step` (d,) of all other unknowns determines."""
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -214,10 +211,7 @@ def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) 
 
 
 def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
-    """Return the points' 3x3 blocks JᵀJ with their diagonals times 1 + damping, slightly increased; changed in place.
-
-    The small increase makes a block invertible if all rays of its point are parallel.
-    """
+    """Return 3x3 blocks JᵀJ, changed in place: diagonals times 1 + `damping`, and slightly more, to be invertible."""
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v

@@ -199,10 +199,7 @@ class Adjustment:
 
     @cached_property
     def pose_scores(self) -> Scores:
-        """Quadratic cost of errors of the reported poses, with the unknowns of `solution` eliminated.
-
-        Its c coordinates are the residuals of the used poses of all arms (m, rad; base axes).
-        """
+        """Quadratic cost of all used poses' residuals (m, rad; base axes), unknowns of `solution` eliminated."""
         at = self.solution.at_mode
         freedom = max(len(at.weighed_left) - self.solution.problem.arm_unknowns, 1)
         return Scores(information=at.projection, gradient=at.weighed_left, freedom=freedom)
@@ -255,10 +252,7 @@ class Adjustment:
 
 
 def rank(model: Adjustment, rows: Sequence[Row]) -> list[tuple[Row, float]]:
-    """Return the effects `rows` with the natural log p-values of their score tests, the smallest p-value first.
-
-    The p-value is that of `Scores.log_p`, for the camera or the poses of `model`.
-    """
+    """Return `rows` with the natural log p-values of their score tests (`Scores.log_p`), the smallest first."""
     each = [(model.camera_scores if row.of_camera else model.pose_scores).log_p(row) for row in rows]
     return sorted(zip(rows, each, strict=True), key=lambda one: one[1])
 
@@ -522,10 +516,7 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
 def _rows_of(
     problem: Problem, camera: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return the rows, units and weak prior standard deviations of problem.rows_of for the camera with index `camera`.
-
-    The problem must have observations; all images of the camera are included.
-    """
+    """Return rows, units and weak prior std of problem.rows_of for a camera with all its images."""
     assert problem.observations is not None
     return rows_of(problem, camera, np.flatnonzero(problem.observations.camera == camera), problem.n_images)
 

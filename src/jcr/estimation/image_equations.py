@@ -46,10 +46,7 @@ class RigInformation(NamedTuple):
     """Vector g of the cost ½ sᵀ H s + gᵀ s."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
-        """Return the steps (r,) from the reference poses to the rigs of a state: six numbers of each rig in turn.
-
-        They are translation (unit of the world), then rotation vector (rad), in axes of the world.
-        """
+        """Return the steps (unit of the world, rad; world axes) from the reference poses to the rigs of a state."""
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
@@ -125,10 +122,7 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
 
 
 def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
-    """Return the weight (1/px²) of each of k observations, by the pixel noise of the state and the Cauchy loss.
-
-    `view` is the projection of the state; points behind or very near a camera have weight 0 (`PixelNoise.weights`).
-    """
+    """Return weights (1/px²) of the k observations in `view` of a state, by its pixel noise and the Cauchy loss."""
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
@@ -164,10 +158,7 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the normal distribution of `Problem.columns` by images and priors, linearised at a state.
-
-    The columns are intrinsics, boards and rigs. The points are eliminated; reported poses are not used.
-    """
+    """Return the normal distribution of `Problem.columns` by images and priors, linearised at a state."""
     return linearised(problem, state, view_of(problem, state))[0]
 
 

@@ -109,10 +109,7 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Return the step from the reached to the given pose, and the derivative of the reached pose by the joint angles.
-
-    Both are in base axes and m: translation, then rotation vector (rad) times geometry.ARM.
-    """
+    """Return the step (m, rad · ARM; base axes) from reached to given poses, and the Jacobian of the reached poses."""
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM

@@ -90,10 +90,7 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """Return the finding that a kind of motion leaves a direction unobservable; `at` is an axis or point (m) in `frame`.
-
-    `frame` is "base" or "gripper".
-    """
+    """Return the finding on an unobservable `motion`; `at`: axis or point (m) in the `frame` base or gripper."""
     where: dict[str, Any] = (
         {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )

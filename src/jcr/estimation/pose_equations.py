@@ -175,10 +175,7 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Return the largest factor ≤ 1 that keeps a step's rotations and log scale within ±LARGEST_ROTATION.
-
-    `step` (u,) has the order of `weak_prior`; the limit applies to each component times the factor.
-    """
+    """Return the largest factor ≤ 1 that keeps rotations and log scale of a step (u,) within ±LARGEST_ROTATION."""
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))

@@ -139,10 +139,7 @@ class Solution:
 
     @cached_property
     def log_evidence(self) -> float:
-        """Natural logarithm of (2π)^(3m) times the marginal density of the 6m residuals of m used poses.
-
-        Unknowns and error sizes are integrated out.
-        """
+        """Natural log of (2π)^(3m) times the marginal density of m poses' residuals, without unknowns and sizes."""
         return log_evidence(self.equations, self.at_mode, self.size_information)
 
     @cached_property
@@ -446,10 +443,7 @@ def with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Return the state with the likeliest arms' unknowns (X, scale, Z) and error sizes, for constant image evidence.
-
-    The iteration ends when the squared step in units of standard deviations is below `settled`.
-    """
+    """Return the state with the likeliest X, scale, Z and error sizes; ends at a squared step (σ²) below `settled`."""
     arms = problem.arm_unknowns
     for _ in range(STEPS):
         equations = pose_equations(problem, state, images).equations
@@ -490,10 +484,7 @@ def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray,
 
 
 def _state_at(problem: Problem, start: State, like: State, coordinates: Float[ndarray, " n"]) -> State:
-    """Return the state at `coordinates`, the inverse of `_coordinates`.
-
-    Pixel noise and robot error sizes are those of the state `like`.
-    """
+    """Return the state at `coordinates`, the inverse of `_coordinates`, with the error sizes of the state `like`."""
     ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
     arms, columns, points, sizes = np.split(coordinates, ends)
     return replace(

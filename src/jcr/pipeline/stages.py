@@ -141,10 +141,7 @@ def finished_state(result: RunResult) -> RunState:
 
 
 def fingerprint(*values: Any) -> str:
-    """Return a SHA-256 hash of `values`: of the fields of records, and the content of arrays and files (Path).
-
-    A folder is hashed as its files, and a file above LARGE as size and date.
-    """
+    """Return a SHA-256 hash of `values`: fields of records, arrays, files (above LARGE: size and date) and folders."""
 
     def identity(value: Any) -> Any:
         """Return the value to hash for a value that JSON lacks."""

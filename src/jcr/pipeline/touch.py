@@ -45,10 +45,7 @@ class TouchTest:
 
     @property
     def common(self) -> Float[ndarray, "3"]:
-        """Mean over the points of tip minus surface point (m, base axes).
-
-        A wrong position of the tip in the gripper frame would cause one.
-        """
+        """Mean over the points of tip minus surface point (m, base axes), as of a wrongly stated tip position."""
         return self.error.mean(0)
 
 

@@ -126,10 +126,7 @@ class RobotNoise:
 
     @property
     def together(self) -> tuple[float, float]:
-        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined.
-
-        It is the root of the summed squares of both; the systematic error is `systematic_left`.
-        """
+        """Standard deviation per axis (m, rad) of a pose: root of squared random and `systematic_left` errors."""
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
@@ -192,10 +189,7 @@ class Budget:
 
     @property
     def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors are at least half of the translation's variance.
-
-        More images do not reduce these errors.
-        """
+        """Whether systematic robot errors are half of the translation's variance or more; images do not reduce these."""
         others = self.robot_random, self.intrinsics, self.images, self.faults
         return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
@@ -392,10 +386,7 @@ class Uncertainty:
     @computed_field
     @property
     def scene_95_mm(self) -> float | None:
-        """Bound (mm) on 95 % of the errors of the median reconstructed point in the base frame.
-
-        The bound is None where no image was adjusted.
-        """
+        """Bound (mm) on 95 % of the median scene point's errors in the base frame; None if no image was adjusted."""
         return None if self.scene is None else 1e3 * self.scene.within_95_m
 
     @property
@@ -410,10 +401,7 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance (j,j) of transform and scale in COVARIANCE_ORDER, then of the intrinsics if estimated.
-
-        The intrinsics are fx, fy, cx, cy and the distortion coefficients. Without these, j is 7.
-        """
+        """Covariance (j,j) in COVARIANCE_ORDER, then of fx, fy, cx, cy and distortion if these are estimated."""
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property

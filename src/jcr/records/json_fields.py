@@ -30,10 +30,7 @@ class Part(BaseModel):
     )
 
     def __eq__(self, other: object) -> bool:
-        """Test whether two records have the same type and JSON.
-
-        A comparison of their arrays would give no single truth value.
-        """
+        """Test whether two records have the same type and JSON; comparing arrays would give no single truth value."""
         return (
             isinstance(other, Part) and type(self) is type(other) and self.model_dump() == other.model_dump()
         )
@@ -62,10 +59,7 @@ EXACT = 1e-15
 
 
 def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Float[ndarray, "n n"]:
-    """Return a covariance matrix from nested lists.
-
-    Raises ValueError if it is not symmetric, or if an eigenvalue of its correlation matrix is below `least`.
-    """
+    """Return a covariance from lists; raise ValueError unless symmetric, with correlation eigenvalues ≥ `least`."""
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), EXACT**2))
     correlation = matrix / np.outer(std, std)

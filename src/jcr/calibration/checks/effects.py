@@ -311,10 +311,7 @@ def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bo
 
 
 def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
-    """Return the natural logarithm of the largest p-value at which an effect of this kind is significant.
-
-    It is that of `Policy.alpha`, or of ALPHA_IF_GIVEN for wrong intrinsics that were given.
-    """
+    """Return the log of the largest p-value at which an effect is significant: `Policy.alpha` or ALPHA_IF_GIVEN."""
     is_given = kind is FindingKind.INTRINSICS and model.is_given
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
 

@@ -124,10 +124,7 @@ def check_lengths(case: Case) -> Case:
 
 
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with `depth_check` set, and a Length for each known length of the case.
-
-    `Length.off` is the logarithm of the length by the robot's positions over the stated length.
-    """
+    """Return the calibration with `depth_check` set, and a Length for each known length of the case."""
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
