@@ -74,10 +74,7 @@ def calibrate_reconstruction(
 def calibrate_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case after fit, adjustment and checks, with required accuracy and proposed gripper poses.
-
-    `robot` is the error prior of the registered images' gripper poses.
-    """
+    """Return the case of `checked_case` with its required accuracy and proposed gripper poses."""
     case = checked_case(capture, reconstruction, options, robot)
     gripper, assumptions = case.base_from_gripper, assumptions_of(case)
     found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)

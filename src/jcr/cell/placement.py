@@ -81,10 +81,7 @@ class ImageUse(Part):
 
 
 class CameraPlacement(Part):
-    """Placement of one camera other than the capture's own: pose, uncertainty, intrinsics, findings.
-
-    The pose is null if the camera could not be placed.
-    """
+    """Placement of another camera: pose (null if not placed), uncertainty, intrinsics, findings."""
 
     name: str
     mount: Mount

@@ -186,10 +186,7 @@ def _examined(
 def _placement(
     views: CameraViews, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
-    """Return the placement of a camera from the joint solution; `faults` are findings on effects such as a slip.
-
-    The covariances of `faults` add to the covariance of the camera's pose.
-    """
+    """Return a camera's placement from the joint solution, whose covariance includes that of the findings `faults`."""
     c, problem = views.number, solution.problem
     assert problem.observations is not None
     transform, covariance = solution.transform(views.parent_from_camera)

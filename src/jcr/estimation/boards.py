@@ -114,10 +114,7 @@ class BoardShapes:
         )
 
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Return the height (z) of each corner over its body's plane, in the unit of `x_in_body`.
-
-        `shape` are the s shape parameters, as in `residual`.
-        """
+        """Return corner heights (z) over their body's plane, in the unit of `x_in_body`, for parameters `shape`."""
         return self.by_shape[:, 2] @ shape
 
 

@@ -110,10 +110,7 @@ def _polished(
     camera: Float[ndarray, "h n 3 3"],
     rounds: int,
 ) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
-    """Refine rotations R_X from h initial values by alternating least squares of R_gripper R_X = R_Z R_camera.
-
-    Return R_X (gripper_from_camera), R_Z (base_from_recon) and the sum of squared residuals of each.
-    """
+    """Return R_X refined by alternating least squares of R_gripper R_X = R_Z R_camera, R_Z, squared residuals."""
     from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
     base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
     for _ in range(rounds):

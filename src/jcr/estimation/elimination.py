@@ -115,10 +115,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations `hessian · step = right` of the d unknowns that are not point coordinates.
-
-    The points were eliminated; `stepped` computes their step from that of the other unknowns.
-    """
+    """Normal equations `hessian · step = right` of the d unknowns other than the points, which were eliminated."""
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]

@@ -45,10 +45,7 @@ def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Observations of points: rig and camera of each of n images; image, point and pixel of each of k observations.
-
-    A rig is a set of cameras that move together.
-    """
+    """Rig (cameras that move together) and camera of each of n images; image, point and pixel of k observations."""
 
     rig: Int[ndarray, " n"]
     """Rig of each image."""
@@ -338,7 +335,7 @@ class Problem:
         return self.arm_unknowns + len(self.free)
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
-        """Prior standard deviations of the first l columns: cameras, model errors (sizes of `state`), boards."""
+        """Return the prior std of the first l columns: cameras, model errors (sizes of `state`), boards."""
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std

@@ -279,10 +279,7 @@ def uncertainty_of(found: Solution) -> Uncertainty:
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
-    """Return scale (metres per unit) and base_from_recon (metres) of the reconstruction that `tracks` belong to.
-
-    They are the robust least-squares similarity from the reconstruction's points to the adjusted ones (base frame).
-    """
+    """Return scale (m per unit) and base_from_recon (m) of the frame of `tracks`, by a robust similarity of points."""
     state, observations = solution.state, solution.problem.observations
     assert observations is not None and observations.point_rows is not None
     points = apply(state.z[0], state.scale * state.points_in_world)

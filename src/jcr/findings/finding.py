@@ -224,10 +224,7 @@ def is_explained(findings: Sequence[Finding]) -> bool:
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return sorted findings; if the first one rejects, the findings that it explains are left out.
-
-    `findings` must be sorted by `strongest_first`.
-    """
+    """Return findings in order (`strongest_first`), without those that the first one explains if it rejects."""
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings

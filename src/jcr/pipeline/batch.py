@@ -119,10 +119,7 @@ def batch(
 
 
 def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:
-    """Run all stages for one capture in the folder `out`, and return its row, in which an error is reported.
-
-    A finished run of the same inputs and options in the folder is not repeated.
-    """
+    """Run all stages for one capture in `out`, unless finished already; return its row, which reports an error."""
     start, reason = time.perf_counter(), ""
     row = BatchRow(capture=str(capture), out=str(out), status="failed")
     try:

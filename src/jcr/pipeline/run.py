@@ -203,10 +203,7 @@ def add_camera(
 
 
 def measure(out: str | Path) -> "Measurement":
-    """Measure the support plane and the objects on it, from the cloud and the calibration of the run folder `out`.
-
-    Raises InputError if the run has no map, or the scene no support plane.
-    """
+    """Measure support plane and objects of the run folder `out`; raise InputError without a map or support plane."""
     from jcr.segments.measure import measure_objects
 
     return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)

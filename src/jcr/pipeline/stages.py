@@ -80,10 +80,7 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run those of the named stages that the run's cameras and options need; return the result with their outputs.
-
-    The times (s) of the stages after the calibration are added to `timings_s` of the calibration.
-    """
+    """Run those of the named stages that the run needs; return the result with outputs and times (s) of each."""
     unneeded = set() if result.others else {"cameras"}
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):

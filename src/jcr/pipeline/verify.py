@@ -56,10 +56,7 @@ class Verification(Drift):
 
     @property
     def std(self) -> Float[ndarray, "6"]:
-        """Standard deviations of `offset`: translation x, y, z (m), rotation vector x, y, z (rad).
-
-        The axes are those of the gripper, or of the base for a fixed camera.
-        """
+        """Standard deviations of `offset` (m, rad), along axes of the gripper, or of the base for a fixed camera."""
         return np.sqrt(np.diag(self.covariance))
 
     @property

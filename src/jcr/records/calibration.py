@@ -240,10 +240,7 @@ class DepthCheck:
     """Number of features that were compared."""
 
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
-        """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
-
-        It is the root of the summed squares of `noise_m`, `noise_per_m`·z² and the uncertainty of the scale error.
-        """
+        """Return the std (m) of depths z (m), scale corrected, by `noise_m`, `noise_per_m`·z² and `std_percent`."""
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
