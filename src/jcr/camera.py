@@ -203,10 +203,7 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
-
-    The unknown of Newton's method is the angle between ray and optical axis, limited to 84°.
-    """
+    """Return the rays with z = 1 of distorted fisheye coordinates, by Newton's method on their angle, up to 84°."""
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
     angle = np.minimum(bent, _WIDEST_ANGLE)

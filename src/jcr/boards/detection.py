@@ -206,10 +206,7 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
 
 
 def _circles(count: tuple[int, int], spacing: float) -> Detector:
-    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart.
-
-    Circles in a row are twice `spacing` apart, and every second row is displaced by `spacing`.
-    """
+    """Return the detector of an asymmetric grid of `count` circles (per row, rows), `spacing` m apart in both axes."""
     across, down = count
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2

@@ -100,10 +100,7 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Read a depth image (in mm): return the depth along the optical axis (m) at each pixel, 0 where none was measured.
-
-    Raises InputError if the file is not a 16-bit grey image of `size` (width, height).
-    """
+    """Read a 16-bit depth image of `size` (mm): return the depth along the optical axis (m), 0 where not measured."""
     require_file(path)
     if not path.is_file():
         raise InputError(f"{path}: no such depth image; correct its name in the capture or add it")

@@ -107,10 +107,7 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
-    """Pair the poses of a table with images by the image names in its rows; the result is that of `pair_with_images`.
-
-    Folder, slashes, case and file ending of a name may differ from those of the image file.
-    """
+    """Pair poses with images by names, whose folder, case and ending may differ; return as `pair_with_images`."""
     assert table.images is not None
     own: dict[str, list[str]] = {}
     for image in image_names(folder):

@@ -130,10 +130,7 @@ class TfTree:
         return poses_at
 
     def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
-        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static.
-
-        Samples are in the order of the messages. Raises InputError for numbers that are no transform.
-        """
+        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static."""
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():

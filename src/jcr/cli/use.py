@@ -240,10 +240,7 @@ class MeasureCommand:
 
 
 def sizes_lines(measured: "Measurement") -> list[str]:
-    """Return the lines of a measurement: one for the support plane, and one for each object.
-
-    An object has height, length and width in mm with standard deviations, and its centre x, y (m, base frame).
-    """
+    """Return a line for the support plane, and one for each object: sides (mm) with std, centre x, y (m, base)."""
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]
     lines = [

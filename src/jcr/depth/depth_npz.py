@@ -33,10 +33,7 @@ class DepthHeader(BaseModel):
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write depth z, its std and origin, and confidence of a reconstruction's pointmaps to a file depth.npz.
-
-    An error leaves no incomplete file. `made_from` is the fingerprint that `is_made_from` compares.
-    """
+    """Write z, its std and origin, and confidence to depth.npz, with the fingerprint `made_from` of the input."""
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
     about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}

@@ -116,10 +116,7 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the centres (x,y,z,3) in m of a grid of cubic voxels of side `voxel` (m); the axes follow x, y, z.
-
-    `count` (3,) is the number of voxels along each axis, and `lower` (3,) the grid's lowest corner (m).
-    """
+    """Return the centres (x,y,z,3), m, of `count` (3,) voxels of side `voxel` (m) from the corner `lower` on."""
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 

@@ -66,10 +66,7 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Return the depths (z in the camera frame, m) to try in each of n images (columns), evenly spaced in inverse depth.
-
-    They are DEPTH_RANGE times the depth of the point where the optical axes meet.
-    """
+    """Return depths (m) evenly spaced in inverse depth, for n images: DEPTH_RANGE times that where the axes meet."""
     pose = cameras.base_from_camera
     depth = ((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
     middle = np.clip(depth, *MEET_WITHIN)

@@ -176,10 +176,7 @@ def search_depths(
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
-    """Return for each image and point the squared colour difference, summed over RGB (0 to 1).
-
-    The colour of image n at the pixel u[n, k], v[n, k], by bilinear interpolation, is compared with that of point k.
-    """
+    """Return the squared difference of RGB (0 to 1) between each image at its pixels u, v, and each point."""
     difference = sample(level.color, level, u, v) - points.color
     return np.einsum("nkc,nkc->nk", difference, difference)
 
@@ -217,10 +214,7 @@ def in_view(
 def sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation.
-
-    `stack` has the images of `level`, or derivatives, one below the other. Pixels outside take the border's colour.
-    """
+    """Return colours (n,k) at pixels u, v of each of n images in `stack`, bilinear; outside, the border's colour."""
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -119,10 +119,7 @@ class PreparedImages:
 def prepare_images(
     capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
 ) -> PreparedImages:
-    """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
-
-    `grid_of` returns the resize and crop for a width and height. Raises InputError for an unreadable image.
-    """
+    """Read images, undistort them if the intrinsics are known, and resize and crop them by `grid_of(size)`."""
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics
     if intrinsics is not None and is_distorted(intrinsics):

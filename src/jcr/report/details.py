@@ -39,10 +39,7 @@ def details_section(
 
 
 def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Content:
-    """Return a row for each object: name, RGB of its label, height, length, width (mm, ± one sigma), and place.
-
-    The place is the centre x, y of the object's box (m, base frame). `label_names` are the names of all labels.
-    """
+    """Return a row per object: name, RGB of its label, height, length, width (mm, ± 1 σ), and x, y of its box (m)."""
     colors = label_colors(len(label_names)).tolist()
     rows = []
     for one in measured.objects:

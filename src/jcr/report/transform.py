@@ -138,10 +138,7 @@ def sketch(
 def _projection(
     x: Float[ndarray, "n 3"], down: bool
 ) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
-    """Return a function that projects points (k,3) m to pixels (k,2) of the sketch, in parallel projection.
-
-    The points are in the parent frame. All points `x` are visible; `down`: the z axis is drawn downwards.
-    """
+    """Return the parallel projection of points (k,3) m to pixels that shows all points `x`; `down`: z downwards."""
     azimuth, elevation = np.radians(EYE_DEG)
     up_z = -1.0 if down else 1.0
     eye = np.array(

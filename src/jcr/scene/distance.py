@@ -33,10 +33,7 @@ class DistanceGrid:
     """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
-
-        The points are in the base frame; a point outside of the grid has the values of the nearest point on its border.
-        """
+        """Return signed distance (m) and derivatives by x, y, z, (n,4), at n points (m, base); outside, the border's."""
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

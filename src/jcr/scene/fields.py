@@ -178,10 +178,7 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set offset and scale of all outputs but occupancy and label to mean and std of the property's `targets`.
-
-        `targets` has an array (n, outputs) for each property, such as the colours of n points.
-        """
+        """Set offset and scale of outputs to mean and std of `targets` (n, outputs), except for occupancy and label."""
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))

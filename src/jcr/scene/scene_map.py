@@ -186,10 +186,7 @@ class SceneMap:
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
 
     def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
-        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
-
-        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
-        """
+        """Return raw outputs (n, outputs) at points (n,3) m, base frame, by property; logits for occupancy and label."""
         x = self._points(x_in_base, "points")
         answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
         if not isinstance(x_in_base, Tensor):

@@ -55,10 +55,7 @@ class SeenGrid:
         return torch.where(inside, self.state.view(-1).index_select(0, index), 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Return the index of each point's cell (0 for points outside), and a mask of the points inside the workspace.
-
-        The index counts cells of the flattened `state`, in which x changes fastest. The points are in m, base frame.
-        """
+        """Return the index in the flattened `state` of each point's cell, 0 outside, and a mask of the points inside."""
         nz, ny, nx = self.state.shape
         # Points beyond the range of int32, and NaN, must not become indices inside the box.
         at = ((x_in_base - self.lower) * (1.0 / self.cell)).nan_to_num(-1.0).clamp(-1.0, 1e6).floor().int()

@@ -51,10 +51,7 @@ def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
 def working_cameras(
     all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int = WORKING_SIZE_PX
 ) -> list[pycolmap.Camera]:
-    """Return COLMAP's camera of each of the intrinsics, for images reduced to a long side of at most `working_size_px`.
-
-    If the intrinsics are not `known`, COLMAP refines focal length and distortion.
-    """
+    """Return COLMAP's cameras at a long side of up to `working_size_px`; COLMAP refines those not `known`."""
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)

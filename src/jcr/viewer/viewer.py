@@ -290,10 +290,7 @@ class Viewer:
                 self.robot.update_cfg(self._configurations[row])
 
     def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
-        """Select the image of a registered camera, and move the view of a client (browser) to the pose of this camera.
-
-        `camera` is its index among the registered images. With `client` None the image is only selected.
-        """
+        """Select a registered camera's image, and move the view of a client (browser), if any, to the camera's pose."""
         self.image.value = int(self.image_index[camera])
         if client is None:
             return
@@ -330,10 +327,7 @@ class Viewer:
                     self.server.scene.remove_by_name(name)
 
     def show_slice(self) -> None:
-        """Draw the horizontal slice of the map with the selected property and height (base z), or hide it.
-
-        Columns of the image follow the x axis of the base; rows follow y from the largest value to the smallest.
-        """
+        """Draw the map's slice with the selected property and height (base z), or hide it; x to the right, y up."""
         assert self.scene is not None  # the control exists only with a map
         with self._lock:
             of, height = self.slice_of.value, self.slice_at.value

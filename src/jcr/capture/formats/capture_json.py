@@ -156,10 +156,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
 
 def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
-    """Return the camera `name` from its entry in "cameras" of capture.json; raise InputError if its image sizes differ.
-
-    `used` is True for each frame of the file that `capture` contains. Messages begin with `where`.
-    """
+    """Return the camera `name` from its entry in "cameras"; `used` tells which frames of the file `capture` has."""
     poses, frame = None, None
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:

@@ -167,10 +167,7 @@ def _read_table(
 
 
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
-    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`.
-
-    The template is relative to the data set `path`. Raises InputError if the result leads out of it.
-    """
+    """Return the file of a template such as file-{index:03d}.parquet in the data set `path`; InputError if outside."""
     name = re.sub(
         r"\{(\w+)(?::0?(\d?\d)d)?\}",  # the value of a field is padded with zeros to the width in the template
         lambda field: str(fields.get(field[1], field[0])).zfill(int(field[2] or 0)),

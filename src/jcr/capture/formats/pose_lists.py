@@ -35,10 +35,7 @@ def read_yaml_or_json(file: Path) -> Any:
 
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
-    """Return the keys of gripper pose and marker pose in the samples of a YAML or JSON file; None if it has no samples.
-
-    `content` is that of the file. For easy_handeye2 the keys are ("robot", "tracking").
-    """
+    """Return the keys of gripper and marker pose, such as ("robot", "tracking"), in a file's samples; None without."""
     first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
@@ -92,10 +89,7 @@ def _entry(entry: Any, where: str) -> Entry:
 
 
 def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield column name and number, such as ("qx", 0.1), of each number in a nested pose of a YAML or JSON file.
-
-    `value` is the pose or a part of it, such as its rotation, and `key` its key in the file.
-    """
+    """Yield column name and number, such as ("qx", 0.1), of each number in a pose or a part of it, named `key`."""
     names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}

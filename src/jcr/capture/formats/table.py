@@ -49,10 +49,7 @@ class OpenConventionError(InputError):
 
 
 def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
-    """Return the options with each convention and units that columns rx, ry, rz may have, to try them all.
-
-    One list per convention ("ur", "yaskawa"), with one entry per pair of units of length and angle.
-    """
+    """Return the options with both conventions that columns rx, ry, rz may have: a list per convention, by units."""
     units = [options.pose_units]
     if options.pose_units == "auto":
         units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
@@ -157,10 +154,7 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the pose convention that column names identify; raise InputError, begun with `where`, if they do not.
-
-    For columns rx, ry, rz, which two conventions use, the error is an OpenConventionError.
-    """
+    """Return the convention that column names identify; raise OpenConventionError for rx, ry, rz, or InputError."""
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
@@ -248,10 +242,7 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
 
 
 def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
-    """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp.
-
-    The header has "image" or "timestamp" if present, then x, y, z, ur_x, ur_y, ur_z. Other lines raise InputError.
-    """
+    """Return header (x, y, z, ur_x, …, after "image" or "timestamp") and cells of lines with p[…] of a UR."""
     rows = list[list[str]]()
     for number, line in enumerate(lines, start=1):
         match = _UR_POSE.search(line)

@@ -298,10 +298,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps of images from the tokens (b,n,c) in the last entry of `layers`.
-
-        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
-        """
+        """Return the pointmaps from the tokens (b,n,c) of the last of `layers`; `grid`: rows and columns of tokens."""
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -316,10 +313,7 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps of images from the tokens (b,n,c) in four entries of `layers`.
-
-        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
-        """
+        """Return the pointmaps from the tokens (b,n,c) of four `layers`; `grid`: rows and columns of tokens."""
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
@@ -345,10 +339,7 @@ class Dpt(nn.Module):
         )
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
-        """Return the four raw outputs of each pixel (x, y, z, c of `pointmap`) from the token grids of four layers.
-
-        The grids have shape (b, channels, rows, columns), from the earliest layer to the last.
-        """
+        """Return x, y, z, c of each pixel from four layers' token grids (b, channels, rows, columns), first to last."""
         x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):

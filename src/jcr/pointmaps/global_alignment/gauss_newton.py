@@ -88,10 +88,7 @@ class ImageEquations:
 
 
 def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
-    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image.
-
-    A first stage has COARSE_PIXELS pixels. Raises RejectedError where the pointmaps do not determine the unknowns.
-    """
+    """Estimate poses, focal length, pair scales and depths, first with COARSE_PIXELS, then with `pixels`, per image."""
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
