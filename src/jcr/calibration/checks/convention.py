@@ -151,7 +151,9 @@ def _better_adjusted(
     """
     rows = case.reconstruction.image_index
     given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
-    if not case.is_adjustable or case.tracks.from_pointmaps or poses_agree(case.hand_eye.robot_noise):
+    if case.capture.intrinsics is not None or not case.is_adjustable or case.tracks.from_pointmaps:
+        return None
+    if poses_agree(case.hand_eye.robot_noise):
         return None
     camera = case.recon_from_camera
     worth = _congruent(others, camera)
