@@ -48,8 +48,7 @@ def rotation_log(rotation: Rotations) -> Vectors:
     """Return the rotation vectors (...,3), in rad with length ≤ π, of rotation matrices; accurate near 0 and π too."""
     if rotation.size == 0:  # refused by SciPy before 1.14
         return np.zeros(rotation.shape[:-1])
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
-    return flat.reshape(*rotation.shape[:-2], 3)
+    return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(*rotation.shape[:-2], 3)
 
 
 def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"] | np.floating:
@@ -69,16 +68,14 @@ def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
 
     Columns: translation (3), rotation vector about the origin (3, rad), log scale (1), in the frame of v.
     """
-    identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
-    return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
+    return np.concatenate([np.broadcast_to(np.eye(3), (*v.shape, 3)), -skew(v), v[..., None]], axis=-1)
 
 
 def transform(
     rotation: Float[ndarray, "*#batch 3 3"], translation: Float[ndarray, "*#batch 3"]
 ) -> Float[ndarray, "... 4 4"]:
     """Return transforms (...,4,4) from rotations (...,3,3) and translations (...,3), which broadcast."""
-    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    out = np.zeros((*batch, 4, 4))
+    out = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
     out[..., :3, :3] = rotation
     out[..., :3, 3] = translation
     out[..., 3, 3] = 1.0

@@ -151,8 +151,7 @@ def _paired_by_time(
     if not ((stamps >= table.stamp_ns.min()) & (stamps <= table.stamp_ns.max())).any():
         return None
     sound = np.isfinite(table.base_from_gripper).all((1, 2))
-    samples = table.stamp_ns[sound], table.base_from_gripper[sound]
-    poses, gap_ns = interpolated_poses(*samples, stamps)
+    poses, gap_ns = interpolated_poses(table.stamp_ns[sound], table.base_from_gripper[sound], stamps)
     stale = np.flatnonzero(gap_ns > 1e6 * options.max_gap_ms).tolist()
     why = f"no pose within {options.max_gap_ms:.0f} ms around it; drop the image or raise --max-gap-ms"
     notes = (f"poses interpolated at the {len(taken)} images' time stamps",)

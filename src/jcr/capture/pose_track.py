@@ -59,8 +59,7 @@ def bracket(
     width = sample_ns[np.minimum(before + 1, last)] - sample_ns[before]
     share = np.clip((stamp_ns - sample_ns[before]) / np.maximum(width, 1), 0.0, 1.0)
     gap = np.where((share == 0) | (share == 1), 0, width)
-    outside = (stamp_ns < sample_ns[0]) | (stamp_ns > sample_ns[last])
-    return before, share, np.where(outside, NEVER, gap)
+    return before, share, np.where((stamp_ns < sample_ns[0]) | (stamp_ns > sample_ns[last]), NEVER, gap)
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:

@@ -101,8 +101,7 @@ def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
     """Return the RGB image of a sensor_msgs/Image or CompressedImage; raise InputError if it is not a colour image."""
     pixels, _ = image_of(message, "image")
     if isinstance(pixels, bytes):
-        decoded = cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR_RGB)
-        return np.asarray(decoded, np.uint8)
+        return np.asarray(cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
     return pixels
 
 

@@ -145,16 +145,14 @@ def _dispatched(arguments: Sequence[str]) -> int:
     require_address_space()
     with contextlib.ExitStack() as silence:
         if record.output.quiet:
-            nowhere = silence.enter_context(open(os.devnull, "wb"))
-            quiet = silence.enter_context(Quiet(nowhere, sys.stderr))
+            quiet = silence.enter_context(Quiet(silence.enter_context(open(os.devnull, "wb")), sys.stderr))
             silence.enter_context(contextlib.redirect_stderr(quiet))
         return record.main()
 
 
 def command(name: str) -> Any:
     """Return the class of a command, whose fields are its arguments: `add-camera` is AddCameraCommand."""
-    kind = name.title().replace("-", "") + "Command"
-    return getattr(import_module(f"jcr.cli.{MODULES[name]}"), kind)
+    return getattr(import_module(f"jcr.cli.{MODULES[name]}"), name.title().replace("-", "") + "Command")
 
 
 def dispatch(arguments: Sequence[str]) -> int:

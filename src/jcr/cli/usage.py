@@ -46,8 +46,7 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
             case _ if unknown := next((word for word in options if word not in known), None):
                 why = f"{program} has no option {unknown}{did_you_mean(unknown, known)}"
             case _errors.MissingArgs(missing_arguments=missing):
-                names = ", ".join(str(one.arg.lowered.metavar) for one in missing)
-                why = f"{names}: required, and not given"
+                why = f"{', '.join(str(one.arg.lowered.metavar) for one in missing)}: required, and not given"
             case _errors.UnrecognizedArgs(tokens=[first, *_]):
                 why = f"{first!r}: one argument too many for {program}"
             case _errors.InvalidChoice(argument=argument, value=value):

@@ -168,8 +168,7 @@ def _compare_depths(typing, sums, compared, place, rays, rest):
         found = (agrees, moved), (agrees, 1.0), (through, 1.0), (agrees, dx * dx + dy * dy)
         for n, (where, value) in enumerate(found):
             at = builder.add(builder.mul(size, LONG(n)), own)
-            total = where.choose(value, 0.0) + Lanes.read(builder, out.data, at, LANES)
-            total.write(out.data, at)
+            (where.choose(value, 0.0) + Lanes.read(builder, out.data, at, LANES)).write(out.data, at)
         return context.get_dummy_value()
 
     return signature(types.none, sums, compared, place, rays, rest), generate

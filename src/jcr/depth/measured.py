@@ -69,8 +69,7 @@ def with_measured_depth(
         z = share * there + (1 - share) * z
         sigma = np.where(agrees, of_matched * np.sqrt(share), sigma)
         new = agrees | (inside & ~matched)
-        x_in_recon = apply(recon_from_camera, (z / scale)[..., None] * ray)
-        points[k][new] = x_in_recon[new]
+        points[k][new] = apply(recon_from_camera, (z / scale)[..., None] * ray)[new]
         std[k][new] = sigma[new] / scale
         confidence[k][new & ~matched] = usual
         reason[k][new] = MATCHED

@@ -231,8 +231,7 @@ def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
 ) -> Float[ndarray, "..."]:
     """Return angles (rad) between gripper · X and X · camera of p pairs: (p,) for X (3,3), (h,p) for X (h,1,3,3)."""
-    trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
-    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return np.arccos(np.clip((np.einsum("...ij,...ij->...", gripper @ x, x @ camera) - 1) / 2, -1, 1))
 
 
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
@@ -250,8 +249,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     # The twist of a quaternion is 2 atan2(q_z, q_w), which equals this expression (Shepperd 1978).
     twist = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
     # Most images keep their orientation, because rotation costs sharpness.
-    common = np.cos(twist[:, None] - twist)
-    return twist - twist[int(np.argmax(np.maximum(common - 0.9, 0).sum(1)))]
+    return twist - twist[int(np.argmax(np.maximum(np.cos(twist[:, None] - twist) - 0.9, 0).sum(1)))]
 
 
 def by_quarters(roll: float) -> float:

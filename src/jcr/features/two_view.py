@@ -179,8 +179,7 @@ def _least_squares_motion(
         at, normal = found.unknowns, found.normal
     # Errors of neighbouring matches are correlated: at most a hundred matches count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
-    covariance = np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5))
-    return CameraMotion(*at, covariance, sigma)
+    return CameraMotion(*at, np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5)), sigma)
 
 
 def _retracted(

@@ -321,8 +321,7 @@ def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None
     matrix, goal = np.vstack([by_x, by_y]), np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
     coefficients = np.linalg.lstsq(matrix, goal, rcond=None)[0]
     off_px = max(stored.fx, stored.fy) * np.abs(matrix @ coefficients - goal).max()
-    fitted = intrinsics.model_copy(update={"distortion": coefficients.tolist()})
-    return fitted if off_px < FITTED_PX else None
+    return intrinsics.model_copy(update={"distortion": coefficients.tolist()}) if off_px < FITTED_PX else None
 
 
 # An image can be kept if it is at rest, sharp, well exposed, and different from the images at other gripper poses.

@@ -70,8 +70,7 @@ def propose(
         is not near that of an image that failed. After a failure, gripper rotations are compared instead of axes.
         Rotated enough: by 15° from all images. `or_likely`: if no pose passes both tests, apply only the first one.
         """
-        cosine = (added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T
-        angle = np.arccos(np.clip(cosine, -1, 1)).min(1)
+        angle = np.arccos(np.clip((added @ x)[:, :3, 2] @ (known @ x)[:, :3, 2].T, -1, 1)).min(1)
         if len(refused) or not has_camera[-1]:
             angle = _least_rotation(added, known)
         between = (added @ x)[:, None, :3, 3] - (failed @ x)[:, :3, 3]
@@ -111,8 +110,7 @@ def _assumed(capture: Capture, poses: Float[ndarray, "m 4 4"], hand_eye: Calibra
 
 def _least_rotation(added: Poses, known: Float[ndarray, "n 4 4"]) -> Float[ndarray, " k"]:
     """Return the smallest rotation angle (rad) between each pose in `added` (k,4,4) and the n poses in `known`."""
-    relative = np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3]
-    return np.asarray(rotation_angle(relative)).min(1)
+    return np.asarray(rotation_angle(np.swapaxes(known[:, :3, :3], 1, 2) @ added[:, None, :3, :3])).min(1)
 
 
 def joints_at(
@@ -136,5 +134,4 @@ def joints_at(
             return found[0]
         return None
     posture = inverse_kinematics(arm, np.concatenate([base_from_gripper, goal[None]]))
-    reached = bool((posture.misfit[-1] < FITS).all())
-    return posture.joints[-1] if reached else None
+    return posture.joints[-1] if (posture.misfit[-1] < FITS).all() else None

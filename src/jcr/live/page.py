@@ -45,8 +45,7 @@ def whole_page(session: LiveSession) -> str:
     """Return the HTML of the live page, without its changing parts, which its script requests from `page_parts`."""
     checks = [(name, label, True) for name, label in LAYERS.items()]
     view = {"layers": [], "checks": checks, "through": [], "labels": [], "data": _scene(session.state)}
-    content = {"folder": str(session.folder.folder), "scene": view}
-    return render("live.html", content, PACKAGE)
+    return render("live.html", {"folder": str(session.folder.folder), "scene": view}, PACKAGE)
 
 
 def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> dict[str, Any]:
@@ -185,8 +184,7 @@ def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
     small = _small(image, NOW_PX)
     found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
     for feature in found:
-        center = round(feature.pt[0]), round(feature.pt[1])
-        cv2.circle(small, center, 3, (60, 235, 120), 1, cv2.LINE_AA)
+        cv2.circle(small, (round(feature.pt[0]), round(feature.pt[1])), 3, (60, 235, 120), 1, cv2.LINE_AA)
     few = "" if len(found) >= FEW_FEATURES else " Few: put textured things into view."
     return _jpeg(small), f"{len(found)} features.{few}"
 

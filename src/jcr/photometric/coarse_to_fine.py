@@ -68,8 +68,7 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
     """Return depths (m) evenly spaced in inverse depth, for n images: DEPTH_RANGE times that where the axes meet."""
     pose = cameras.base_from_camera
-    depth = ((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1)
-    middle = np.clip(depth, *MEET_WITHIN)
+    middle = np.clip(((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1), *MEET_WITHIN)
     return middle / np.linspace(1 / DEPTH_RANGE[0], 1 / DEPTH_RANGE[1], DEPTHS)[:, None]
 
 

@@ -152,8 +152,7 @@ def _images(
             raise InputError(f"{source}: colors must be uint8 of shape {(len(rows), size[1], size[0], 3)}")
         colors = colors[np.argsort(rows)]
     else:
-        part = capture.of_rows(ordered)
-        colors = read_colors(part, grid, intrinsics, pinhole)
+        colors = read_colors(capture.of_rows(ordered), grid, intrinsics, pinhole)
     return PreparedImages(
         colors=colors, grid=grid, intrinsics_of_capture=intrinsics, pinhole=pinhole, warnings=warnings
     )

@@ -59,7 +59,7 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
             card |= {"name": name, "numbers": image_numbers(image), "marks": marks.get(k)}
             card["rejected"] = None if image.used else image.reason or "no reason given"
     is_calibrated = result is not None and intrinsics is not None
-    content = {
+    return {
         "cards": cards,
         "shown": SHOWN,
         "is_calibrated": is_calibrated,
@@ -68,7 +68,6 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
         "size": (intrinsics.width, intrinsics.height) if is_calibrated and intrinsics else capture.image_size,
         "pixels": pixels_of_file(intrinsics or capture.intrinsics, capture.image_size),
     }
-    return content
 
 
 def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:

@@ -48,7 +48,7 @@ def motion_section(result: RunResult) -> Content:
     bars = []
     if len(gripper) > 1:
         bars = list(excitation_bars(excitation(gripper, result.found.gripper_from_camera)))
-    content = {
+    return {
         "unobservable": list(zip(observed.unobservable, observed.advice, strict=False)),
         "is_observable": observed.observable,
         "tick": f"{100 * WEAK / GENERAL:.1f}",
@@ -58,7 +58,6 @@ def motion_section(result: RunResult) -> Content:
         "scale_percent": "" if uncertainty is None else significant(uncertainty.scale_std_percent),
         "next_poses": _next_poses(result),
     }
-    return content
 
 
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:

@@ -28,7 +28,7 @@ def residuals_section(result: RunResult) -> Content:
         )
     noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
     count = 6 * int(used.sum())
-    content = {
+    return {
         "rows": [(one.used, name, [column[k] for column in columns]) for k, (name, one) in enumerate(rows)],
         "noise": {
             "mm": significant(1e3 * noise),
@@ -40,4 +40,3 @@ def residuals_section(result: RunResult) -> Content:
         "translation": f"{significant(1e3 * fit.residuals.translation)} mm",
         "rotation": significant(fit.residuals.rotation),
     }
-    return content

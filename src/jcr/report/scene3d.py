@@ -76,14 +76,13 @@ def scene_section(result: RunResult) -> Content:
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
     checks += [("next", "poses to add (green)", False)] * bool(next_poses)
     checks.append(("tracks", "tracked features (red)", not layers))
-    content = {
+    return {
         "layers": [name for name, *_ in layers] + ["no points"] * bool(layers),
         "checks": checks,
         "through": [(k, view["name"]) for k, view in enumerate(views) if view["camera"]],
         "labels": labels,
         "data": data,
     }
-    return content
 
 
 def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:

@@ -56,7 +56,7 @@ def transform_section(hand_eye: Calibration) -> Content:
     mounted = CameraMount(
         parent=parent, child=CHILD, parent_from_child=x, base=BASE, intrinsics=hand_eye.intrinsics
     )
-    content = {
+    return {
         "sketch": sketch(x, hand_eye.intrinsics, mount),
         "mount": mount,
         "parent": parent,
@@ -82,7 +82,6 @@ def transform_section(hand_eye: Calibration) -> Content:
         "order": order,
         "camera_info": None if hand_eye.intrinsics is None else camera_info(mounted),
     }
-    return content
 
 
 def sketch(
@@ -110,8 +109,7 @@ def sketch(
 
     def draw(tag: str, ends: Sequence[ndarray] | ndarray, kind: str) -> None:
         """Add an SVG polyline or polygon (`tag`) through the points `ends` (px), with the CSS class `kind`."""
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)
-        shapes.append((tag, {"class": kind, "points": points}, ""))
+        shapes.append((tag, {"class": kind, "points": " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)}, ""))
 
     def write(x: float, y: float, words: str, kind: str) -> None:
         """Add the text `words` with its left end, or with CSS class `kind` "middle" its centre, at x, y (px)."""

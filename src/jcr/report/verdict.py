@@ -25,7 +25,7 @@ def failure_section(calibration: AnyCalibration) -> Content:
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
     remedies += filter(None, [remedy(failed)])
-    content = {
+    return {
         "fault": text(failed),
         "remedies": [words[0].upper() + words[1:] for words in remedies],
         "attempts": [
@@ -38,7 +38,6 @@ def failure_section(calibration: AnyCalibration) -> Content:
             for attempt in calibration.attempts
         ],
     }
-    return content
 
 
 def _verdict(calibration: AnyCalibration) -> dict[str, str]:

@@ -55,8 +55,7 @@ def distance_grid(
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
     offset, beside = _boundary(lower, cell, solid, is_solid)
     if not beside.any():
-        diagonal = float(np.linalg.norm(shape)) * cell
-        distance = np.full(shape, diagonal, np.float32)
+        distance = np.full(shape, float(np.linalg.norm(shape)) * cell, np.float32)
     else:
         nearest = distance_transform_edt(~beside, return_distances=False, return_indices=True)
         assert isinstance(nearest, ndarray)
@@ -97,8 +96,7 @@ def _boundary(
         low_is_solid = solid[tuple(low.T)]
         share = torch.full((len(low),), 0.5, device=lower.device)
         for k in range(2, BISECTIONS + 2):
-            beyond = is_solid(start + share[:, None] * step) != low_is_solid
-            share += torch.where(beyond, -(0.5**k), 0.5**k)
+            share += torch.where(is_solid(start + share[:, None] * step) != low_is_solid, -(0.5**k), 0.5**k)
         forward, backward = np.zeros(solid.shape, np.float32), np.zeros(solid.shape, np.float32)
         index = low.cpu().numpy()
         forward[tuple(index.T)] = 1.0 / share.cpu().numpy()

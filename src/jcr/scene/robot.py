@@ -182,11 +182,9 @@ def spheres_of_shape(
     pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
     voxels = cast(Any, shape.voxelized(pitch)).fill()
     solid = np.pad(voxels.matrix, 1)
-    depth = np.asarray(distance_transform_edt(solid))
-    distance = np.where(solid, pitch * (0.5 - depth), np.inf)
+    distance = np.where(solid, pitch * (0.5 - np.asarray(distance_transform_edt(solid))), np.inf)
     index, radii = cover_with_spheres(distance, pitch, excess)
-    centers = apply(np.asarray(voxels.transform), index - 1.0)
-    return apply(link_from_shape, centers), radii
+    return apply(link_from_shape, apply(np.asarray(voxels.transform), index - 1.0)), radii
 
 
 def cover_with_spheres(

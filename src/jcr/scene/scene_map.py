@@ -248,8 +248,7 @@ class SceneMap:
             raise InputError(
                 f"segments: shapes {starts.shape} and {ends.shape}; both must be (…, 3), the same"
             )
-        length = np.linalg.norm(ends - starts, axis=-1)
-        longest = float(length.max(initial=0.0))
+        longest = float(np.linalg.norm(ends - starts, axis=-1).max(initial=0.0))
         if not np.isfinite(longest):
             raise InputError("segments: an end is not finite; remove such segments")
         share = np.linspace(0.0, 1.0, int(np.ceil(longest / self.seen.cell)) + 1)

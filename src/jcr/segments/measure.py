@@ -135,8 +135,7 @@ def _shape(
         length, width = np.ptp(hull @ _axes(angle).T, axis=0)
         rotation_rad = angle + np.pi / 2 * float(length < width)
     along = (xy - middle) @ _axes(rotation_rad).T
-    ends = [SIDE_SHARE, 1 - SIDE_SHARE]
-    low, high = np.quantile(along, ends, axis=0, weights=area, method="inverted_cdf")
+    low, high = np.quantile(along, [SIDE_SHARE, 1 - SIDE_SHARE], axis=0, weights=area, method="inverted_cdf")
     within = ((along >= low) & (along <= high)).all(1)
     center = middle + (low + high) / 2 @ _axes(rotation_rad)
     return top, spread, rotation_rad, center, high - low, xy[within]
@@ -166,8 +165,7 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
         peak -= 1
     around = np.abs(height - (low + (peak + 0.5) * step)) < 2.5 * width
     middle = float(np.median(height[around]))
-    spread = 1.4826 * float(np.median(np.abs(height[around] - middle)))
-    return middle, spread
+    return middle, 1.4826 * float(np.median(np.abs(height[around] - middle)))
 
 
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
@@ -179,8 +177,7 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
     cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     count = np.zeros([rows.max() + 2 for rows in cell])
     np.add.at(count, cell, 1.0)
-    smooth = gaussian_filter(count, 0.5, mode="constant")
-    kept = smooth[cell] >= EDGE_SHARE * np.median(count[count > 0])
+    kept = gaussian_filter(count, 0.5, mode="constant")[cell] >= EDGE_SHARE * np.median(count[count > 0])
     if kept.sum() < 3:
         kept[:] = True
     return xy[kept], 1 / count[cell][kept]

@@ -160,8 +160,7 @@ def merged(
             inside[row, cell[k][mask & known[k]]] = True
     holds = inside.astype(np.float32)
     shared = holds @ holds.T
-    visible = holds @ seen.T.astype(np.float32)
-    in_other = visible[:, image_of]
+    in_other = (holds @ seen.T.astype(np.float32))[:, image_of]
     union = in_other + in_other.T - shared
     one = (shared > OVERLAP * union) & (image_of[:, None] != image_of)
     _, group = connected_components(coo_array(one), directed=False)
@@ -178,5 +177,4 @@ def merged(
         mask = masks[k][row - np.searchsorted(image_of, k)]
         if rank[group[row]] > 0:
             labels[k][mask] = rank[group[row]]
-    names = ("none", *(f"segment {n}" for n in range(1, int((size > 0).sum()) + 1)))
-    return labels, names
+    return labels, ("none", *(f"segment {n}" for n in range(1, int((size > 0).sum()) + 1)))

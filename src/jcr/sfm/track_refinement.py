@@ -69,8 +69,7 @@ def align_tracks(
     # An area on this plane appears in an image with a factor det [J; nᵀ], times the same constant in all images.
     camera_from_recon = inverse(recon_from_camera)[image]
     by_recon = by_point(intrinsics, _x_in_b(camera_from_recon, x_in_recon)) @ camera_from_recon[:, :3, :3]
-    scale = np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
-    rank = np.lexsort((scale, point))
+    rank = np.lexsort((np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1))), point))
     reference = rank[(ends[:-1] + ends[1:]) // 2]
     of_reference = np.repeat(reference, np.diff(ends))
     warp, bend = _warps(x_px, image, x_in_recon, facing, of_reference, recon_from_camera, intrinsics)
@@ -129,8 +128,7 @@ def _warps(
     height = ((x_in_recon - centre) * facing).sum(1)
 
     def at(u: int, v: int) -> Float[ndarray, "k 2"]:
-        offset = _BEND_AT_PX * np.array([u, v])
-        rays = unproject(intrinsics, x_px[of_reference] + offset)
+        rays = unproject(intrinsics, x_px[of_reference] + _BEND_AT_PX * np.array([u, v]))
         ray = np.einsum("kij,kj->ki", recon_from_reference[:, :3, :3], rays)
         on_plane = centre + (height / (ray * facing).sum(1))[:, None] * ray
         return project(intrinsics, _x_in_b(camera_from_recon, on_plane))

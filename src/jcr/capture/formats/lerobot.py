@@ -189,8 +189,7 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
         if len(mine) == 0:
             continue
         if episode.video is not None:
-            times = episode.video_start_s + episode.time_s[local]
-            frames = _video_frames(episode.video, times, 0.5 / fps)
+            frames = _video_frames(episode.video, episode.video_start_s + episode.time_s[local], 0.5 / fps)
             yield from ((row, rgb, ".png") for row, rgb in zip(mine.tolist(), frames, strict=True))
             continue
         numbers = episode.frame[local].tolist()

@@ -171,8 +171,7 @@ def _inflation(
     variance = np.einsum("kcm,kcm->k", weighted, parts) / total
     means = (weighted @ o.cell) / np.maximum(cell_total, 1e-12)[:, None]
     variance_of_means = np.einsum("kcg,kcg,kg->k", means, means, cell_total) / total
-    per_cell = weight.shape[1] / CELL_SIDE**2
-    return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
+    return np.maximum(1.0, weight.shape[1] / CELL_SIDE**2 * variance_of_means / np.maximum(variance, 1e-30))
 
 
 def initial_depth(o: ImageObservations, state: AlignmentState) -> Float[ndarray, " m"]:
