@@ -276,7 +276,5 @@ def require_rigid(matrix: Transform, where: str) -> Transform:
         hint = f"it is scaled by {size:.4g}: divide it out" if scaled else "check units, order and angles"
         raise InputError(f"{where}: no rotation, RᵀR differs from the identity by {off:.2g}; {hint}")
     if determinant < 0:
-        raise InputError(
-            f"{where}: a reflection (determinant {determinant:.3f}); an axis has its sign flipped"
-        )
+        raise InputError(f"{where}: a reflection (determinant {determinant:.3f}); flip the sign of an axis")
     return transform(nearest_rotation(rotation), matrix[:3, 3])

@@ -322,9 +322,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     if options.backend != "auto":
         names = [options.backend]
         if options.backend not in BACKENDS:
-            raise InputError(
-                f"--backend {options.backend}: no such back end; there are {', '.join(BACKENDS)}"
-            )
+            raise InputError(f"--backend {options.backend}: no such back end; take {', '.join(BACKENDS)}")
     elif len(selecting) > 1:
         raise InputError(
             f"{' and '.join(f'--{row.selected_by}' for row in selecting)} select different back ends "

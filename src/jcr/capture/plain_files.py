@@ -114,9 +114,7 @@ def read_json(file: Path) -> Any:
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # a number of thousands of digits
-        raise InputError(
-            f"{file}: a number that is none, or nested too deeply ({error}); correct it"
-        ) from None
+        raise InputError(f"{file}: an invalid number or deep nesting ({error}); correct it") from None
 
 
 def first_few(names: Sequence[str]) -> str:
@@ -170,9 +168,7 @@ def contained(folder: Path, name: str, where: str) -> Path:
     except ValueError:  # an empty name, or half of a surrogate pair
         longest = LONGEST + 1
     if "\0" in name or longest > LONGEST or Path(name).is_absolute():
-        raise InputError(
-            f"{where}: {shown(name)} is no path inside the capture; use one relative to {folder}"
-        )
+        raise InputError(f"{where}: {shown(name)} is no path inside the capture; use one under {folder}")
     target = folder / name
     try:
         inside = target.resolve().is_relative_to(folder.resolve())

@@ -47,9 +47,7 @@ def read_capture(
     """
     found = read_source(path, options, into=into, progress=progress, at_least=at_least)
     if isinstance(found, PosePairs):
-        raise InputError(
-            f"{path}: has camera poses but no images; use `jcr calibrate`, or solve_hand_eye in Python"
-        )
+        raise InputError(f"{path}: has camera poses but no images; use `jcr calibrate` or solve_hand_eye")
     return found
 
 
@@ -67,13 +65,9 @@ def read_source(
     """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
-        raise InputError(
-            f"{path}: no such capture; name a folder that holds a capture.json, or another format"
-        )
+        raise InputError(f"{path}: no such capture; name a folder with a capture.json, or another format")
     if options.frames < MIN_FRAMES:
-        raise InputError(
-            f"--frames {options.frames}: at least {MIN_FRAMES} frames are needed, 8 to 15 are good"
-        )
+        raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed, 8 to 15 are good")
     name = format_of(path, options) if options.format == "auto" else options.format
     if name not in RECORDINGS:
         folder, origin, found = None, [], FORMATS[name].read(path, options)

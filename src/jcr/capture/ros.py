@@ -123,9 +123,7 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
         raise InputError(f"{where}: compressed as {message.format!r}; jcr reads JPEG and PNG of colours")
     encoding, (height, width) = message.encoding, (message.height, message.width)
     if encoding not in _ENCODINGS:
-        raise InputError(
-            f"{where}: encoding {encoding!r} is no colour image that jcr knows; choose another topic"
-        )
+        raise InputError(f"{where}: encoding {encoding!r} is no colour image jcr knows; choose another topic")
     channels, code = _ENCODINGS[encoding]
     rows = _rows(message, width * channels, f"an image of {width}x{height} {encoding}", where)
     pixels = rows.reshape(height, width, channels)
@@ -147,9 +145,7 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
         return np.asarray(depth)
     kinds = {"16UC1": (np.uint16, 1.0), "mono16": (np.uint16, 1.0), "32FC1": (np.float32, 1e3)}
     if message.encoding not in kinds:
-        raise InputError(
-            f"{where}: encoding {message.encoding!r} is no depth; ROS has 16UC1 (mm) and 32FC1 (m)"
-        )
+        raise InputError(f"{where}: encoding {message.encoding!r} is no depth; give 16UC1 (mm) or 32FC1 (m)")
     kind, to_mm = kinds[message.encoding]
     order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     what = f"a depth image of {message.width}x{message.height}"

@@ -146,9 +146,7 @@ class RecordedArm:
         """Compute base_from_gripper (m) from recorded positions, in order of `joints`; raise InputError for degrees."""
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
-            raise InputError(
-                f"joint angles go up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg"
-            )
+            raise InputError(f"joint angles up to {largest:.0f} rad; if degrees, add --pose-units m-deg")
         poses = np.empty((len(positions), 4, 4))
         for pose, row in zip(poses, positions, strict=True):
             self.urdf.update_cfg(dict(zip(self.joints, row, strict=True)))
@@ -188,16 +186,12 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     chain = joints_to(urdf, gripper)
     parents = [joint.parent for joint in chain]
     if base not in (*parents, gripper):
-        raise InputError(
-            f"{file}: no joints lead from {base} to {gripper}; name the robot's base with --base-frame"
-        )
+        raise InputError(f"{file}: no joints lead from {base} to {gripper}; name the base with --base-frame")
     chain = chain[parents.index(base) :] if base in parents else []
     moving = [joint for joint in chain if joint.type != "fixed"]
     names = tuple(dict.fromkeys(joint.mimic.joint if joint.mimic else joint.name for joint in moving))
     if not names:
-        raise InputError(
-            f"{file}: nothing moves between {base} and {gripper}; name a link behind the last joint"
-        )
+        raise InputError(f"{file}: nothing moves between {base} and {gripper}; name a link after a joint")
     if unknown := [name for name in names if name not in urdf.actuated_joint_names]:
         raise InputError(
             f"{file}: a joint mimics {unknown[0]}, which is not an independent joint of the URDF; correct it"

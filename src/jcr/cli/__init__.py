@@ -72,14 +72,10 @@ for example:
 
 
 _DISK = {
-    **dict.fromkeys(
-        (errno.ENOSPC, errno.EDQUOT), "make room, or choose another folder; finished results are kept"
-    ),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room or choose another folder; results are kept"),
     errno.EFBIG: "the disk cannot hold a file of that size; choose another folder",
     errno.EROFS: "choose a folder on a writable disk",
-    **dict.fromkeys(
-        (errno.EACCES, errno.EPERM), "choose a folder that you can write to, or files that you can read"
-    ),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "choose a folder you can write to, or files you can read"),
     errno.EIO: "the disk is failing; copy its files and use another",
     errno.EISDIR: "there is a folder where a file belongs; move it away",
     errno.ENOTDIR: "there is a file where a folder belongs; move it away",
@@ -130,9 +126,7 @@ def _dispatched(arguments: Sequence[str]) -> int:
         return 0
     if name != "--tyro-write-completion" and name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
-        raise InputError(
-            f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
-        )
+        raise InputError(f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (--help)")
     from jcr.cli.usage import parsed, write_completion
 
     if name == "--tyro-write-completion":

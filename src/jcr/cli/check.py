@@ -350,9 +350,7 @@ class TouchCommand:
         verdict = "REJECTED: larger than" if is_larger else "ACCEPTED: within"
         lines = [f"{verdict} the reported uncertainty: {rms:.2f} mm (rms), {expected:.2f} mm expected"]
         if is_larger:
-            remedy = (
-                "check the tip's calibration (a constant error), then calibrate the camera again (jcr run)"
-            )
+            remedy = "check the tip's calibration (a constant error), then calibrate again (jcr run)"
             lines += labelled("Remedy", remedy)
         lines += labelled("Mean", f"{numbers(mean, 2, '+')} mm")
         points = [

@@ -153,9 +153,7 @@ class ModelsCommand:
             self.output.result(lines, facts | {"folder": str(folder)})
             return 0
         if self.name is not None or self.accept_licence or self.revision is not None:
-            raise InputError(
-                "jcr models: a name, --accept-licence and --revision are for jcr models get NAME"
-            )
+            raise InputError("jcr models: name, --accept-licence and --revision are for jcr models get NAME")
         lines, facts = [], []
         for row in BACKENDS.values():
             missing = [] if row.is_installed() else [row.install]

@@ -200,9 +200,7 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
     except Exception as error:
         raise InputError(f"{path}: cannot be read as points ({error}); give x, y, z in metres") from error
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: expected points of shape (n, 3) in metres, got {points.shape} {points.dtype}"
-        )
+        raise InputError(f"{path}: expected points (n, 3) in metres, got {points.shape} {points.dtype}")
     points = points.astype(np.float64)
     if not (finite := np.isfinite(points).all(1)).all():
         raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")

@@ -94,9 +94,7 @@ def write_run(
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
         names = get_args(ExportName)
-        raise InputError(
-            f"{format}: no such format{did_you_mean(format, names)}; choose one of {', '.join(names)}"
-        )
+        raise InputError(f"{format}: no such format{did_you_mean(format, names)}; choose {', '.join(names)}")
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     path = path or out / "export" / row.file
@@ -218,9 +216,7 @@ class ExportedRun:
         for camera in () if cameras is None else cameras.cameras:
             if camera.name == name and camera.parent_from_camera is not None:
                 return camera
-        raise InputError(
-            f"--camera {name}: {self.run.out} has placed no camera of that name; see its cameras.json"
-        )
+        raise InputError(f"--camera {name}: {self.run.out} has no such camera; see its cameras.json")
 
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
         """Return the frame `child` of a camera other than the calibrated one, with its transform to its parent frame."""

@@ -55,9 +55,7 @@ def write_nerfstudio(
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)
         if intrinsics.model in ("rational", "thin_prism"):
-            raise InputError(
-                f"nerfstudio has no {intrinsics.model} distortion model; export with --undistort"
-            )
+            raise InputError(f"nerfstudio has no {intrinsics.model} distortion; export with --undistort")
         distortion = dict(zip(COEFFICIENTS[intrinsics.model], intrinsics.distortion, strict=True))
         camera_model = "OPENCV_FISHEYE" if intrinsics.model == "fisheye" else "OPENCV"
         if not is_distorted(intrinsics):

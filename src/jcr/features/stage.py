@@ -264,9 +264,7 @@ def match_with_robot(
         x = hand_eye_of_pairs(found, motion)
     if matcher.still is not None:
         percent = 100 * matcher.still.mean()
-        notes += (
-            f"{percent:.0f} % of the image do not move while the gripper does, fingers or a logo: left out",
-        )
+        notes += (f"{percent:.0f} % of the image stay while the gripper moves, fingers or a logo: left out",)
     report("matching", 1.0)
     intrinsics = search.view.intrinsics
     return MatchedPairs(geometries=kept, intrinsics=intrinsics, x=x, notes=notes, warnings=warnings)

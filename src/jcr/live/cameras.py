@@ -244,15 +244,11 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
         if is_file:
             profile.get_device().as_playback().set_real_time(False)
         elif options.focus is not None:
-            raise InputError(
-                f"--focus {options.focus:g}: a RealSense has a fixed focus; leave the option out"
-            )
+            raise InputError(f"--focus {options.focus:g}: a RealSense has fixed focus; leave the option out")
         elif (exposure := options.exposure) is not None:
             sensor, option = profile.get_device().first_color_sensor(), rs.option.exposure
             if not sensor.supports(option):
-                raise InputError(
-                    f"--exposure {exposure:g}: this camera has no such setting; leave the option out"
-                )
+                raise InputError(f"--exposure {exposure:g}: this camera has no such setting; leave it out")
             limits = sensor.get_option_range(option)
             if not limits.min <= exposure <= limits.max:
                 raise InputError(

@@ -164,9 +164,7 @@ class LiveFolder:
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))
             if metres < MOVED[0] and radians < MOVED[1]:
-                raise InputError(
-                    f"{number}: repeats {one.image}, image and pose; move the arm and take another"
-                )
+                raise InputError(f"{number}: repeats {one.image}, image and pose; move the arm")
             raise InputError(
                 f"{number}: is the same as {one.image}, though the gripper moved by {1e3 * metres:.0f} mm and "
                 f"{np.degrees(radians):.0f}°; check that the camera's stream is live"

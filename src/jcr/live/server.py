@@ -78,9 +78,7 @@ class LiveServer(ThreadingHTTPServer):
         `takes_samples`: other programs may post gripper poses, at which images are then taken.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
-            raise InputError(
-                "JCR_TOKEN: has characters that an address cannot have; use letters, digits, - and _"
-            )
+            raise InputError("JCR_TOKEN: has characters that no address has; use letters, digits, - and _")
         where = f"{'--page-port' if host == LOOPBACK else '--listen'} {host}:{port}"
         is_any_host = host == ""
         with suppress(ValueError):

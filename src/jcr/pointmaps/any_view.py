@@ -67,9 +67,7 @@ def reconstruct_any_view(
     there = np.isfinite(maps.x_in_camera).all(-1) & (maps.x_in_camera[..., 2] > 0)
     there &= np.isfinite(maps.confidence) & (maps.confidence > 0)
     if not there.any() or not np.isfinite(maps.recon_from_camera).all():
-        raise InputError(
-            f"{backend} gave no usable depth or camera; its weights may be damaged, get them again"
-        )
+        raise InputError(f"{backend} gave no usable depth or camera; get its weights again")
     maps = replace(
         maps,
         x_in_camera=np.where(there[..., None], maps.x_in_camera, 0).astype(np.float32),

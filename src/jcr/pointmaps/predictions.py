@@ -98,9 +98,7 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
             )
         return np.arange(count)
     if len(names) != count or len(set(names)) != count:
-        raise InputError(
-            f"{source}: 'images' has {len(names)} names for {count} images; give one different each"
-        )
+        raise InputError(f"{source}: 'images' has {len(names)} names for {count} images; give one each")
     unknown = [name for name in names if name not in capture.images]
     if unknown:
         raise InputError(f"{source}: no image {unknown[0]!r} in the capture; it has {capture.images[0]!r} …")

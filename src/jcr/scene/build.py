@@ -44,9 +44,7 @@ def build_scene(
     options = options or MapOptions()
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
         if not np.isfinite(numbers).all():
-            raise InputError(
-                "the cloud holds numbers that are not finite; remove those points and map the rest"
-            )
+            raise InputError("the cloud holds numbers that are not finite; remove those points")
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
@@ -61,9 +59,7 @@ def build_scene(
         history = {"preset": options.preset, "carving_s": f"{carved - start:.3f}"}
         if options.preset == "paper":
             if values:
-                raise InputError(
-                    "the preset paper has occupancy, colour and label alone; leave the values out"
-                )
+                raise InputError("the preset paper learns no further values; leave the values out")
             learnt = train_paper(cloud, seed=options.map_seed, box=box, max_seconds=options.max_seconds)
             fields = Fields(list(learnt.values())).to(device)
         else:

@@ -183,6 +183,4 @@ def read_cloud(path: Path) -> PointCloud:
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
     except (ValueError, IndexError):
-        raise InputError(
-            f"{path}: is no cloud of jcr, or was damaged; make it again with jcr map OUT"
-        ) from None
+        raise InputError(f"{path}: is no cloud of jcr, or damaged; run jcr map OUT again") from None

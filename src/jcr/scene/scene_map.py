@@ -245,9 +245,7 @@ class SceneMap:
         """
         starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)
         if starts.ndim == 0 or starts.shape[-1] != 3 or starts.shape != ends.shape:
-            raise InputError(
-                f"segments: shapes {starts.shape} and {ends.shape}; both must be (…, 3), the same"
-            )
+            raise InputError(f"segments: shapes {starts.shape} and {ends.shape}; give (…, 3) twice")
         longest = float(np.linalg.norm(ends - starts, axis=-1).max(initial=0.0))
         if not np.isfinite(longest):
             raise InputError("segments: an end is not finite; remove such segments")

@@ -37,9 +37,7 @@ def surface_mesh(
     if len(center):
         (volume[near],) = in_chunks(lambda x: (scene.fields(x, ("occupancy",))["occupancy"][:, 0],), center)
     if volume.max() < 0:
-        raise InputError(
-            "the map holds no surface to make a mesh of; see in the report what the images showed"
-        )
+        raise InputError("the map holds no surface; see in the report what the images showed")
     zyx, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0.0)
     vertices = scene.box[0] + seen.cell * (zyx[:, ::-1] + 0.5)
     middle = torch.as_tensor(vertices[faces].mean(1), dtype=torch.float32, device=center.device)

@@ -46,9 +46,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
                     f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
                 )
             if label.max() >= MOST:
-                raise InputError(
-                    f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}"
-                )
+                raise InputError(f"{path}: holds label {label.max()}; number labels from 1 to {MOST - 1}")
             label = label.astype(np.uint16)
             labels[k] = cv2.remap(label, at_px[..., 0], at_px[..., 1], cv2.INTER_NEAREST, borderValue=0)
     count = int(labels.max()) + 1

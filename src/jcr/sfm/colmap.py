@@ -377,9 +377,7 @@ def _not_registered(
     elif pairs < len(x_px) - 1:
         reason = f"only {pairs} of {math.comb(len(x_px), 2)} pairs of images share features"
     else:
-        reason = (
-            "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
-        )
+        reason = "the matches agree on no common scene: a repeated pattern, motion, or wrong intrinsics"
     registered = model.num_reg_images() if model else 0
     return RejectedError(
         f"structure from motion registered {registered} of {len(x_px)} images ({reason})",

@@ -37,9 +37,7 @@ def reconstruct_given(
             known.append(k)
             rows.append(row)
     if len(known) < 3:
-        raise InputError(
-            f"{cameras}: knows {len(known)} of the capture's images by name; at least 3 are needed"
-        )
+        raise InputError(f"{cameras}: knows {len(known)} of the capture's images; at least 3 are needed")
     recon_from_camera = recon_from_camera[rows]
     intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
     model = colmap.read_model(cameras)

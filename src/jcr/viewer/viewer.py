@@ -89,9 +89,7 @@ def open_server(port: int, title: str) -> LocalServer:
         server = LocalServer(host=HOST, port=port, label=title, verbose=False)
     if port not in (0, server.get_port()):  # viser uses the next free port without an error
         server.stop()
-        raise InputError(
-            f"cannot listen on port {port} of {HOST}; choose another with --port (0 takes any free one)"
-        )
+        raise InputError(f"cannot listen on port {port} of {HOST}; choose another --port (0: any free one)")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
 

@@ -130,9 +130,7 @@ class _Bag:
             for connection, at, raw in self.reader.messages(connections, **span):
                 yield connection, at, self.reader.deserialize(raw, connection.msgtype)
         except Exception as error:  # each storage raises its own errors, struct and KeyError among them
-            raise InputError(
-                f"{self.path}: damaged ({error}); repair it with the tool that recorded it"
-            ) from None
+            raise InputError(f"{self.path}: damaged ({error}); repair it with its recorder") from None
 
     def pictures(self, rows: Int[ndarray, " k"]) -> Iterator[Picture]:
         """Yield the row, image (encoded bytes or RGB pixels) and file ending for each of k rows.
@@ -190,9 +188,7 @@ def _opened(path: Path) -> Iterator[Any]:
         if not all(isinstance(name, str) for c in reader.connections for name in (c.topic, c.msgtype)):
             raise ValueError("its metadata has a topic without a name")
     except Exception as error:  # each storage raises its own errors, SQLite, YAML and struct among them
-        raise InputError(
-            f"{path}: not a readable bag ({error}); check that it was closed and is whole"
-        ) from None
+        raise InputError(f"{path}: not a readable bag ({error}); check that it is whole") from None
     try:
         yield reader
     finally:

@@ -145,9 +145,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
     if own is not None:
         capture = replace(capture, camera_name=own, mount=entries.pop(own).mount)
     elif capture.camera_name in entries:
-        raise InputError(
-            f"{where}: camera {capture.camera_name} is the frames' own; give the other another name"
-        )
+        raise InputError(f"{where}: camera {capture.camera_name} is the frames' own; rename the other")
     used = [True] * len(capture) if used is None else used
     others = [
         _camera(name, entry, capture, f"{where}: camera {name}", used) for name, entry in entries.items()
@@ -164,9 +162,7 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
         poses = np.array([one.base_from_gripper for one in entry.frames])
     elif entry.mount == "gripper":
         if len(listed) != len(used):
-            raise InputError(
-                f"{where}: {len(listed)} images for {len(used)} frames; give one for each, or null"
-            )
+            raise InputError(f"{where}: {len(listed)} images for {len(used)} frames; give one each, or null")
         listed = [image for image, is_used in zip(listed, used, strict=True) if is_used]
         frame = np.flatnonzero([image is not None for image in listed])
     images = [image for image in listed if image is not None]
@@ -204,9 +200,7 @@ def _stated_intrinsics(
     if intrinsics is None:
         raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
     if (missing := len(intrinsics.distortion) - len(std.distortion)) < 0:
-        raise InputError(
-            f"{where}: distortion must be a list of at most {len(intrinsics.distortion)} numbers"
-        )
+        raise InputError(f"{where}: distortion has at most {len(intrinsics.distortion)} numbers")
     values = [std.fx, std.fy, std.cx, std.cy, *std.distortion, *[None] * missing]
     return {"intrinsics": intrinsics, "intrinsics_std": np.array(values, np.float64)}
 

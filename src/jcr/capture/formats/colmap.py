@@ -122,9 +122,7 @@ def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] 
         )
     ((name, names_of_params, width, height, *params),) = kinds
     if name not in _MODELS:
-        raise InputError(
-            f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
-        )
+        raise InputError(f"{folder}: unknown camera model {name}; run colmap image_undistorter")
     value = dict(zip(names_of_params.split(", "), params, strict=True))
     kind: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
     value = {"fx": value.get("f"), "fy": value.get("f"), "k1": value.get("k", 0.0)} | value

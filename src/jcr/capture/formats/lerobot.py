@@ -225,9 +225,7 @@ def _video_frames(
     except (av.FFmpegError, IndexError) as error:
         raise InputError(f"{file}: not a readable video ({error}); download it again") from None
     if due:
-        raise InputError(
-            f"{file}: has no frame at {due[0]:.3f} s, which the data set lists; download it again"
-        )
+        raise InputError(f"{file}: has no frame at {due[0]:.3f} s, as listed; download it again")
 
 
 def _poses(

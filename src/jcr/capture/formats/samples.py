@@ -30,9 +30,7 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
     content = read_yaml_or_json(path)
     keys = pair_keys(content)
     if keys is None:
-        raise InputError(
-            f"{path}: no list of samples of MoveIt Calibration or easy_handeye2; name such a file"
-        )
+        raise InputError(f"{path}: no samples of MoveIt Calibration or easy_handeye2; name such a file")
     parameters = (
         content.get("parameters") if isinstance(content, dict) else {"calibration_type": "eye_in_hand"}
     )

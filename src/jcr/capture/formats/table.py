@@ -116,9 +116,7 @@ def pose_table(
     width = len(header or rows[0])
     for number, row in enumerate(rows, start=1):
         if len(row) != width:
-            raise InputError(
-                f"{where}: row {number} has {len(row)} columns, not {width}; complete or drop it"
-            )
+            raise InputError(f"{where}: row {number} has {len(row)} columns, not {width}; correct it")
     cells, units, convention = _named_columns(header, rows, options, where)
     image, stamp = (
         next((cells[name] for name in names if name in cells), None) for names in (_IMAGE, _STAMP)

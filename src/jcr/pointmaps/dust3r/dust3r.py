@@ -145,9 +145,7 @@ def _in_batches(
         # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
         torch.cuda.empty_cache()
         if sizes[-1] == 0:
-            raise InputError(
-                "out of memory with one pair of images; close other programs, or use --device cpu"
-            )
+            raise InputError("out of memory with one pair; close other programs, or use --device cpu")
 
 
 def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:

@@ -121,9 +121,7 @@ class Dust3r(nn.Module):
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
         """Return the encoder tokens of images (RGB, -1 to 1), whose height and width must be multiples of 16."""
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
-            raise ValueError(
-                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
-            )
+            raise ValueError(f"images are {tuple(images.shape[-2:])}; both must be multiples of {PATCH}")
         with self._autocast(images):
             grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
             rotary = rotary_embedding(grid, self.head_dims[0], self.rope_base, images.device)

@@ -125,9 +125,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
     if not solution.settled:
         warnings += (f"the alignment had not settled after {ROUNDS} rounds and may be wrong",)
     if middle > USELESS:
-        warnings += (
-            f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them",
-        )
+        warnings += (f"the pairs disagree by {100 * middle:.0f} % of distance; nothing can be built on them",)
     return Alignment(
         recon_from_camera=state.recon_from_camera,
         focal_px=(focal, focal * problem.aspect),

@@ -65,9 +65,7 @@ class AlignmentProblem:
         for k, weight in enumerate(self.weigh(total / shown[:, None])):
             best = np.maximum.reduceat(weight[by_cell], starts)
             if best.max() <= 0:
-                raise InputError(
-                    f"no pixel of image {predictions.names[k]} has any confidence; leave the image out"
-                )
+                raise InputError(f"image {predictions.names[k]} has no confident pixel; leave it out")
             winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
             winners = winners[np.unique(cell[winners], return_index=True)[1]]
             chosen.append(observe(self, k, winners[best > POOR * np.quantile(best, 0.9)]))
