@@ -129,9 +129,7 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
         )
     pairs = zip(table.images, located, strict=True)
     other = [f"{name} is {found}" for name, found in pairs if found not in (name, f"images/{name}")]
-    notes = (
-        [f"{len(other)} names in {file.name} are not those of files: {other[0]}, and so on"] if other else []
-    )
+    notes = [f"{len(other)} names in {file.name} are not those of files: {other[0]} …"] if other else []
     return located, table.base_from_gripper, table.faults, (*notes, *([left_out] if here else []))
 
 

@@ -120,8 +120,6 @@ def _origin(path: Path, options: ReadOptions) -> list[Any]:
     """Return the entry made_from of an extracted capture: path of the recording, digest of its files, and options."""
     sources = [path, *filter(None, (options.urdf, options.camera_info))]
     files = [file for one in sources for file in ([one] if one.is_file() else sorted(one.rglob("*")))]
-    states = [
-        (str(file), (state := file.stat()).st_size, state.st_mtime_ns) for file in files if file.is_file()
-    ]
+    states = [(str(one), (state := one.stat()).st_size, state.st_mtime_ns) for one in files if one.is_file()]
     digest = hashlib.sha256(json.dumps(states).encode()).hexdigest()
     return [str(path.resolve()), digest, json.loads(json.dumps(asdict(options), default=str))]

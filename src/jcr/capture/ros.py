@@ -23,9 +23,7 @@ _ROS_MODELS: dict[str, DistortionModel] = {
     "fisheye": "fisheye",
 }
 """Distortion models of jcr by their names in ROS (sensor_msgs/distortion_models.hpp; depthai writes fisheye)."""
-_Numbers = Annotated[
-    list[float], BeforeValidator(lambda array: list(array) if hasattr(array, "__iter__") else array)
-]
+_Numbers = Annotated[list[float], BeforeValidator(lambda it: list(it) if hasattr(it, "__iter__") else it)]
 """List of floats, converted from the array of a message."""
 
 

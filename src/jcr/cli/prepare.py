@@ -87,9 +87,7 @@ def pages() -> dict[str, Path]:
     if not (CHECKOUT / "conf.py").is_file():
         with suppress(PackageNotFoundError):  # when run from source files, without installation
             installed = [Path(str(file.locate())) for file in files(DISTRIBUTION) or []]
-            found = [
-                file for file in installed if file.suffix == ".md" and f"doc/{DISTRIBUTION}/" in str(file)
-            ]
+            found = [one for one in installed if one.suffix == ".md" and f"doc/{DISTRIBUTION}/" in str(one)]
     sections = {name: number for number, name in enumerate(SECTIONS)}
     named = [file for file in found if file.parent.name in sections and file.stem not in ("index", "README")]
     named.sort(key=lambda file: (sections[file.parent.name], file))

@@ -200,9 +200,7 @@ def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
     """Return the options of a run from the fields of a command with the same names; those in `chosen` replace them."""
     from jcr.result import RunOptions
 
-    given = {
-        one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)
-    }
+    given = {f.name: getattr(arguments, f.name) for f in fields(RunOptions) if hasattr(arguments, f.name)}
     return RunOptions(**given | chosen)
 
 

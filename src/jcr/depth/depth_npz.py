@@ -72,9 +72,7 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
         require_shapes(
             {"depth": (depth, shape), "relative_std": (std, shape), "confidence": (confidence, shape)}
         )
-        matched, filled = (
-            np.unpackbits(file[name], count=int(np.prod(shape))) for name in ("matched", "filled")
-        )
+        matched, filled = (np.unpackbits(file[k], count=int(np.prod(shape))) for k in ("matched", "filled"))
         if capture is None:
             colors = np.full((*shape, 3), GREY, np.uint8)
         else:

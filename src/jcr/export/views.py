@@ -120,9 +120,7 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
         model.write_binary(str(sparse))
         model.write_text(str(sparse))
         about = "".join(f"{name}: {text}\n" for name, text in notes.items())
-        (made / "README.txt").write_text(
-            f"{about}COLMAP's world is that frame; cameras are world to camera.\n"
-        )
+        (made / "README.txt").write_text(f"{about}The world is that frame; cameras are world to camera.\n")
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:

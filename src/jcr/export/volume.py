@@ -79,10 +79,8 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
 
 def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
     """Write arrays and notes as .npz; an interrupted write leaves no partial file."""
-    with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(
-            stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()}
-        )
+    with written_whole(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()})
 
 
 def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:

@@ -238,9 +238,7 @@ def without_commands(lines: Iterable[str], press: Callable[[Action, int | None],
     """
     for line in lines:
         first, *rest = line.split() or [""]
-        found = [
-            action for action in get_args(Action) if len(first) >= 3 and action.startswith(first.lower())
-        ]
+        found = [one for one in get_args(Action) if len(first) >= 3 and one.startswith(first.lower())]
         most = any(action in WITH_NUMBER for action in found)
         if len(found) == 1 and len(rest) <= most and all(word.isdecimal() for word in rest):
             press(found[0], int(rest[0]) if rest else None)

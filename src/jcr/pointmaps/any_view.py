@@ -83,7 +83,7 @@ def reconstruct_any_view(
 def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
     """Return images (RGB, 0 to 255) as a tensor (n,3,h,w), normalised by mean and deviation of ImageNet's colours."""
     mean, deviation = (
-        torch.tensor(values, device=device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
+        torch.tensor(rgb, device=device)[:, None, None] for rgb in (IMAGENET_MEAN, IMAGENET_STD)
     )
     unit_range = torch.from_numpy(np.array(colors)).to(device).permute(0, 3, 1, 2) / 255
     return (unit_range - mean) / deviation

@@ -121,9 +121,7 @@ def scene_data(
         "views": views,
         "others": [],
         "bases": [],
-        "next": [
-            {"gripper": _rows(pose), "camera": _rows(pose @ gripper_from_camera)} for pose in next_poses
-        ],
+        "next": [{"gripper": _rows(one), "camera": _rows(one @ gripper_from_camera)} for one in next_poses],
         "intrinsics": asdict(intrinsics),
     }
 

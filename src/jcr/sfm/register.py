@@ -111,9 +111,7 @@ def registrations(
     feature = np.concatenate([mine for mine, _ in of_row])
     row = np.repeat(np.arange(len(of_row)), [len(mine) for mine, _ in of_row])
     theirs = list(zip(known.features, (rows for _, rows in of_row), strict=True))
-    rays, row_x_px = (
-        np.concatenate([getattr(one, of)[rows] for one, rows in theirs]) for of in ("rays", "x_px")
-    )
+    rays, row_x_px = (np.concatenate([getattr(k, of)[own] for k, own in theirs]) for of in ("rays", "x_px"))
     points, spread, good = triangulated_features(
         feature, row, rays, known.recon_from_camera, GATE_PX / known.camera.fx, len(new.rays)
     )

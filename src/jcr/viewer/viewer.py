@@ -259,10 +259,8 @@ class Viewer:
         with gui.add_folder("Sphere to drag", expand_by_default=False):
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
             self.answer = gui.add_markdown("")
-        start = np.array([*_middle(self._solid)[:2], table_m + 0.15])
-        self.gizmo = scene.add_transform_controls(
-            "/sphere", scale=0.12, disable_rotations=True, position=start
-        )
+        at = np.array([*_middle(self._solid)[:2], table_m + 0.15])
+        self.gizmo = scene.add_transform_controls("/sphere", scale=0.12, disable_rotations=True, position=at)
         self.ball = scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
         for control in (self.slice_of, self.slice_at, self.unknown):
             control.on_update(lambda _: self.show_slice())

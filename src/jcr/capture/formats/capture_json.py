@@ -147,9 +147,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
     elif capture.camera_name in entries:
         raise InputError(f"{where}: camera {capture.camera_name} is the frames' own; rename the other")
     used = [True] * len(capture) if used is None else used
-    others = [
-        _camera(name, entry, capture, f"{where}: camera {name}", used) for name, entry in entries.items()
-    ]
+    others = [_camera(name, one, capture, f"{where}: camera {name}", used) for name, one in entries.items()]
     return replace(capture, others=tuple(others))
 
 

@@ -113,9 +113,7 @@ def read_intrinsics(folder: Path, size: tuple[int, int], names: Collection[str] 
     model = read_model(folder)
     images = [model.image(k) for k in model.reg_image_ids()]
     cameras = [model.camera(one.camera_id) for one in images if names is None or one.name in names]
-    kinds = {
-        (one.model.name, one.params_info, one.width, one.height, *map(float, one.params)) for one in cameras
-    }
+    kinds = {(c.model.name, c.params_info, c.width, c.height, *map(float, c.params)) for c in cameras}
     if len(kinds) != 1:
         raise InputError(
             f"{folder}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"

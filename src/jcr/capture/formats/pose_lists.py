@@ -55,9 +55,7 @@ def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[st
     first = cells[0]
     if isinstance(first, list):
         return None, [row if isinstance(row, list) else [] for row in cells]
-    return list(first), [
-        [row.get(name, "") if isinstance(row, dict) else "" for name in first] for row in cells
-    ]
+    return list(first), [[row.get(k, "") if isinstance(row, dict) else "" for k in first] for row in cells]
 
 
 def _entries(content: Any) -> list[Any]:

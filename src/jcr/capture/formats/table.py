@@ -118,9 +118,7 @@ def pose_table(
         if len(row) != width:
             raise InputError(f"{where}: row {number} has {len(row)} columns, not {width}; correct it")
     cells, units, convention = _named_columns(header, rows, options, where)
-    image, stamp = (
-        next((cells[name] for name in names if name in cells), None) for names in (_IMAGE, _STAMP)
-    )
+    image, stamp = (next((cells[one] for one in names if one in cells), None) for names in (_IMAGE, _STAMP))
     require_frames(0 if image is None else len(image), where, 0)
     wanted = CONVENTIONS[convention].columns
     if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(cells):

@@ -91,9 +91,7 @@ def predict_pairs(
     def encode(rows: Int[ndarray, " b"]) -> None:
         colors = torch.from_numpy(images.colors[rows]).to(network.device).permute(0, 3, 1, 2)
         tokens, grid = network.encode((colors / 255 - 0.5) / 0.5)
-        features.update(
-            (row, EncodedImages(own[None], grid)) for row, own in zip(rows.tolist(), tokens, strict=True)
-        )
+        features.update((k, EncodedImages(t[None], grid)) for k, t in zip(rows.tolist(), tokens, strict=True))
 
     def decode(rows: Int[ndarray, " b"]) -> None:
         first, second = (

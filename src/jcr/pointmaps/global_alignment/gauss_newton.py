@@ -148,9 +148,7 @@ def gauss_newton(
 
 def _residuals(images: list[ImageObservations], state: AlignmentState) -> list[Residuals]:
     """Return the residuals of each image at the poses, focal length, pair scales, pair errors and depths of `state`."""
-    return [
-        depth_residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
-    ]
+    return [depth_residuals(o, state, own) for o, own in zip(images, state.log_depth, strict=True)]
 
 
 def _least_squares(
