@@ -32,8 +32,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     added, owner = capture_json.read(folder), read_json(file).get(OWNER)
     if owner != str(capture.folder.resolve()):
         raise InputError(
-            f"{folder}: holds images added to the run of {shown(owner)}; choose another folder for this run, or "
-            f"remove {folder}"
+            f"{folder}: holds images added to the run of {shown(owner)}; choose another folder or remove it"
         )
     return added
 

@@ -55,8 +55,7 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
     if len(taken) != len(table.base_from_gripper):
         raise InputError(
             f"{file}: {len(table.base_from_gripper)} poses for {len(taken)} images in {folder} "
-            f"({taken[0]} … {taken[-1]}), and no column says which belongs to which; add a column image with "
-            "their names"
+            f"({taken[0]} … {taken[-1]}), and no column says which belongs to which; add a column image with their names"
         )
     how = f"rows paired with images in order of their names: {taken[0]} … {taken[-1]}"
     return taken, table.base_from_gripper, table.faults, (how,)

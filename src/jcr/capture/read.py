@@ -111,8 +111,7 @@ def format_of(path: Path, options: ReadOptions | None = None) -> str:
             "add a table of gripper poses with the columns image,x,y,z,qx,qy,qz,qw (m), or name one with --poses"
         )
     raise InputError(
-        f"{path}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); "
-        "see jcr docs captures"
+        f"{path}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); see jcr docs captures"
     )
 
 

@@ -153,8 +153,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
                 length = int.from_bytes(head) if len(head) == 4 else 0
                 if length not in UR_TOOL:
                     raise InputError(
-                        f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or "
-                        "30013"
+                        f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or 30013"
                     )
                 if len(packet := head + stream.read(length - 4)) < length:
                     break
@@ -211,8 +210,7 @@ def xarm_states(host: str) -> Iterator[RobotState]:
             wrong, angles = arm.get_servo_angle(is_radian=True)
             if code or wrong:
                 raise InputError(
-                    f"{where}: the arm answers with code {code or wrong}; look at UFACTORY Studio what it reports; "
-                    "the same command resumes"
+                    f"{where}: the arm answers with code {code or wrong}; see UFACTORY Studio; the same command resumes"
                 )
             (base_from_gripper,) = poses_from_numbers(np.array([pose]), "xarm-axis-angle", "mm-rad", where)
             joints = np.array(angles[: arm.axis], dtype=np.float64)

@@ -114,8 +114,7 @@ class LiveServer(ThreadingHTTPServer):
         while not self.session.state.is_over:
             if time.monotonic() - self.sampled_s > timeout_s:
                 raise InputError(
-                    f"--poses http: no sample for {timeout_s:.0f} s; the images taken are kept and the same command "
-                    "resumes"
+                    f"--poses http: no sample for {timeout_s:.0f} s; the images are kept and the same command resumes"
                 )
             time.sleep(0.1)
 

@@ -47,8 +47,7 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
         maps = _posed_pointmaps(arrays, np.argsort(rows), images.grid, source)
     else:
         raise InputError(
-            f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
-            "see jcr docs predictions"
+            f"{source}: holds neither 'edges' nor 'recon_from_camera' of pointmaps; see jcr docs predictions"
         )
     return reconstruct_pointmaps(capture, images, maps, "predictions", progress, np.sort(rows))
 

@@ -65,8 +65,7 @@ def load_sam(weights: str) -> "Sam2Model":
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"--sam-weights {weights}: cannot be loaded ({reason}); the folder must hold config.json and "
-            "model.safetensors"
+            f"--sam-weights {weights}: cannot be loaded ({reason}); it must hold config.json and model.safetensors"
         ) from None
     finally:
         if bars:

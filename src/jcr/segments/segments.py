@@ -82,8 +82,7 @@ def image_labels(
         labels = read_labels(capture, reconstruction)
         if labels is None and options.segments == "labels":
             raise InputError(
-                f"{capture.folder / 'labels'}: holds no PNG; put labels/NAME.png there for every image, "
-                "or choose --segments tabletop"
+                f"{capture.folder / 'labels'}: holds no PNG; give NAME.png for each image, or choose --segments tabletop"
             )
         return labels
     if options.segments == "sam":

@@ -85,8 +85,7 @@ def global_align(
     if part.any():
         names = ", ".join(predictions.names[k] for k in np.flatnonzero(part != part[edges[0, 0]]))
         raise InputError(
-            f"no chain of pairs joins {names} to the other images; predict pairs between them, "
-            "or leave these images out"
+            f"no chain of pairs joins {names} to the other images; predict pairs between them, or leave these out"
         )
     problem = AlignmentProblem.of(predictions)
     return _dense_alignment(problem, solve(problem, pixels), progress or silent)
