@@ -93,9 +93,7 @@ def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
     assert is_made({})
 
 
-def test_a_recording_is_not_extracted_into_a_folder_where_another_process_writes(
-    tmp_path: Path, captures: list[Path]
-):
+def test_a_recording_is_not_extracted_where_another_process_writes(tmp_path: Path, captures: list[Path]):
     with module.locked(tmp_path):
         row = run_one(captures[0], tmp_path, RunOptions(map=None), ReadOptions())
     assert row.status == "failed" and "another jcr is writing there" in row.reason
@@ -113,9 +111,7 @@ def test_a_process_that_dies_takes_no_other_capture_with_it_and_names_are_kept_a
     assert {Path(row.out).name for row in rows} == {"one", "bad", "two", "two-2", "two-2-2"}
 
 
-def test_the_episode_whose_camera_moved_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_done: Path
-):
+def test_a_moved_episode_camera_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_done: Path):
     monkeypatch.setattr(module, "run_one", copies_a_run)
     read = ReadOptions(episode=(0, 1, 2))
     rows = batch([small_done], tmp_path / "out", RunOptions(), COMPLETE, read=read)

@@ -70,9 +70,7 @@ def truly_touches(joint_values: np.ndarray, true_mesh: "trimesh.Trimesh") -> np.
     return np.array(touches)
 
 
-def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
-    done: Path, true_mesh: "trimesh.Trimesh"
-):
+def test_ompl_plans_an_arm_past_mapped_things_without_touching_them(done: Path, true_mesh: "trimesh.Trimesh"):
     pytest.importorskip("ompl", reason="needs ompl: pip install 'jcr-handeye[planning]'")
     planner = example("05_plan_with_ompl")
     planner.util.RNG.setSeed(1)

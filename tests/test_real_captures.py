@@ -19,9 +19,7 @@ from scenes import center_errors, reference_of
     ("name", "max_mm", "max_deg", "count"),
     [pytest.param("franka_wood_table", 4.0, 0.5, 12, marks=pytest.mark.long), ("doosan_bench", 5.0, 0.7, 15)],
 )
-def test_within_reach_of_the_marker_reference(
-    real_captures: Path, name: str, max_mm: float, max_deg: float, count: int
-):
+def test_near_the_marker_reference(real_captures: Path, name: str, max_mm: float, max_deg: float, count: int):
     """And the cameras follow the gripper."""
     capture = jcr.read_capture(real_captures / name)
     found = reconstruct_colmap(capture)
@@ -62,9 +60,7 @@ def test_a_plain_background_is_rejected(real_captures: Path):
 @pytest.mark.parametrize(
     ("name", "least"), [("elephant_floor", 15), pytest.param("ur_black_cloth", 18, marks=pytest.mark.long)]
 )
-def test_another_first_pair_is_tried_where_the_first_bends_unknown_intrinsics(
-    real_captures: Path, name: str, least: int
-):
+def test_another_pair_is_tried_where_the_first_bends_intrinsics(real_captures: Path, name: str, least: int):
     """Three images of the first register in one model alone, four of the second by the strict thresholds alone."""
     capture = jcr.read_capture(real_captures / name)
     assert capture.intrinsics is None

@@ -41,9 +41,7 @@ def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_ali
     assert candidates(ReconstructOptions(backend="colmap")) == ("colmap",)
 
 
-def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_weights_the_command_to_get_them_is_named(present: set[str], monkeypatch: pytest.MonkeyPatch):
     capture = capture_of(np.eye(4)[None])
     for installed, words in (
         (
@@ -83,9 +81,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
     ],
 )  # fmt: skip
-def test_what_a_back_end_does_not_use_is_refused_in_a_line(
-    options: ReconstructOptions, words: str, present: set[str]
-) -> None:
+def test_what_a_back_end_does_not_use_is_refused(options: ReconstructOptions, words: str, present: set[str]):
     with pytest.raises(InputError, match=words) as caught:
         candidates(options)
     assert "\n" not in str(caught.value)
@@ -183,9 +179,7 @@ def auto_result(
 
 
 @pytest.mark.slow
-def test_a_second_one_runs_only_when_the_first_is_rejected(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_second_one_runs_only_if_the_first_is_rejected(present: set[str], monkeypatch: pytest.MonkeyPatch):
     present.add("mast3r")
     rng = np.random.default_rng(0)
     problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, 5e-4))
@@ -212,9 +206,7 @@ def test_a_second_one_runs_only_when_the_first_is_rejected(
         auto_result(problem, {"colmap": nothing, "mast3r": damaged, "direct": nothing}, monkeypatch)
 
 
-def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_of_two_rejected_the_one_that_shows_a_cause_stays(present: set[str], monkeypatch: pytest.MonkeyPatch):
     """Whatever its leave-one-out error, which a cause makes large."""
     present.add("mast3r")
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
@@ -243,7 +235,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
 
 
 @pytest.mark.slow
-def test_of_two_that_are_rejected_the_smaller_leave_one_out_error_is_kept(
+def test_of_two_rejected_the_least_leave_one_out_error_stays(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
     present.add("dust3r")
@@ -264,9 +256,7 @@ def test_of_two_that_are_rejected_the_smaller_leave_one_out_error_is_kept(
 
 
 @pytest.mark.slow
-def test_what_plenty_of_features_reject_colours_do_not_accept(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_what_many_features_reject_colours_do_not_accept(present: set[str], monkeypatch: pytest.MonkeyPatch):
     """Direct alignment tests no camera: a stronger fault, which features reject, would get the less honest answer."""
     present |= {"xfeat", "da3"}
     monkeypatch.setattr(selection, "TEXTURED", 10)

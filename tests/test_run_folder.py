@@ -93,9 +93,7 @@ FILES = [("run.json", STATES), ("calibration.json", CALIBRATIONS)]
         pytest.param(name, length, id=f"{name} cut to {length}") for name, _ in FILES for length in (0, 1, 40)
     ],
 )
-def test_an_edited_or_cut_file_is_refused_in_one_line(
-    sound: Path, tmp_path: Path, name: str, change: Change | int, capsys
-):
+def test_edited_or_cut_files_refused(sound: Path, tmp_path: Path, name: str, change: Change | int, capsys):
     out, made = shutil.copytree(sound, tmp_path / "out"), tmp_path / "made.xml"
     text = (out / name).read_text()
     if isinstance(change, int):
@@ -162,9 +160,7 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
 
 
 @pytest.mark.slow
-def test_a_capture_whose_images_changed_is_not_read_with_the_run_of_the_earlier_ones(
-    small_capture: Path, small_done: Path
-):
+def test_a_capture_with_changed_images_is_not_read_with_an_earlier_run(small_capture: Path, small_done: Path):
     capture = read_capture(small_capture)
     assert len(RunResult(small_done, capture=capture).of_wrist_camera()[1]) == 5
     for rows in ([1, 0, 2, 3, 4], [0, 1, 2, 3]):

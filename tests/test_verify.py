@@ -159,9 +159,7 @@ def test_the_command_is_content_with_what_has_not_moved(out: Path, capture: Capt
     assert capsys.readouterr().out.startswith("ACCEPTED: no drift is detected")
 
 
-def test_images_of_the_calibration_are_refused_by_their_content(
-    out: Path, capture: Capture, tmp_path: Path, capsys
-):
+def test_images_of_a_calibration_are_refused_by_content(out: Path, capture: Capture, tmp_path: Path, capsys):
     today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10, 3])
     old = today.folder / capture.images[3]
     old.rename(old.with_name("fresh.jpg"))
@@ -200,9 +198,7 @@ def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, 
     assert "no such capture" in capsys.readouterr().err
 
 
-def test_a_new_image_of_a_fixed_camera_shows_whether_it_rotated(
-    out: Path, capture: Capture, tmp_path: Path, capsys
-):
+def test_a_new_image_of_a_fixed_camera_shows_rotation(out: Path, capture: Capture, tmp_path: Path, capsys):
     """A rotation about the camera's own centre moves pixels by a homography, whatever the scene."""
     run = tmp_path / "out"
     shutil.copytree(out, run)

@@ -68,9 +68,7 @@ def test_a_capture_is_calibrated_and_reported_as_with_torch(calibrated: Path, sm
     assert json.loads(compared.stdout)["translation_mm"] < 1e-3
 
 
-def test_what_needs_torch_shows_what_to_install_before_any_work(
-    small_capture: Path, calibrated: Path, tmp_path: Path
-):
+def test_what_needs_torch_shows_what_to_install_first(small_capture: Path, calibrated: Path, tmp_path: Path):
     mapped = tmp_path / "mapped"
     shutil.copytree(calibrated, mapped)
     (mapped / "map.safetensors").write_bytes(b"")

@@ -175,9 +175,7 @@ def test_corners_are_tracks_of_a_board_and_survive_the_file(monkeypatch: pytest.
     assert np.array_equal(again.on_board, made.tracks.on_board) and found.tracks.boards is None
 
 
-def test_a_board_that_was_moved_is_used_where_most_images_show_it_and_the_others_are_named(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_a_moved_board_is_used_where_most_images_show_it_the_others_named(monkeypatch: pytest.MonkeyPatch):
     capture, made, _ = with_board(monkeypatch, [0] * 6 + [1] * 3)
     boards = made.tracks.boards
     assert boards is not None and boards.elsewhere == (6, 7, 8)

@@ -104,9 +104,7 @@ def test_a_board_of_30_mm_given_for_one_of_25_rejects_the_calibration_in_one_lin
         (Sheet(bend_m=3e-3), FindingKind.BOARD_BENT),
     ],
 )
-def test_a_board_that_is_wrong_is_named_and_leaves_the_result_as_it_is_without(
-    sheet: Sheet, kind: FindingKind
-):
+def test_a_wrong_board_is_named_and_leaves_the_result_as_it_is_without(sheet: Sheet, kind: FindingKind):
     alone = calibrated_alone(1)
     hand_eye, x = calibrated(sheet, seed=1)
     named = of_kind(hand_eye, kind)

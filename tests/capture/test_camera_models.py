@@ -24,9 +24,7 @@ CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1
 
 
 @pytest.mark.parametrize("intrinsics", CAMERAS)
-def test_intrinsics_survive_capture_json_camera_info_and_calibration_json(
-    intrinsics: Intrinsics, tmp_path: Path
-):
+def test_intrinsics_survive_capture_json_camera_info_and_calibration(intrinsics: Intrinsics, tmp_path: Path):
     entry = IntrinsicsEntry.of(intrinsics).model_dump_json(exclude_unset=True)
     assert IntrinsicsEntry.model_validate_json(entry).record(SIZE, "here") == intrinsics
     mount = ros.CameraMount(

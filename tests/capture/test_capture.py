@@ -98,9 +98,7 @@ def test_images_are_rotated_as_their_exif_tag_says_with_a_note(capture: Path, or
 @pytest.mark.parametrize("ending", [".png", ".tif"])
 @pytest.mark.parametrize("bits", [8, 12, 16])
 @pytest.mark.parametrize("shape", [(64, 64), (64, 64, 3)])
-def test_the_bits_in_use_of_16_bit_images_are_read(
-    tmp_path: Path, ending: str, bits: int, shape: tuple[int, ...]
-):
+def test_used_bits_of_16_bit_images_are_read(tmp_path: Path, ending: str, bits: int, shape: tuple[int, ...]):
     """A defective pixel does not count. Pillow keeps the upper eight bits of coloured ones, which may be black."""
     ramp = np.arange(64, dtype=np.uint16) << 2
     deep = np.broadcast_to(ramp.reshape(1, 64, *[1] * (len(shape) - 2)) << (bits - 8), shape).copy()

@@ -68,18 +68,14 @@ WRITERS = writers.CORPUS | {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_images_and_poses_read_back_as_the_same_capture(
-    name: str, tmp_path: Path, capture: Capture, problem: HandEyeProblem
-):
+def test_formats_read_back_one_capture(name: str, tmp_path: Path, capture: Capture, problem: HandEyeProblem):
     WRITERS[name](tmp_path, capture)
     got = jcr.read_capture(tmp_path)
     assert_same(got, capture)
     assert_same_calibration(got.base_from_gripper, problem.recon_from_camera, problem)
 
 
-def test_cameras_that_were_given_read_back_with_their_capture(
-    tmp_path: Path, capture: Capture, problem: HandEyeProblem
-):
+def test_given_cameras_read_back_with_a_capture(tmp_path: Path, capture: Capture, problem: HandEyeProblem):
     path = writers.write_colmap(tmp_path, capture, problem.recon_from_camera)
     assert format_of(path) == "colmap"
     got = jcr.read_capture(path)
@@ -252,9 +248,7 @@ def test_poses_are_interpolated_at_nanosecond_stamps(tmp_path: Path, capture: Ca
     assert np.allclose(got.base_from_gripper[:, 0, 3] - capture.base_from_gripper[:3, 0, 3], 0.075, atol=1e-9)
 
 
-def test_an_image_without_a_pose_near_its_time_and_a_damaged_sample_are_left_out(
-    tmp_path: Path, capture: Capture
-):
+def test_an_image_without_a_near_pose_and_a_damaged_sample_are_left_out(tmp_path: Path, capture: Capture):
     writers.write_tum(tmp_path, capture)
     file = tmp_path / "poses.txt"
     lines = file.read_text().splitlines()
@@ -364,9 +358,7 @@ def test_faults_of_tables_are_named(fault: str, tmp_path: Path, written: Path):
 
 
 @pytest.mark.parametrize("fault", ROW_FAULTS)
-def test_a_row_that_holds_no_pose_is_left_out_with_its_reason(
-    fault: str, tmp_path: Path, written: Path, capture: Capture
-):
+def test_a_row_without_pose_is_left_out_named(fault: str, tmp_path: Path, written: Path, capture: Capture):
     row, spoil, words = ROW_FAULTS[fault]
     folder = shutil.copytree(written, tmp_path / "table")
     spoil(folder / "poses.csv")
@@ -381,9 +373,7 @@ UR_ROWS = ["{k}.png, p[{numbers}]", "{k}.png; p [{numbers}]", '{k}.png\t"p[{numb
 
 @pytest.mark.parametrize("row", UR_ROWS)
 @pytest.mark.parametrize("header", ["", "image,pose\n", "# copied from the log\n"])
-def test_ur_poses_are_read_as_urscript_writes_them(
-    tmp_path: Path, problem: HandEyeProblem, row: str, header: str
-):
+def test_ur_poses_are_read_as_in_urscript(tmp_path: Path, problem: HandEyeProblem, row: str, header: str):
     rows = writers.rows_as("ur", problem.base_from_gripper)
     lines = [row.format(k=k, numbers=", ".join(map(repr, line))) for k, line in enumerate(rows.tolist())]
     got = table_of(tmp_path, header + "\n".join(lines))

@@ -298,9 +298,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
         ),
     ],
 )
-def test_cameras_that_cannot_be_are_refused_in_one_line(
-    folder: Path, camera: dict[str, object], message: str
-):
+def test_impossible_cameras_are_refused_in_one_line(folder: Path, camera: dict[str, object], message: str):
     (folder / "capture.json").write_text(json.dumps(content(overhead=camera)))
     with pytest.raises(jcr.InputError, match=message) as refusal:
         read(folder)

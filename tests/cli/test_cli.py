@@ -52,9 +52,7 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
     return {name: list(map(str, line)) for name, line in lines.items()}
 
 
-def test_json_is_one_object_and_quiet_is_silence(
-    commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str]
-):
+def test_json_is_one_object_quiet_silence(commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str]):
     for name, line in commands.items():
         assert dispatch([*line, "--quiet", "--json"]) == 0, name
         printed = capsys.readouterr()
@@ -218,9 +216,7 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert content["requirement"]["more_images"] == 0 and content["next_poses"] == []
 
 
-def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(
-    small_capture: Path, small_done: Path, tmp_path: Path
-):
+def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture: Path, small_done: Path, tmp_path: Path):
     capture, stages = jcr.read_capture(small_capture), list[str]()
     shutil.copytree(small_done, tmp_path / "whole")
     jcr.calibrate(capture, tmp_path / "out")

@@ -113,9 +113,7 @@ def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None)
     return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
 
 
-def test_memory_that_ends_in_a_worker_thread_ends_the_stage(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_that_ends_in_a_worker_thread_ends_the_stage(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     """The buffers of the threads are fewer than the images: one that is not returned blocks the stage for ever."""
 
     def exhausted(*arguments: object) -> None:
@@ -200,9 +198,7 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: Pointmaps) 
     assert np.median(np.abs(other.depth_std[both] / scale / dense.depth_std[both] - 1)) < 1e-2
 
 
-def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
-    scene: Scene, dense: Pointmaps, tmp_path: Path
-) -> None:
+def test_the_stage_estimates_depth_in_any_order_of_the_frames(scene: Scene, dense: Pointmaps, tmp_path: Path):
     """Of images whose names sort otherwise than the capture's frames; and what has pointmaps is left as it is."""
     order = np.array([3, 0, 6, 1, 5, 2, 4])  # row k of the capture is row order[k] by name
     names = tuple(f"{k}.png" for k in order)

@@ -227,9 +227,7 @@ def views(tmp_path: Path) -> "PosedImages":
 
 
 @pytest.mark.parametrize(("undistorted", "read"), [(False, "read_binary"), (True, "read_text")])
-def test_colmap_model_reprojects_its_points_exactly(
-    views: "PosedImages", undistorted: bool, read: str, tmp_path: Path
-):
+def test_colmap_model_reprojects_points(views: "PosedImages", undistorted: bool, read: str, tmp_path: Path):
     from jcr.export.views import write_colmap
 
     out = tmp_path / "model"
@@ -254,9 +252,7 @@ def test_colmap_model_reprojects_its_points_exactly(
 
 
 @pytest.mark.parametrize("undistorted", [False, True])
-def test_nerfstudio_cameras_see_the_points_where_the_images_do(
-    views: "PosedImages", undistorted: bool, tmp_path: Path
-):
+def test_nerfstudio_cameras_see_points_as_images_do(views: "PosedImages", undistorted: bool, tmp_path: Path):
     from jcr.export.views import write_nerfstudio
 
     out = tmp_path / "splat"
@@ -305,9 +301,7 @@ def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
     assert "comment frame arm_base" in header and "comment unit m" in header
 
 
-def test_mesh_lies_on_the_true_surface_and_faces_free_space(
-    done: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path
-):
+def test_mesh_lies_on_the_surface_faces_outward(done: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path):
     loaded = trimesh.load_scene(export(done, "glb", tmp_path / "map.glb"))
     assert loaded.metadata["frame"] == "base_link" and loaded.metadata["unit"] == "m"
     mesh = loaded.to_geometry()
@@ -327,9 +321,7 @@ def test_mesh_lies_on_the_true_surface_and_faces_free_space(
     assert np.median(off[near < 0.003]) < 12
 
 
-def test_octomap_tells_free_from_occupied_from_unknown(
-    done: Path, scene: "SceneMap", tabletop: Path, tmp_path: Path
-):
+def test_octomap_has_free_occupied_and_unknown(done: Path, scene: "SceneMap", tabletop: Path, tmp_path: Path):
     import pyoctomap
 
     from jcr.scene.scene_map import FREE, OCCUPIED
@@ -355,9 +347,7 @@ def test_octomap_tells_free_from_occupied_from_unknown(
 
 
 @pytest.mark.parametrize("unknown", ["occupied", "free"])
-def test_esdf_voxels_hold_the_distance_at_their_centres(
-    done: Path, scene: "SceneMap", unknown: str, tmp_path: Path
-):
+def test_esdf_voxels_hold_distances_at_centres(done: Path, scene: "SceneMap", unknown: str, tmp_path: Path):
     path = export(done, "esdf", tmp_path / "esdf.npz", "--unknown", unknown, "--voxel-size", 0.015)
     with np.load(path) as file:
         grid = {name: file[name] for name in file.files}
@@ -389,9 +379,7 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMa
     assert distance[covered].max() < 0.025
 
 
-def test_command_gives_the_root_link_asked_for(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_command_gives_the_asked_root_link(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     # Looking forward (x of the root), the optical frame has z there, x to the right (-y) and y down (-z).
     np.testing.assert_array_equal(ros.ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     gripper_from_camera = np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"])

@@ -165,9 +165,7 @@ def test_each_fault_ends_in_one_line_and_harms_nothing(
 
 
 @pytest.mark.parametrize("name", ["reconstruction.npz", "depth.npz"])
-def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(
-    tmp_path: Path, small_done: Path, name: str, capsys
-):
+def test_a_damaged_reconstruction_is_named_others_stay(tmp_path: Path, small_done: Path, name: str, capsys):
     copy = tmp_path / "done"
     shutil.copytree(small_done, copy)
     cut(copy / name)

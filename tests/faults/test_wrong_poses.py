@@ -109,9 +109,7 @@ def faultless() -> tuple[Capture, Reconstruction]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CONTRADICT.values(), ids=CONTRADICT)
-def test_poses_that_contradict_simulated_images_lead(
-    faultless: tuple[Capture, Reconstruction], change: Change
-):
+def test_poses_that_contradict_drawn_images_lead(faultless: tuple[Capture, Reconstruction], change: Change):
     capture, made = faultless
     said, _ = first_kinds(with_poses(capture, change(capture.base_from_gripper)), made)
     assert said[0] in OF_POSES

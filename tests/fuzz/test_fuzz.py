@@ -275,7 +275,5 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
         ("added/capture.json", ("added_to",), "a\0b"),
     ],
 )
-def test_what_further_values_found_stays_closed(
-    targets: dict[str, Target], name: str, place: Place, value: object
-):
+def test_what_values_found_stays_closed(targets: dict[str, Target], name: str, place: Place, value: object):
     assert tried(targets[name], place, value)[0] == "refused"

@@ -102,9 +102,7 @@ def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_th
 
 
 @pytest.mark.slow
-def test_a_place_that_shows_what_another_does_is_not_proposed_again(
-    resumed: LiveCalibration, capture: Capture
-):
+def test_a_place_that_shows_what_another_does_is_not_proposed(resumed: LiveCalibration, capture: Capture):
     places = []
     for _ in range(3):
         pose = resumed.progress.next_pose
@@ -224,9 +222,7 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
         assert [file.name for file in (live.live.folder / "images").iterdir()] == ["000.png"]
 
 
-def test_grey_and_bgr_images_are_converted_lists_are_poses_and_all_images_may_be_removed(
-    tmp_path: Path, tabletop: Path
-):
+def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tmp_path: Path, tabletop: Path):
     image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
     grey = np.asarray(cv2.cvtColor(still(tabletop, 1), cv2.COLOR_RGB2GRAY), np.uint8)
     with closing(LiveCalibration(tmp_path / "capture")) as live:

@@ -103,9 +103,7 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         )
 
 
-def test_the_page_says_when_the_requirement_is_met_and_stops_proposing(
-    capture: tuple[LiveSession, Scripted], tabletop: Path
-):
+def test_the_page_shows_a_met_requirement_and_no_pose(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, scripted = capture
     poses = jcr.read_capture(tabletop).base_from_gripper
     proposed = NextPose(
@@ -128,9 +126,7 @@ def test_the_page_says_when_the_requirement_is_met_and_stops_proposing(
             assert bool(json.loads(shown["scene"])["next"]) is not is_met
 
 
-def test_the_server_answers_until_the_page_has_the_result_and_its_report(
-    capture: tuple[LiveSession, Scripted], tabletop: Path
-):
+def test_the_server_serves_until_the_report_is_sent(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, scripted = capture
     add(live, scripted, tabletop, 5)
     scripted.warns = True
@@ -212,9 +208,7 @@ def test_the_camera_now_is_shown_with_its_features(capture: tuple[LiveSession, S
 
 
 @pytest.mark.slow
-def test_the_buttons_take_retake_remove_undo_and_finish_on_a_phone(
-    chromium: Chromium, tmp_path: Path, tabletop: Path
-):
+def test_buttons_take_retake_remove_undo_end_on_a_phone(chromium: Chromium, tmp_path: Path, tabletop: Path):
     poses, at = jcr.read_capture(tabletop).base_from_gripper, [0]
     live, scripted = a_capture(
         tmp_path / ("a-long-name-of-a-folder-without-any-space" * 3),

@@ -139,9 +139,7 @@ def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tab
     assert "moved" in answer["reason"] and not (tmp_path / "c" / "capture.json").exists()
 
 
-def test_a_full_disk_refuses_the_image_and_the_capture_goes_on(
-    tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_full_disk_refuses_the_image_alone(tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch):
     taken = Stepped(tmp_path / "c", tabletop)
     full = OSError(errno.ENOSPC, "No space left on device")
     real, files = LiveFolder._write, []
@@ -220,9 +218,7 @@ def close_to(image: ndarray, other: ndarray) -> bool:
     return bool(np.abs(image.astype(float) - other).mean() < 4)
 
 
-def test_each_pose_gets_the_image_that_was_still_there_and_a_stopped_capture_is_resumed(
-    tmp_path: Path, tabletop: Path
-):
+def test_each_pose_gets_the_image_still_there_and_a_stopped_capture_resumes(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     first = taken(tmp_path / "c", video(tmp_path / "a.avi", tabletop, range(3)), pose[:3])
     assert [answer["image"] for answer in first] == [f"images/00{k}.png" for k in range(3)]

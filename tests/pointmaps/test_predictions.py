@@ -164,9 +164,7 @@ def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> 
 
 
 @pytest.mark.slow
-def test_a_network_gives_the_same_record(
-    capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_gives_a_record(capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch):
     """The dust3r back end around synthetic predictions on the grid it prepared."""
     from jcr.pointmaps.dust3r import dust3r
 

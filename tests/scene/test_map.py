@@ -475,9 +475,7 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
             load_robot(broken)
 
 
-def test_the_page_on_the_map_runs_as_printed(
-    scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_manual_of_maps_runs(scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     page = (ROOT / "docs" / "how-to" / "map.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.S)
     assert len(blocks) == 4

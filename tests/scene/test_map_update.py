@@ -138,9 +138,7 @@ def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
     return x @ thing.base_from_box[:3, :3].T + thing.base_from_box[:3, 3]
 
 
-def test_a_thing_that_was_taken_away_leaves_the_map(
-    truth: Truth, capture: Capture, whole: list[View], tmp_path: Path
-):
+def test_a_thing_taken_away_leaves_the_map(truth: Truth, capture: Capture, whole: list[View], tmp_path: Path):
     before, hand_eye = known_reconstruction(truth, whole[:6])
     places = np.concatenate([beside(truth, 0, 2), beside(truth, 4, 2)])
     new = added_views(tmp_path, truth, capture, scene_of(truth, without="toolbox"), places)

@@ -238,9 +238,7 @@ def test_label_images_are_read_where_the_pointmap_looks_through_the_distortion(t
         (b"no picture", "no label image"),
     ],
 )
-def test_label_images_that_cannot_be_used_are_named(
-    tmp_path: Path, label: ndarray | bytes | None, words: str
-):
+def test_unusable_label_images_are_named(tmp_path: Path, label: ndarray | bytes | None, words: str):
     capture, reconstruction = labelled_capture(tmp_path)
     write_label(tmp_path, "a", np.ones((60, 80), np.uint8))
     if isinstance(label, bytes):

@@ -197,9 +197,7 @@ def off_mm(capture: Capture, found: LiveMap) -> float:
     return 1e3 * float(center_errors(capture, made).max())
 
 
-def test_images_that_come_leave_and_come_back_are_matched_once(
-    tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_images_that_leave_and_come_back_are_matched_once(tabletop: Path, monkeypatch: pytest.MonkeyPatch):
     whole, matched = jcr.read_capture(tabletop), list[int]()
     real = sift.matches
     monkeypatch.setattr(sift, "matches", lambda *of: (matched.append(1), real(*of))[1])

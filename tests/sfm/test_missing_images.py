@@ -136,9 +136,7 @@ def off_mm(table: PointsOfATable, model: pycolmap.Reconstruction) -> float:
     return 1e3 * float(np.sqrt(((scale * own - centres) ** 2).sum(1).mean()))
 
 
-def test_missing_images_are_added_from_the_map_s_own_x(
-    tmp_path: Path, table: PointsOfATable, matched: MatchedPairs
-):
+def test_missing_images_are_added_by_the_map_x(tmp_path: Path, table: PointsOfATable, matched: MatchedPairs):
     database, model = begun(tmp_path, table, matched, (4, 11, 12, 29))
     reported = table.base_from_gripper.copy()
     reported[11] = reported[25]  # a stale pose
@@ -147,9 +145,7 @@ def test_missing_images_are_added_from_the_map_s_own_x(
     assert off_mm(table, whole) < 1.0
 
 
-def test_images_that_nothing_ties_to_the_map_stay_out(
-    tmp_path: Path, table: PointsOfATable, matched: MatchedPairs
-):
+def test_images_not_tied_to_the_map_stay_out(tmp_path: Path, table: PointsOfATable, matched: MatchedPairs):
     """Twenty images and ten others, without a common match: gripper poses alone would hold them together."""
     apart = {key: one for key, one in matched.geometries.items() if (key[0] < 20) == (key[1] < 20)}
     database, model = begun(tmp_path, table, replace(matched, geometries=apart), tuple(range(20, 30)))

@@ -140,9 +140,7 @@ def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
         assert f"images/{row:02d}.jpg" in viewer._about_image.content
 
 
-def test_a_robot_without_joint_values_or_with_too_few_joints_is_refused(
-    capture: Capture, gantry: Path, tmp_path: Path
-):
+def test_a_robot_without_joint_values_or_joints_is_refused(capture: Capture, gantry: Path, tmp_path: Path):
     from jcr.viewer.viewer import read_robot
 
     robot, configurations = read_robot(gantry, replace(capture, joints=np.ones((12, 4))))
@@ -155,9 +153,7 @@ def test_a_robot_without_joint_values_or_with_too_few_joints_is_refused(
         read_robot(tmp_path / "none.urdf", capture)
 
 
-def test_command_serves_this_machine_alone_until_it_is_interrupted(
-    done: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_command_serves_this_machine_alone_until_interrupted(done: Path, monkeypatch: pytest.MonkeyPatch):
     """In this process, which another thread interrupts once it has asked from this machine and from outside."""
     printed, answers = io.StringIO(), []
 

@@ -88,9 +88,7 @@ def assert_same_output(network: "Dust3r", loaded: "Dust3r") -> None:
             torch.testing.assert_close(ours.points, theirs.points, rtol=1e-5, atol=1e-6)
 
 
-def test_a_folder_or_its_file_loads_to_the_same_network(
-    tmp_path: Path, network: "Dust3r", capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_or_file_is_a_network(tmp_path: Path, network: "Dust3r", capsys: pytest.CaptureFixture[str]):
     folder = write_folder(tmp_path / "folder", network)
     for source in (folder, folder / "model.safetensors", folder):
         loaded = load(source)
@@ -148,9 +146,7 @@ def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear:
     assert "size mismatch for enc_norm.weight" in complaint(folder)
 
 
-def test_a_network_runs_on_the_device_that_is_asked_for(
-    tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_runs_on_the_asked_device(tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     used: list[str] = []
 
     def load(weights: Weights, device: str) -> None:
@@ -165,9 +161,7 @@ def test_a_network_runs_on_the_device_that_is_asked_for(
     assert used == ["cpu", "cuda"]
 
 
-def test_a_hub_id_comes_from_the_cache(
-    tmp_path: Path, linear: "Dust3r", monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hub_id_comes_from_the_cache(tmp_path: Path, linear: "Dust3r", monkeypatch: pytest.MonkeyPatch):
     import huggingface_hub.constants
 
     from jcr.pointmaps.dust3r.dust3r import load_weights
@@ -224,9 +218,7 @@ def predicted(loaded: "Dust3r", images: PreparedImages) -> PairPredictions:
     return predict_pairs(loaded, images, NAMES, complete_pairs(4))[0]
 
 
-def test_each_pair_is_what_the_network_shows_of_its_two_images(
-    loaded: "Dust3r", images: PreparedImages
-) -> None:
+def test_each_pair_is_what_the_network_shows_of_its_two_images(loaded: "Dust3r", images: PreparedImages):
     import torch
 
     pairs = predicted(loaded, images)
