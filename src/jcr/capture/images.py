@@ -89,7 +89,7 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
     """
     deep = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if deep is None or deep.dtype != np.uint16:
-        raise InputError(f"{path}: pixels of fractions or over 16 bits; save it with 8 or 16 bits")
+        raise InputError(f"{path}: pixels are fractions or of more than 16 bits; save it with 8 or 16 bits")
     rank = -2 - deep.size // DEFECTIVE
     largest = int(np.partition(deep, rank, axis=None)[rank])
     bits = next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)

@@ -114,7 +114,7 @@ def read_json(file: Path) -> Any:
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # a number of thousands of digits
-        raise InputError(f"{file}: an invalid number or deep nesting ({error}); correct it") from None
+        raise InputError(f"{file}: an invalid number, or nested too deeply ({error}); correct it") from None
 
 
 def first_few(names: Sequence[str]) -> str:

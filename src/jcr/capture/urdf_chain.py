@@ -146,7 +146,7 @@ class RecordedArm:
         """Compute base_from_gripper (m) from recorded positions, in order of `joints`; raise InputError for degrees."""
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
-            raise InputError(f"joint angles up to {largest:.0f} rad; if degrees, add --pose-units m-deg")
+            raise InputError(f"angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg")
         poses = np.empty((len(positions), 4, 4))
         for pose, row in zip(poses, positions, strict=True):
             self.urdf.update_cfg(dict(zip(self.joints, row, strict=True)))

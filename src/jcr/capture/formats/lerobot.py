@@ -199,7 +199,7 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
             file = images[number].get("bytes") if isinstance(images[number], dict) else None
             if not file:
                 raise InputError(
-                    f"{episode.table}: holds no {key} of frame {number}; write the data set again with images"
+                    f"{episode.table}: holds no {key} of frame {number}; write the data set with embedded images"
                 )
             yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
 
