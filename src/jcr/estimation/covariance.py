@@ -28,6 +28,11 @@ from jcr.records import Budget
 
 COVERED = 0.99
 """Probability of the ellipsoid that the enlarged covariance must contain."""
+PRIOR_POSES = 6.0
+"""Weight of the prior second moment of a pose's systematic error, as a number of poses: the dimension of the error.
+
+Without this prior, the 95 % regions of eight poses of an arm with known joint angles contain 59 to 76 % of the errors.
+"""
 HALVINGS = 40
 """Number of bisections for the squared radius of that ellipsoid; relative error 1e-11."""
 
@@ -64,12 +69,14 @@ def posterior(
         second_moment = blocks_of_poses(part)
         if expected:
             return region.spread(second_moment)
-        # E[e eᵀ] of each pose's systematic error e, given the residuals of all poses.
+        # E[e eᵀ] of each pose's systematic error e, given the residuals of all poses, minus its prior value.
+        mean = (part @ solution.weighed_left[..., None]).reshape(*part.shape[:-2], -1, 6)
+        learned = mean[..., :, None] * mean[..., None, :]
         for sign, whitened in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
             columns = np.moveaxis(whitened.reshape(*whitened.shape[:-1], -1, 6), -2, -3)
-            second_moment = second_moment + sign * np.swapaxes(columns, -1, -2) @ columns
-        mean = (part @ solution.weighed_left[..., None]).reshape(*part.shape[:-2], -1, 6)
-        return region.spread(second_moment + mean[..., :, None] * mean[..., None, :])
+            learned = learned + sign * np.swapaxes(columns, -1, -2) @ columns
+        poses = learned.shape[-3]
+        return region.spread(second_moment + poses / (poses + PRIOR_POSES) * learned)
 
     found = over_sizes(equations, mode, information, density)
     groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
