@@ -63,11 +63,7 @@ def check_known_length(capture: Capture, known_length: LengthInImage | None) -> 
 def length_cue(
     capture: Capture, reconstruction: Reconstruction, known_length: LengthInImage
 ) -> tuple[float, float]:
-    """Return the scale (metres per recon unit) from a known length between two pixels, and its relative 1σ error.
-
-    The distance of both pixels' surface points in the recon frame comes from the pointmaps (`surface_at`). Raises
-    InputError if the image is not registered or a pixel has no depth.
-    """
+    """Return the scale (m per recon unit) by a known length between two pixels (`surface_at`), and its relative std."""
     image, *ends, length_mm = known_length
     first, second = (
         surface_at(capture, reconstruction, image, end, "--known-length")

@@ -405,8 +405,7 @@ class Calibration(Outcome):
 class FailedCalibration(Outcome):
     """Result for a capture that could not be reconstructed; its findings are the reasons.
 
-    Fields of a Calibration, such as `scale`, are None here and null in the file. Properties and methods of a
-    Calibration raise RejectedError.
+    Fields of a Calibration, such as `scale`, are None here, null in the file; its other attributes raise RejectedError.
     """
 
     @computed_field

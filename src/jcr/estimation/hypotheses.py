@@ -122,8 +122,7 @@ class Scores:
     def log_p(self, row: Row) -> float:
         """Return the natural log p-value of the score test of an effect: the chance of its gain without the effect.
 
-        The gain of `Row.both` minus that of `Row.beside`, over `dispersion` and the number of parameters, is tested by
-        an F distribution. The p-value is multiplied by `row.places`.
+        It is an F test of the gain of `both` over `beside` per parameter and `dispersion`, times `row.places`.
         """
         (without, fewer), (gain, more) = self.gain(row.beside), self.gain(row.both)
         d = max(more - fewer, 1)
@@ -242,8 +241,7 @@ class Adjustment:
     def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
         """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
 
-        An effect on the camera frees its directions. An effect on the poses adds errors whose parameters have the prior
-        standard deviation `Row.unit`. Raises LinAlgError if the problem becomes singular.
+        Camera effects free directions; pose effects add errors of prior std `Row.unit`. Raises LinAlgError if singular.
         """
         free, own = replace(self, rows=tuple(rows)), self.poses[1]
         errors = [row.unit * row.columns[own] for row in rows if not row.of_camera]
@@ -444,8 +442,7 @@ OfImage = Literal["focal", "shear", "x", "y"]
 def tested_intrinsics(model: Adjustment) -> list[str]:
     """Return the names of the camera's parameters that the test of FindingKind.INTRINSICS frees.
 
-    They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, as far as the camera has them. A given distortion coefficient is
-    not tested if its prior is at least as wide as in ESTIMATED: its value was not used.
+    They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, without given distortion that the prior of ESTIMATED ignores.
     """
     assert model.camera is not None
     prior, tested = model.solution.problem.cameras[model.camera], TESTED_IF_ESTIMATED
@@ -535,11 +532,7 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return directions (columns) in the e parameters of a camera (`Row`) that give each of p images a focal length.
-
-    The first column changes fx and fy by the same factor. The others change the logarithms of the images' focal lengths
-    by the columns of `differences`. `images` is p.
-    """
+    """Return directions in the e parameters (`Row`) for a focal length per image: a common one, then `differences`."""
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0

@@ -51,8 +51,7 @@ class PixelNoise:
     ) -> Float[ndarray, " k"]:
         """Return the weight (1/px²) of each of k observations: Cauchy weight of its residual over its variance.
 
-        The variance includes the inflation. `depth` is z of each observed point in the camera frame; points behind a
-        camera, or nearer than NEAREST of the median depth, have weight 0.
+        The variance is inflated. Points with z = `depth` below 0, or below NEAREST of the median depth, have weight 0.
         """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance

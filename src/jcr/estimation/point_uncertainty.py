@@ -63,8 +63,7 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
     """Return base-frame coordinates (m) and covariance (m²) of points at pixels with z = `depth_m` in the camera frame.
 
-    `x` is gripper_from_camera; `uncertainty` and `x_px` are those of `point_covariance`. `noise` adds the errors of the
-    gripper pose, for a pose in the workspace of the capture.
+    `x` is gripper_from_camera; `noise` adds gripper pose errors in the workspace; others as in `point_covariance`.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]

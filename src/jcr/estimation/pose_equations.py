@@ -52,8 +52,7 @@ LEAST_FREE = 0.4
 class Region:
     """Linear fit of the effective hand-eye transform to n pose errors (s = 6n numbers).
 
-    The effective transform is the gripper_from_camera X and base_from_recon Z that fit best in spite of systematic
-    robot errors; the scale is not fitted.
+    The effective X (gripper_from_camera) and Z (base_from_recon) fit best in spite of systematic errors; no scale.
     """
 
     by_unknown: Float[ndarray, "s u"]

@@ -126,8 +126,7 @@ def typical_camera(
 ) -> PredictedCamera:
     """Return the camera of a prediction before any images are matched, with typical image information.
 
-    `intrinsics` None: guessed from `size`, the (width, height) in px. `std` are standard deviations of given
-    `intrinsics` in the order of camera.parameters; None: MEASURED.
+    `intrinsics` None: guessed from `size` (width, height in px). `std` of `intrinsics` None: MEASURED.
     """
     camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))

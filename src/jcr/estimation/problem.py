@@ -262,8 +262,7 @@ class Problem:
     def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
         """Order, points and rigs of the r rows of the image equations after sorting by point and rig, and their index.
 
-        A row has two residuals. Before sorting, the rows are the observations, then two rows for each board corner; the
-        order holds their numbers before sorting.
+        A row has two residuals. The order holds numbers before sorting: observations, then two for each board corner.
         """
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
@@ -568,8 +567,7 @@ def step_to(
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
     """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation.
 
-    The seven columns are 1, 3 and 3 numbers; scale and rotation are about the world's origin. The rows of each rig are
-    translation, then rotation (geometry.retract).
+    The seven columns are about the world's origin; each rig has rows of translation, then rotation (geometry.retract).
     """
     position = world_from_rig[:, :3, 3]
     rigs = np.zeros((len(position), 6, 7))

@@ -309,8 +309,7 @@ def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
 def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
     """Estimate error sizes and step all unknowns, in at most ROUNDS rounds until both converge.
 
-    Return the state, the evidence of the images, whether the rounds converged, their number, and the largest last step
-    of an arm's unknown in standard deviations.
+    Return state, evidence of images, whether it converged, number of rounds, last step (σ) of an arm's unknown.
     """
     state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
     ends, steps = list[ndarray](), list[ndarray]()

@@ -80,7 +80,7 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run those of the named stages that the run needs; return the result with outputs and times (s) of each."""
+    """Run those of the named stages that the run needs; return the result with their outputs and times (s)."""
     unneeded = set() if result.others else {"cameras"}
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):

@@ -159,8 +159,7 @@ def check_effects(case: Case) -> Case:
 def of_case(case: Case) -> Adjustment:
     """Return the case's adjustment in the form that the tests of effects need (hypotheses.Adjustment).
 
-    A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
-    a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
+    With too many points (MOST_POINTS) or bytes (MOST_BYTES), a case is adjusted again with a random subset of points.
     """
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
@@ -433,8 +432,7 @@ def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
 def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]:
     """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
-    `after` is the adjustment with the effect. `stds` holds the standard deviation of each tested parameter
-    (`tested_intrinsics`). Those of fx and fy are relative, those of cx and cy are in image widths.
+    `after` includes the effect; `stds` are of `tested_intrinsics`: relative for fx and fy, image widths for cx and cy.
     """
     assert after.camera is not None
     camera, shown = after.solution.problem.cameras[after.camera].intrinsics, list[str]()
@@ -546,8 +544,7 @@ def with_effects(
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
     """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    The first seven unknowns are in COVARIANCE_ORDER. `columns` (s,b) are the b confirmed error patterns of the poses,
-    one standard deviation each; s = 6 per pose (m, rad; base axes).
+    `columns` (s,b), s = 6 per pose (m, rad; base axes), are b confirmed errors of one standard deviation each.
     """
     straight = replace(solution.equations, confirmed=columns @ columns.T)
     return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step

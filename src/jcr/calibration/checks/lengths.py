@@ -186,8 +186,7 @@ def _fused(
 ) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale.
 
-    `hand_eye` is the calibration without these priors, whose findings and checks are kept. `fault` is a covariance
-    (COVARIANCE_ORDER) that is added to the calibration's covariance.
+    Findings and checks of `hand_eye` are kept. `fault` (COVARIANCE_ORDER) is added to the calibration's covariance.
     """
     adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
     assert adjusted is not None
@@ -218,8 +217,7 @@ def _fused(
 def check_predicted_focal(case: Case) -> Case:
     """Return the case with a finding if a network's focal length contradicts the given one.
 
-    They contradict if they differ by more than OF_NETWORK standard deviations. The finding adds the difference to the
-    covariance of the intrinsics (`Finding.intrinsics_shift`).
+    The limit is OF_NETWORK standard deviations; `Finding.intrinsics_shift` adds the difference to the covariance.
     """
     given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
     if given is None or predicted is None:
@@ -240,8 +238,7 @@ def check_predicted_focal(case: Case) -> Case:
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
     """Return scale error and noise of the depth images, measured by the robot; None if too few features have a depth.
 
-    Measured depths are compared with the depths of reconstructed features, which `hand_eye.scale` converts to metres.
-    None is also returned without depth images. Raises InputError if a depth image cannot be read.
+    Features' depths are converted to metres by `hand_eye.scale`. Raises InputError if a depth image cannot be read.
     """
     if capture.depths is None:
         return None
