@@ -10,7 +10,7 @@ from numpy import ndarray
 from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
 from jcr.estimation.intrinsics_prior import camera_about
-from jcr.estimation.problem import Observations, Problem, RigGaussian, State, freed, with_observations
+from jcr.estimation.problem import Observations, Problem, State, freed, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
@@ -117,7 +117,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
     )
 
 
-def _given_poses(rigs: Rigs) -> RigGaussian:
+def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6*m 6*m"]]:
     """Return mean and covariance of the own camera's used poses, for a reconstruction without image features.
 
     The mean is recon_from_camera in metres. The covariance is pose by pose: translation (m), then rotation (rad).
@@ -128,4 +128,4 @@ def _given_poses(rigs: Rigs) -> RigGaussian:
         unit = np.tile(np.repeat([rigs.case.hand_eye.scale, 1.0], 3), len(rows))
         among = (6 * rows[:, None] + np.arange(6)).ravel()
         covariance += unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
-    return RigGaussian(rigs.known.recon_from_camera, covariance)
+    return rigs.known.recon_from_camera, covariance

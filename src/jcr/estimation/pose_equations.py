@@ -273,7 +273,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         gradient += row * (row @ problem.coordinates(state) - value) / std**2
     if images is None:
         assert problem.known_rigs is not None
-        covariance = problem.known_rigs.covariance
+        covariance = problem.known_rigs[1]
     else:
         follow, step, covariance = images.rigs
         coupling = images.information[np.ix_(problem.by_arm, free)]

@@ -109,13 +109,6 @@ def offset_prior(axis: Float[ndarray, "3"], metres: float, std: float) -> Linear
     return LinearPrior(np.r_[axis, np.zeros(UNKNOWNS - 3)], metres, std)
 
 
-class RigGaussian(NamedTuple):
-    """Normal distribution of the poses of the first m rigs: mean, and covariance (6m,6m) of steps (None: exact)."""
-
-    world_from_rig: Float[ndarray, "m 4 4"]
-    covariance: Float[ndarray, "r r"] | None = None
-
-
 @dataclass(frozen=True)
 class Columns:
     """Layout of the unknowns of the image equations: cameras, model errors, boards, mounts, then six for each rig.
@@ -180,7 +173,8 @@ class Problem:
     """Additional free directions of cameras and images, one column each; rows are those of `directions`."""
     freed_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
     """Prior standard deviation along each column of `freed`."""
-    known_rigs: RigGaussian | None = None
+    known_rigs: tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6*m 6*m"] | None] | None = None
+    """Normal distribution of the first m rigs' poses: mean, and covariance (6m,6m) of steps (None: exact)."""
     priors: tuple[LinearPrior, ...] = ()
     """Linear priors on X, scale and cameras."""
     robot_noise_floor: tuple[float, float] | None = None
@@ -616,7 +610,7 @@ def pose_problem(
     problem = Problem(
         arms=(wrist_arm(base_from_gripper, error_covariance),),
         n_rigs=len(base_from_gripper),
-        known_rigs=RigGaussian(recon_from_camera, camera_covariance),
+        known_rigs=(recon_from_camera, camera_covariance),
         priors=priors,
         robot_noise_floor=noise_floor,
     )

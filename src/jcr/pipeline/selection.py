@@ -36,11 +36,6 @@ TEXTURED = 50
 NEARLY_ALL = 0.9
 """Share of the capture's images that SIFT must register so that other features are not tried."""
 
-Keep = Callable[[Reconstruction], None]
-"""Function that stores a reconstruction before its calibration."""
-Selected = tuple[Reconstruction, Calibration]
-"""Selected reconstruction, and its calibration with the record of all attempts and their times."""
-
 
 class NothingFoundError(RejectedError):
     """Error that no back end gave a calibration; it holds the attempts and the findings, strongest first."""
@@ -130,9 +125,9 @@ def select_reconstruction(
     capture: Capture,
     options: RunOptions,
     progress: Progress | None = None,
-    keep: Keep | None = None,
+    keep: Callable[[Reconstruction], None] | None = None,
     before: Callable[[], Reconstruction] | None = None,
-) -> Selected:
+) -> tuple[Reconstruction, Calibration]:
     """Reconstruct and calibrate a capture with the back ends of `reconstruct.tries`, and return the best trial's result.
 
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
@@ -205,7 +200,9 @@ def _why_untried(
     return None, True
 
 
-def _select(trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding, ...]) -> Selected:
+def _select(
+    trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding, ...]
+) -> tuple[Reconstruction, Calibration]:
     """Return reconstruction and calibration of the trial of highest rank, with `notes` and the findings `of_images`.
 
     Raises NothingFoundError if no trial has a calibration. The InputError of an only trial is raised unchanged.
@@ -249,7 +246,7 @@ def _try(
     source: ReconstructOptions | Callable[[], Reconstruction],
     options: RunOptions,
     progress: Progress | None,
-    keep: Keep | None = None,
+    keep: Callable[[Reconstruction], None] | None = None,
 ) -> Trial:
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
