@@ -24,9 +24,8 @@ ONE_AXIS = np.radians(6)
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
     """Return the axis that all rotations of a planar motion share, the camera's coordinate along it, and its std.
 
-    The axis is a unit vector in the gripper frame, with its sign such that it points up in the base frame. The
-    coordinate (m) counts from the gripper's origin; the third number is its standard deviation (m). `height` (m) is the
-    measured height of the camera above the gripper's origin, which is returned as the coordinate.
+    The axis is a unit vector in the gripper frame, upwards in the base frame. The coordinate (m) counts from the
+    gripper's origin; the third number is its standard deviation (m). It is `height` (m), the measured one.
 
     Raises InputError if the gripper does not rotate about one common axis.
     """

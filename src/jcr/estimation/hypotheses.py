@@ -58,9 +58,8 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 class Row:
     """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
 
-    The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
-    intrinsics in the units of problem.rows_of; then focal lengths, shears, x and y offsets of its images; then s1 to s4
-    of the thin prism.
+    The c coordinates are residuals of reported poses (m, rad; base axes), or the camera's e parameters: intrinsics in
+    units of problem.rows_of; focal lengths, shears, x and y offsets of its images; s1 to s4 of the thin prism.
     """
 
     kind: FindingKind
@@ -259,8 +258,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
     """Return Wald's test of one possible effect `row`: whether its estimate differs significantly from 0.
 
     The error sizes are estimated anew together with the effect. An effect on the poses is estimated in the linearised
-    equations of `model`. An effect on the camera is estimated by a new adjustment with all confirmed effects of
-    `model`, which raises LinAlgError if it is singular.
+    equations of `model`. An effect on the camera needs a new adjustment, which raises LinAlgError if singular.
     """
     if not row.of_camera:
         test = confirm_in_equations(model.solution.equations, row)

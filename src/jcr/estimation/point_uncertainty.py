@@ -134,9 +134,9 @@ def valid_radius_px(
 ) -> float | None:
     """Return the radius (px) around the image centre within which 95 % of position errors are below `bound_m`.
 
-    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, in
-    RADII steps each; the worst of the four counts. `x` is gripper_from_camera. The result is None if the bound holds up
-    to the corners, and 0 if it does not hold at the centre.
+    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, of
+    which the worst counts. `x` is gripper_from_camera. The result is None if the bound holds up to the corners, and 0
+    if it does not hold at the centre.
     """
     half = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
     corners = half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
@@ -276,8 +276,7 @@ def _derivatives(
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns and by pixels; a covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale and the intrinsics, if
-    estimated. The covariance (px²) is that of the pixels by the distortion that the model cannot express. `distance_m`
-    is along the ray.
+    estimated. The covariance (px²) is of the pixels by the model error. `distance_m` is along the ray.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)

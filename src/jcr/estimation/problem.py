@@ -443,8 +443,7 @@ def freed(
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
     `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. The intrinsics part
-    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images` are the indices of
-    the camera's m images among all `n_images`.
+    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images`: the camera's.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -512,8 +511,7 @@ def stepped(
     """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
 
     `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
-    arms; `columns` (d,) has the order of `Problem.columns`. Six numbers of a transform are translation, then rotation
-    (rad), as in geometry.retract. None: no step. Points do not move.
+    arms; `columns` (d,) has the order of `Problem.columns`. Transforms step as in geometry.retract. Points stay.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()

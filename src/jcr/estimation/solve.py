@@ -212,8 +212,7 @@ def solve(
 
     If `start` has an estimate of the pixel noise already, it is taken as near the solution. Otherwise a bundle
     adjustment with assumed robot errors precedes the rounds. `averaged`: average over the sizes of the robot's errors,
-    else use their most likely values, which is faster and understates the uncertainty. `start_noise` are these assumed
-    random errors of the poses (m, rad), unless the problem has a lower bound.
+    else use their most likely values (fast, understates the uncertainty). `start_noise` are these errors (m, rad).
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)
@@ -362,9 +361,8 @@ def _joint_step(
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
     """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
 
-    `equations` are those of the reported poses about `images.state`, `log_sizes` the log sizes of the robot's errors.
-    The columns (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the
-    columns `Problem.free`.
+    `equations` are about `images.state`. The d columns are those of `Problem.columns` (cameras, boards, rigs). The p
+    unknowns are those of the arms, then the columns `Problem.free`.
     """
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
@@ -384,8 +382,7 @@ def _accelerated(
     """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
 
     `ends` and `steps` hold for each round the n coordinates (`_coordinates`) at its end, and its step. The combination
-    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`. All n
-    coordinates are combined by the same factors.
+    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`.
     """
     if len(steps) == 1:
         return ends[-1]
@@ -407,8 +404,7 @@ def with_covariance(
     """Return the solution with its covariance, from a state near the solution and the evidence of the images.
 
     The arms' unknowns and error sizes are first iterated to convergence. `images` None: camera poses are given.
-    `averaged` is that of `solve`. `expected` is the assumed robot noise of a predicted solution, whose residuals are 0
-    and whose state is not iterated; None: the noise is estimated.
+    `averaged` is that of `solve`. `expected` is the noise of a predicted solution (residuals 0); None: estimated.
     """
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)

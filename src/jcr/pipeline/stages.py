@@ -163,8 +163,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
 
     A reconstruction of the same inputs in the run folder, or in the one that `jcr capture` wrote, is used again. For a
     fixed camera, only the pixels of the object that the gripper carries are used. If no back end gives a calibration,
-    calibration.json and the report state the reason, and NothingFoundError is raised; it proposes the option `--board`
-    if the images show a board.
+    calibration.json and the report state the reason, and NothingFoundError is raised, which may propose `--board`.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture

@@ -189,8 +189,7 @@ def effects_of_fit(
     """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
     Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
-    `known` are further keyword arguments of `pose_problem`: `camera_covariance`, `error_covariance`, `noise_floor`,
-    `priors`.
+    `known` are further keyword arguments of `pose_problem`, such as `error_covariance` and `priors`.
     """
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
@@ -505,8 +504,8 @@ def with_effects(
 
     `model` includes the effects that `findings` report. The adjusted X is the effective hand-eye transform, which
     predicts best from reported gripper poses. A finding's remaining shift is the difference from the transform for the
-    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. Return None as
-    adjustment if there is no effect on camera or arm.
+    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. The adjustment is None
+    without such an effect.
     """
     strains = [row for row in model.rows if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):

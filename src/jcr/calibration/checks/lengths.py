@@ -74,9 +74,8 @@ class Length:
 def check_lengths(case: Case) -> Case:
     """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
 
-    A known length comes from a board, the option known_length, a depth camera or a network; the robot's positions count
-    as another length. Two of them contradict if they differ by more than SIGMAS standard deviations and by more than
-    LEAST. The comparison is recorded in `Calibration.lengths`.
+    Known lengths are of a board, the option known_length, a depth camera, a network, or the robot's positions. Two
+    contradict if they differ by more than SIGMAS standard deviations and than LEAST. `Calibration.lengths` records it.
     """
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
@@ -153,8 +152,7 @@ def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: 
     """Return the finding that two of the `lengths` contradict each other; a length by the robot must be `one`.
 
     The finding rejects only if both lengths are exact (EXACT) and one is the robot's. A board that contradicts the
-    robot by up to MISPRINTED, with no other length near the board's, was printed or stated at a wrong size. The finding
-    then warns, because the result is that of the robot alone.
+    robot by up to MISPRINTED, with no other length near the board's, has a wrong size; the finding then warns.
     """
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
