@@ -19,7 +19,7 @@ from jcr.findings import (
     verdict_of,
     without_consequences,
 )
-from jcr.records import BoardEstimate, GivenIntrinsicsResult, LeaveOneOut, PointUncertaintyOverImage, share_of
+from jcr.records import GivenIntrinsicsResult, LeaveOneOut, PointUncertaintyOverImage, share_of
 from jcr.rounding import labelled, significant, with_std
 
 NEGLIGIBLE = 0.02
@@ -209,29 +209,26 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
         for name, size in sorted(sizes.items(), key=lambda item: -item[1][0]):
             if (size > least).any():
                 parts[name] = f"{size[0]:.2f} mm {size[1]:.3f}°"
+    board = dict[str, str]()
+    if (found := content.board) is not None:
+        stated = f", {found.stated_mm:g} mm stated" if found.stated_mm else ""
+        board = {
+            found.spec: f"{found.corners} corners in {found.images} images, {found.rms_px:.2f} px rms per axis",
+            "side by the robot's positions": f"{with_std(found.side_mm, found.side_std_mm)} mm{stated}",
+            "lowest to highest corner": f"{significant(found.bend_mm)} mm",
+        }
+        for k, (at, tilt) in enumerate(zip(found.centres_in_base, found.tilts_deg, strict=True), start=1):
+            name = f"place of tag {k}" if found.bodies > 1 else "place"
+            centre = ", ".join(f"{x:.3f}" for x in at)
+            board[name] = f"({centre}) m in the base, {tilt:.1f}° from horizontal"
     return {
         "Time": time,
         "Uncertainty, 1 σ per axis": parts,
         "Lengths": lengths,
         "Depth camera": depth,
         "Robot": robot,
-        "Board": {} if content.board is None else _board(content.board),
+        "Board": board,
     }
-
-
-def _board(board: BoardEstimate) -> dict[str, str]:
-    """Return named values of an adjusted board: corners, size, flatness, and position in the base frame."""
-    stated = f", {board.stated_mm:g} mm stated" if board.stated_mm else ""
-    rows = {
-        board.spec: f"{board.corners} corners in {board.images} images, {board.rms_px:.2f} px rms per axis",
-        "side by the robot's positions": f"{with_std(board.side_mm, board.side_std_mm)} mm{stated}",
-        "lowest to highest corner": f"{significant(board.bend_mm)} mm",
-    }
-    for k, (centre, tilt) in enumerate(zip(board.centres_in_base, board.tilts_deg, strict=True), start=1):
-        name = f"place of tag {k}" if board.bodies > 1 else "place"
-        at = ", ".join(f"{x:.3f}" for x in centre)
-        rows[name] = f"({at}) m in the base, {tilt:.1f}° from horizontal"
-    return rows
 
 
 def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Float[ndarray, "7 7"]) -> str:
