@@ -1,7 +1,6 @@
 """File format depth.npz: the estimated depth of the pixels of each image, 8.25 bytes a pixel.
 
-The points are computed from the depth and the camera poses of reconstruction.npz; colours come from the capture's
-images.
+The points follow from depth and the camera poses of reconstruction.npz; colours come from the images.
 """
 
 from dataclasses import asdict

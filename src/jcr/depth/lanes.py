@@ -31,8 +31,7 @@ class Lanes:
     def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
         """Load `count` consecutive numbers from memory, beginning at element `place` of the array `start`.
 
-        `builder` is the IR builder; `start` is an LLVM pointer, `place` an LLVM integer, and `kind` the LLVM type of
-        the numbers.
+        `builder` is the IR builder, `start` an LLVM pointer, `place` an LLVM integer, `kind` an LLVM type.
         """
         there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))

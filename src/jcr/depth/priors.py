@@ -2,8 +2,7 @@
 
 The method follows ACMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020), with a plane for
 each region of one colour (Romanoni and Matteucci, "TAPA-MVS", ICCV 2019) and one support plane of the scene, mostly the
-table. A pixel takes its plane's depth where the other views show the point in the same colour and none of them sees
-through it.
+table. A pixel takes its plane's depth where the other views show the point in the same colour.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
 """Export of the map for planners and Rerun: OctoMap, voxel grid of distances, spheres, mesh of the surface.
 
-OctoMap, voxel grid and spheres are computed by queries, so they agree with `SceneMap.check_spheres` and
-`SceneMap.query`.
+OctoMap, voxel grid and spheres are computed by queries of `SceneMap`, so they agree with these.
 """
 
 from pathlib import Path

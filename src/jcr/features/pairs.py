@@ -62,9 +62,8 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
 def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
-    Each image has up to PARTNERS viewpoints. The shared scene is measured by the points of the pairs in `found` that
-    the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
-    gripper's i_from_j.
+    Each image has up to PARTNERS viewpoints. The shared scene is measured by points of confirmed pairs in `found`, at
+    least 20, with a known hand-eye rotation. `motion[i, j]` is the gripper's i_from_j.
     """
     if (gripper_from_camera := hand_eye_of_pairs(found, motion)) is None:
         return []

@@ -153,8 +153,7 @@ def search_depths(
 
     `host` is the image row of each pixel; `depths` (z in the host's camera frame, m) has one row per trial and one
     column per image. The cost of a point is the mean of r²/(r² + sigma²) over the share SEEN_BY of the images with the
-    smallest colour difference r. It is 1 where fewer than two images see the point. Points with a cost below `least`
-    are marked as agreed.
+    smallest colour difference r. It is 1 where fewer than two images see the point. Points below `least` agree.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)

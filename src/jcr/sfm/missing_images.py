@@ -1,8 +1,7 @@
 """Models near predicted cameras: images that the mapper left out, and cameras predicted by a network.
 
 Points are triangulated and adjusted alternately. Cameras of images that the mapper left out are predicted from the
-gripper poses and the hand-eye transform X of the model itself; keypoints near projected points are then matched with
-them.
+gripper poses and the hand-eye transform X of the model itself; keypoints near projected points are matched.
 """
 
 from collections import Counter

@@ -1,7 +1,6 @@
 """Samples of marker-based hand-eye tools: pairs of gripper pose and marker pose, without images.
 
-The frame of a marker that does not move serves as the frame of a reconstruction: recon_from_camera is the inverse of
-camera_from_marker.
+The frame of a fixed marker is the recon frame: recon_from_camera is the inverse of camera_from_marker.
 """
 
 from pathlib import Path
