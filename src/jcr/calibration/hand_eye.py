@@ -13,6 +13,7 @@ from jcr.calibration.record import Calibration
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import camera_error_covariance
+from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
@@ -117,6 +118,9 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     if camera_covariance is None and camera_errors != "none":
         assert fit.problem.used is not None
         start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
+        if not poses_agree(fit.noise):
+            # The fit may have explained camera errors by systematic robot errors; the closed form has neither.
+            start, used = initial_estimate(gripper, camera), np.ones(n, dtype=bool)
         adding_up = camera_errors == "in sequence"
         errors = camera_error_covariance(
             gripper, camera, start, used, systematic, robot_noise, priors, adding_up
