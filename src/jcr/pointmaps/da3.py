@@ -64,14 +64,14 @@ def build(name: str) -> nn.Module:
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
-def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> PosedPointmaps:
+def predict_views(network: nn.Module, views: Views) -> PosedPointmaps:
     """Return the pointmaps and camera poses of all images, predicted in one pass.
 
-    `network` is Depth Anything 3 with its weights. The images are resized so that their long edge has about `long_edge`
+    `network` is Depth Anything 3 with its weights. The images are resized so that their long edge has about LONG_EDGE
     px (`grid_of`). Frame and unit are arbitrary.
     """
-    grid = grid_of(views.size, long_edge)
-    colors = np.stack([resized_for_grid(image, grid, long_edge) for image in views.colors])
+    grid = grid_of(views.size)
+    colors = np.stack([resized_for_grid(image, grid) for image in views.colors])
     device = next(network.parameters()).device.type
     # Half precision halves the time on a GPU, as in the package; on a CPU it is no faster.
     half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
@@ -93,22 +93,20 @@ def predict_views(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) 
     )
 
 
-def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
-    """Return the grid of an image of `size` px: its long edge is `long_edge`, and both are multiples of PATCH."""
-    edges = (round(edge * long_edge / max(size)) for edge in size)
+def grid_of(size: tuple[int, int]) -> ImageGrid:
+    """Return the grid of an image of `size` px: its long edge is LONG_EDGE, and both are multiples of PATCH."""
+    edges = (round(edge * LONG_EDGE / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))
 
 
-def resized_for_grid(
-    image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int
-) -> UInt8[ndarray, "h2 w2 3"]:
-    """Resize an image (RGB) to a long edge of `long_edge` px, and then to the size of `grid`.
+def resized_for_grid(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
+    """Resize an image (RGB) to a long edge of LONG_EDGE px, and then to the size of `grid`.
 
     Each step is bicubic if it enlarges an edge and otherwise averages over areas, as in Depth Anything 3.
     """
     height, width = image.shape[:2]
-    scale = long_edge / max(width, height)
+    scale = LONG_EDGE / max(width, height)
     for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):
         if size != (width, height):
             enlarges = size[0] > width or size[1] > height
