@@ -13,7 +13,7 @@ from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fit_poses
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import arm_named
-from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED
+from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
 from scenes import capture_of, pairs_of, reconstruction_of
@@ -218,9 +218,10 @@ def test_a_given_distortion_that_folds_over_is_unknown():
     for intrinsics in (capture.intrinsics, folds):
         capture = replace(capture, intrinsics=intrinsics)
         prior = fit_poses(capture, reconstruction, CalibrateOptions(), robot).camera
-        stds.append(np.sqrt(prior.directions**2 @ prior.std**2))
+        stds.append(prior.parameter_std)
     assert np.array_equal(stds[0][:4], stds[1][:4])
-    assert stds[0][4] == MEASURED["k1"] and stds[1][4] == ESTIMATED["k1"]
+    usual = camera_with_prior(folds, ESTIMATED).parameter_std
+    assert stds[0][4] == MEASURED["k1"] and stds[1][4] == usual[4] > 0.1
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.cameras import answered
+from benchmarks.references import placed as points_along
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.estimation import elimination
+from jcr.estimation.arms import arm_named
 from jcr.estimation.elimination import Derivatives, Sightings, with_fixed_points, without_points
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import (
@@ -41,7 +43,7 @@ from jcr.estimation.solve import Solution, adjust_wrist, uncertainty_of
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 from simulation.cells import CellProblem, Kind, cell_problem
-from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed
+from simulation.problems import INTRINSICS, HandEyeProblem, bent_problem, error, hand_eye_problem, observed
 
 
 def solved(
@@ -120,6 +122,32 @@ def warped(warp_px: float) -> Solution:
     return solved(
         problem, tracks, camera_with_prior(Intrinsics(619.0, 619.0, 319.5, 239.5, 640, 480), ESTIMATED)
     )
+
+
+WIDE = Intrinsics(458.7, 457.3, 375.5, 239.5, 752, 480, (-0.2834, 0.0740, 1.9e-4, 1.8e-5, 0.0))
+"""Left camera of EuRoC, with a distortion of -20 % of the radius in the corners."""
+
+
+@pytest.mark.slow
+def test_estimated_distortion_of_a_wide_lens_is_not_extrapolated_beyond_its_usual_size():
+    """Features within half of the corner radius left corners 26 mm off, with a stated 95 % bound of up to 1 m."""
+    off = with_parameters(WIDE, parameters(WIDE) * np.r_[1.003, 1.003, np.ones(7)])
+    middle = np.array([WIDE.width - 1.0, WIDE.height - 1.0]) / 2
+    x_px = middle * (1 + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]))
+    for seed in (300, 301):
+        problem = bent_problem(arm_named("ur5e"), "white", 12, seed)
+        tracks = observed(problem, np.random.default_rng([seed, 9]), 600, 0.3, WIDE)
+        inner = np.linalg.norm(tracks.x_px - middle, axis=1) < np.linalg.norm(middle) / 2
+        found = solved(problem, tracks.only(inner), camera_with_prior(off, ESTIMATED))
+        x, camera = found.state.x[0], found.problem.intrinsics(found.state)[0]
+        covariance = point_covariance(x, uncertainty_of(found), camera, x_px, DISTANCE_M)
+        bounds = np.array([within_95(one) for one in covariance])
+        ours, truth = (
+            points_along(pose, lens, x_px, DISTANCE_M)
+            for pose, lens in ((x, camera), (problem.gripper_from_camera, WIDE))
+        )
+        lengths = np.linalg.norm(ours - truth, axis=1)
+        assert lengths.max() < 0.02 and (lengths < bounds).all() and bounds.max() < 0.2
 
 
 @pytest.mark.slow

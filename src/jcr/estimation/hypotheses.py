@@ -18,7 +18,7 @@ from jcr.camera import parameter_names
 from jcr.distributions import f as f_distribution
 from jcr.estimation.elimination import cholesky, over
 from jcr.estimation.image_equations import ImageEvidence, image_evidence
-from jcr.estimation.intrinsics_prior import ESTIMATED
+from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian
 from jcr.estimation.pose_equations import PoseEquations, pose_equations
 from jcr.estimation.problem import (
@@ -446,9 +446,9 @@ def tested_intrinsics(model: Adjustment) -> list[str]:
     prior, tested = model.solution.problem.cameras[model.camera], TESTED_IF_ESTIMATED
     names, loose = parameter_names(prior.intrinsics), set[str]()
     if model.is_given:
-        std, tested = np.sqrt(prior.directions**2 @ prior.std**2), TESTED_IF_GIVEN
-        each = zip(names[4:], std[4:], strict=True)
-        loose = {name for name, one in each if one >= ESTIMATED.get(name, np.inf)}
+        tested, usual = TESTED_IF_GIVEN, camera_with_prior(prior.intrinsics, ESTIMATED).parameter_std
+        each = zip(names[4:], prior.parameter_std[4:], usual[4:], strict=True)
+        loose = {name for name, one, most in each if one >= most > 0}
     return [name for name in tested if name in names and name not in loose]
 
 
