@@ -48,8 +48,9 @@ def with_adjusted_images(case: Case) -> Case:
     """Return the case after bundle adjustment, with the adjusted calibration in place of the fit to camera poses.
 
     A rejected fit is replaced too, because without given intrinsics its camera poses are poor. For correspondences
-    between pointmaps, whose errors are correlated, the leave-one-out error (`LeaveOneOut.length_m`) must decrease. The
-    fit is kept if motions are degenerate or the adjustment fails.
+    between pointmaps, whose errors are correlated, the fit is replaced only if the leave-one-out error
+    (`LeaveOneOut.length_m`) decreases. The fit is kept if the motions are degenerate, or if the adjustment fails
+    (points behind the cameras).
 
     If the case is not adjustable (`Case.is_adjustable`), the fit is kept. The uncertainty of given intrinsics, or of
     the principal point for a network's camera poses, is added to its covariance.
@@ -138,11 +139,13 @@ def with_intrinsics_considered(
 
     This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
     Φ is the covariance of the intrinsics, from their prior `camera`. S is the derivative of the fit by the intrinsics.
-    For S, each parameter changes by 1σ, and the camera poses change so that the pixels of `tracks` stay.
+    For S, each parameter changes by one standard deviation, and the camera poses change so that the pixels of `tracks`
+    stay in place.
 
     `hand_eye` is the fit, and `priors` are the priors that the fit used. Poses, tracks and `systematic` are those of
     the m used images. `systematic` (6m,6m) is the covariance (m, rad; base axes) of the systematic robot errors for a
-    joint error of 1 rad standard deviation. With fewer than FEWEST observations in an image, `hand_eye` is unchanged.
+    joint error of 1 rad standard deviation. `hand_eye` is returned unchanged if an image has fewer than FEWEST
+    observations.
     """
     moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
     for row, pose in enumerate(recon_from_camera):

@@ -91,7 +91,8 @@ class Case:
     def systematic(self) -> Float[ndarray, "s s"]:
         """Covariance of the used gripper poses' systematic errors for an error size of 1 rad.
 
-        Six rows a pose (m, rad; base axes). The size is the std of a joint's error, or of an unknown arm's rotation.
+        Each pose has six rows: translation (m), then rotation vector (rad), in base axes. The size is the standard
+        deviation of a joint's error or, for an unknown arm, of the gripper's rotation.
         """
         return of_poses(self.robot.systematic, self.used)
 

@@ -24,8 +24,9 @@ ONE_AXIS = np.radians(6)
 def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
     """Return the axis that all rotations of a planar motion share, the camera's coordinate along it, and its std.
 
-    The axis is a unit vector in the gripper frame, upwards in the base frame. The coordinate (m) counts from the
-    gripper's origin; the third number is its standard deviation (m). It is `height` (m), the measured one.
+    The axis is a unit vector in the gripper frame, with its sign such that it points up in the base frame. The
+    coordinate (m) counts from the gripper's origin; the third number is its standard deviation (m). `height` (m) is the
+    measured height of the camera above the gripper's origin, which is returned as the coordinate.
 
     Raises InputError if the gripper does not rotate about one common axis.
     """
@@ -62,7 +63,11 @@ def check_known_length(capture: Capture, known_length: LengthInImage | None) -> 
 def length_cue(
     capture: Capture, reconstruction: Reconstruction, known_length: LengthInImage
 ) -> tuple[float, float]:
-    """Return the scale (m per recon unit) by a known length between two pixels (`surface_at`), and its relative std."""
+    """Return the scale (metres per recon unit) from a known length between two pixels, and its relative 1σ error.
+
+    The distance of both pixels' surface points in the recon frame comes from the pointmaps (`surface_at`). Raises
+    InputError if the image is not registered or a pixel has no depth.
+    """
     image, *ends, length_mm = known_length
     first, second = (
         surface_at(capture, reconstruction, image, end, "--known-length")

@@ -102,7 +102,8 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
 def read_hand_eye(path: Path) -> StatedTransform:
     """Read gripper_from_camera and its covariance from a run folder, calibration.json or reference.json.
 
-    A reference.json may have `std_mm` and `std_deg` along gripper axes. Raises InputError without gripper_from_camera.
+    A reference.json may state standard deviations `std_mm` and `std_deg` along the axes of the gripper. Raises
+    InputError for a file without gripper_from_camera.
     """
     file = path
     if path.is_dir():

@@ -128,7 +128,8 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
 def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
     """Return translation (m) and rotation (rad) that a χ² test at level `alpha` detects with probability 0.9.
 
-    `alpha` is the probability of a false alarm, `covariance` (m, rad) that of a motion, whose worst direction counts.
+    `alpha` is the probability of a false alarm. `covariance` is that of an estimated motion: translation (m), then
+    rotation vector (rad). The motions to detect have its least certain direction.
     """
     length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]

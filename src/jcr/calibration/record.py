@@ -103,8 +103,9 @@ AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
 class Outcome:
     """Base class of Calibration and FailedCalibration: findings, verdict, and the use of each image.
 
-    With mount "gripper" the camera is on the gripper and the reconstructed scene rests in the base frame; with "base"
-    the camera is fixed and the gripper carries the object. `parent` is gripper or base.
+    With mount "gripper" the camera is on the gripper, and the reconstructed scene rests in the base frame. With mount
+    "base" the camera is fixed, and the gripper carries the reconstructed object. `parent_from_camera` is
+    gripper_from_camera or base_from_camera.
     """
 
     __pydantic_config__ = ConfigDict(allow_inf_nan=False)
@@ -368,9 +369,9 @@ class Calibration(Outcome):
         """Return the base-frame coordinates (m) of points given by pixel and depth, and their covariances (m²).
 
         `pixel` (…,2) are pixels (x, y) of the distorted image, `depth_m` (…) the z coordinates in the camera frame.
-        `base_from_gripper` is the reported pose. The covariances include the errors of intrinsics, transform and
-        reported gripper pose, but not those of `pixel` and `depth_m`. Raises InputError for a fixed camera or without
-        intrinsics.
+        `base_from_gripper` (4,4) is the reported gripper pose of the image. The covariances include the errors of
+        intrinsics, transform and reported gripper pose, but not those of `pixel` and `depth_m`. Raises InputError for a
+        fixed camera or without intrinsics.
         """
         x = self.gripper_from_camera
         if self.intrinsics is None:
@@ -404,7 +405,8 @@ class Calibration(Outcome):
 class FailedCalibration(Outcome):
     """Result for a capture that could not be reconstructed; its findings are the reasons.
 
-    Fields of a Calibration, such as `scale`, are None here, null in the file; its other attributes raise RejectedError.
+    Fields of a Calibration, such as `scale`, are None here and null in the file. Properties and methods of a
+    Calibration raise RejectedError.
     """
 
     @computed_field

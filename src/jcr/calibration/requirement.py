@@ -149,7 +149,8 @@ def assumptions_of_poses(
 def reached(uncertainty: Uncertainty, at: Where) -> tuple[float, float]:
     """Return the bounds on 95 % of the translation errors (mm) and rotation errors (degrees) that `at` selects.
 
-    "seen": a point seen by the camera, also for "scene" without one; "camera": its pose; "scene": mapped points.
+    The value "seen" selects a point seen by the camera, "camera" the camera's pose. The value "scene" selects mapped
+    points, or a seen point if the uncertainty has no scene.
     """
     covariance, scene, seen = uncertainty.covariance, uncertainty.scene, uncertainty.seen
     if at == "camera":

@@ -57,7 +57,8 @@ def robot_errors(
     """Return the prior covariance of systematic errors of a capture's gripper poses, then of a `later` capture's.
 
     Raises InputError if the poses do not fit the arm of the option `robot`. Raises LengthError for any arm if all poses
-    are too long by one factor. An arm of the capture that the poses do not fit is `unused`.
+    are too long by one factor for their joint angles. An arm that only the capture names and that the poses do not fit
+    is not used; `unused` of the result is then a finding.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:

@@ -42,7 +42,8 @@ class CellImages:
         """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
 
         `combinations` (e,p) are p directions in the e parameters of hypotheses.Row. `errors` (s,b) are the errors of
-        the arm's poses (m, rad; axes of its base) by b confirmed effects of 1σ each. None: unchanged.
+        the arm's poses (pose by pose: m, then rad; axes of its base) by b confirmed effects of one standard deviation
+        each. None: nothing is added.
         """
         problem = self.problem
         if combinations is not None:

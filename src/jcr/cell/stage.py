@@ -116,7 +116,8 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
     """Return a finding if the images of a fixed camera have different poses; an empty tuple if the poses agree.
 
     Poses differ if their squared Mahalanobis distance exceeds APART and a step exceeds MATERIAL standard deviations.
-    Each image is adjusted with its own pose; common errors, as of the intrinsics, cancel in a difference.
+    Each image is adjusted with its own pose; common errors, as of the intrinsics, cancel in the covariance of a
+    difference.
     """
     alone = Rigs(rigs.case, rigs.known)
     alone.poses += list(views.places)

@@ -69,9 +69,10 @@ def absolute_pose(
     """Return the camera pose in the frame of k points from their pixels; None if fewer than six (planar: four) agree.
 
     `x_px` are pixels of the distorted image. The pose has the most points with a reprojection error below `gate_px`.
-    `planar`: the points lie in a plane; the better of two refined poses is returned. `point_covariance` is in the frame
-    of the points; None: exact points; pixel noise is estimated in any case. `focal` "free": the focal length is
-    estimated; `camera` has its initial value. `loss` "linear" is for detected corners.
+    `planar`: the points lie in a plane; both possible poses are refined, and the one with the smaller reprojection
+    error is returned. `point_covariance` is in the frame of the points; None: exact points; pixel noise is estimated in
+    any case. `focal` "free": the focal length is estimated; `camera` has its initial value. `loss` "linear" is for
+    detected corners, which have no wrong matches.
     """
     least, p = 4 if planar else 6, 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance

@@ -124,7 +124,8 @@ def shapes_of(
     """Return the shape prior of boards with corners among the points, and initial world_from_body of each of b bodies.
 
     A body is a board or tag; its rig number is `first_rig` plus the number of the body. Only corners whose points are
-    `seen` (observed), and bodies with at least four of them, are used. The prior is None without bodies.
+    `seen` (observed), and bodies with at least four of them, are used. The prior is None without bodies. World is the
+    frame of `points_in_world`.
     """
     bodies = []
     for body in () if boards is None else boards.bodies:

@@ -138,7 +138,8 @@ def with_fixed_points(
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
     """Return Hessian JᵀJ (d,d) and right side −Jᵀr (d,) of all unknowns but the points, as if the points were fixed.
 
-    Unknowns are the columns that all images share, then those of each rig in `seen`; J and r are those in `rows`.
+    The d unknowns are the columns that all images share, then the columns of each rig. J and r are the derivatives and
+    residuals in `rows`, whose rigs `seen` lists.
     """
     s, o = rows.shared.shape[2], rows.own.shape[2]
     size = s + o * len(seen.rows)

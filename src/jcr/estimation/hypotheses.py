@@ -58,8 +58,9 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 class Row:
     """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
 
-    The c coordinates are residuals of reported poses (m, rad; base axes), or the camera's e parameters: intrinsics in
-    units of problem.rows_of; focal lengths, shears, x and y offsets of its images; s1 to s4 of the thin prism.
+    The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
+    intrinsics in the units of problem.rows_of; then focal lengths, shears, x and y offsets of its images; then s1 to s4
+    of the thin prism.
     """
 
     kind: FindingKind
@@ -121,7 +122,8 @@ class Scores:
     def log_p(self, row: Row) -> float:
         """Return the natural log p-value of the score test of an effect: the chance of its gain without the effect.
 
-        It is an F test of the gain of `both` over `beside` per parameter and `dispersion`, times `row.places`.
+        The gain of `Row.both` minus that of `Row.beside`, over `dispersion` and the number of parameters, is tested by
+        an F distribution. The p-value is multiplied by `row.places`.
         """
         (without, fewer), (gain, more) = self.gain(row.beside), self.gain(row.both)
         d = max(more - fewer, 1)
@@ -240,7 +242,8 @@ class Adjustment:
     def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
         """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
 
-        Camera effects free directions; pose effects add errors of prior std `Row.unit`. Raises LinAlgError if singular.
+        An effect on the camera frees its directions. An effect on the poses adds errors whose parameters have the prior
+        standard deviation `Row.unit`. Raises LinAlgError if the problem becomes singular.
         """
         free, own = replace(self, rows=tuple(rows)), self.poses[1]
         errors = [row.unit * row.columns[own] for row in rows if not row.of_camera]
@@ -258,7 +261,8 @@ def confirm(model: Adjustment, row: Row) -> Test:
     """Return Wald's test of one possible effect `row`: whether its estimate differs significantly from 0.
 
     The error sizes are estimated anew together with the effect. An effect on the poses is estimated in the linearised
-    equations of `model`. An effect on the camera needs a new adjustment, which raises LinAlgError if singular.
+    equations of `model`. An effect on the camera is estimated by a new adjustment with all confirmed effects of
+    `model`, which raises LinAlgError if it is singular.
     """
     if not row.of_camera:
         test = confirm_in_equations(model.solution.equations, row)
@@ -440,7 +444,8 @@ OfImage = Literal["focal", "shear", "x", "y"]
 def tested_intrinsics(model: Adjustment) -> list[str]:
     """Return the names of the camera's parameters that the test of FindingKind.INTRINSICS frees.
 
-    They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, without given distortion that the prior of ESTIMATED ignores.
+    They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, as far as the camera has them. A given distortion coefficient is
+    not tested if its prior is at least as wide as in ESTIMATED: its value was not used.
     """
     assert model.camera is not None
     prior, tested = model.solution.problem.cameras[model.camera], TESTED_IF_ESTIMATED
@@ -530,7 +535,11 @@ def _dispersion(images: ImageEvidence) -> float:
 
 
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return directions in the e parameters (`Row`) for a focal length per image: a common one, then `differences`."""
+    """Return directions (columns) in the e parameters of a camera (`Row`) that give each of p images a focal length.
+
+    The first column changes fx and fy by the same factor. The others change the logarithms of the images' focal lengths
+    by the columns of `differences`. `images` is p.
+    """
     q = len(parameter_names(camera))
     out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0

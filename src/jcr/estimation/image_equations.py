@@ -101,7 +101,8 @@ def adjust_images(problem: Problem, state: State) -> State:
 def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations) -> State:
     """Return the state with the pixel noise estimated from the residuals in `view`, the projection of the state.
 
-    Later estimates distinguish groups (each camera, board corners) and use the observations' stated variances.
+    The first estimate has one size for all observations. Later ones distinguish groups (one for each camera, one for
+    board corners) and use the observations' stated variances.
     """
     layout, residual_px, depth, before = problem.layout, view.residual_px, view.depth, state.pixel_noise
     if before is None or (layout.groups == 1 and not layout.states_variances):
@@ -190,7 +191,8 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
     """Return the evidence with a new estimate of the size of each camera's model error.
 
-    That is distortion beyond the camera model. The second result is the largest change of a log size; 0 without any.
+    The model error is the distortion that the camera model cannot express. The second result is the largest absolute
+    change of the natural logarithm of a size; 0 if no model errors are estimated.
     """
     state, change, sizes = images.state, 0.0, images.state.model_error_std.copy()
     columns = {k: own for k, own in enumerate(images.problem.columns.model_error) if own.stop > own.start}

@@ -147,7 +147,8 @@ def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n 
     """Return for each pose one of its s solutions `found`, by the Viterbi algorithm.
 
     The path has the least weighted sum of `misfit` (m²), squared change of the angles between successive poses, and
-    squared difference of the angles from the rest posture. Angles are shifted by full turns for the least change.
+    squared difference of the angles from the rest posture. Angles are shifted by full turns for the least change within
+    the limits.
     """
     own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []

@@ -34,7 +34,8 @@ def excitation(
     """Return how strongly n gripper poses determine each direction of X (gripper_from_camera) and the scale.
 
     `priors` add information on X and scale. `gripper_from_camera` None: the camera is assumed at the gripper's origin.
-    Excitation is the rms change of predicted gripper poses (m; 0.3 m per rad) by a unit step, base_from_recon refitted.
+    Excitation is the rms change of the predicted gripper poses (m; 0.3 m per rad) by a unit step along the direction,
+    after base_from_recon is fitted again.
     """
     n = len(base_from_gripper)
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
@@ -67,7 +68,8 @@ def observability(
 
     Findings reject if the smallest excitation is below EXACT, and warn if it is only below WEAK (both lower for few
     images). Else there are none. Two poses always give a finding. `recon_from_camera`, if given, distinguishes an orbit
-    about the scene from rotations about a tool point. `gripper_from_camera` None: the gripper's origin.
+    about the scene from rotations about a tool point. Without `gripper_from_camera` the camera is assumed at the
+    gripper's origin.
     """
     n = len(base_from_gripper)
     if n == 2:

@@ -51,7 +51,8 @@ class PixelNoise:
     ) -> Float[ndarray, " k"]:
         """Return the weight (1/px²) of each of k observations: Cauchy weight of its residual over its variance.
 
-        The variance is inflated. Points with z = `depth` below 0, or below NEAREST of the median depth, have weight 0.
+        The variance includes the inflation. `depth` is z of each observed point in the camera frame; points behind a
+        camera, or nearer than NEAREST of the median depth, have weight 0.
         """
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance
@@ -110,7 +111,8 @@ def pixel_noise(
     `ratio` (g,) is each group's variance over that of the first. The standard deviations fit the median over points
     without outliers of the sum of squared residuals. `depth` is z in the camera frame; `common` is `PixelNoise.common`.
     For independent errors, the squared sum of weighted residuals over a cell equals on average the sum of squares; the
-    inflation is the factor by which it exceeds this (Liang and Zeger, Biometrika 73, 1986).
+    inflation is the factor by which it exceeds this (variance inflation of cluster sampling; Liang and Zeger,
+    Biometrika 73, 1986).
     """
     relative = (residual_px**2).sum(1) / (ratio[layout.group] * layout.relative_variance(common))
     far = relative > FAR_OFF**2 * np.median(relative)
@@ -137,7 +139,8 @@ def refined_noise(
 
     Squared residuals are corrected for the leverage of the points, since a fitted point reduces its own residuals.
     `before` is the previous estimate, which gives the weights; `depth` is z in the camera frame. `by_point` are
-    derivatives by the points, `starts` each point's first observation, and `known` other information on points.
+    derivatives by the points, `starts` each point's first observation, and `known` is the information matrix of each
+    point from other sources than its observations; None: there is none.
     """
     weight = replace(before, inflation=1.0).weights(residual_px, depth, layout)
     j = np.sqrt(weight)[:, None, None] * by_point

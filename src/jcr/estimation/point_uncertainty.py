@@ -63,7 +63,8 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
     """Return base-frame coordinates (m) and covariance (m²) of points at pixels with z = `depth_m` in the camera frame.
 
-    `x` is gripper_from_camera; `noise` adds gripper pose errors in the workspace; others as in `point_covariance`.
+    `x` is gripper_from_camera; `uncertainty` and `x_px` are those of `point_covariance`. `noise` adds the errors of the
+    gripper pose, for a pose in the workspace of the capture.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
@@ -134,9 +135,9 @@ def valid_radius_px(
 ) -> float | None:
     """Return the radius (px) around the image centre within which 95 % of position errors are below `bound_m`.
 
-    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, of
-    which the worst counts. `x` is gripper_from_camera. The result is None if the bound holds up to the corners, and 0
-    if it does not hold at the centre.
+    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, in
+    RADII steps each; the worst of the four counts. `x` is gripper_from_camera. The result is None if the bound holds up
+    to the corners, and 0 if it does not hold at the centre.
     """
     half = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
     corners = half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
@@ -276,7 +277,8 @@ def _derivatives(
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns and by pixels; a covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale and the intrinsics, if
-    estimated. The covariance (px²) is of the pixels by the model error. `distance_m` is along the ray.
+    estimated. The covariance (px²) is that of the pixels by the distortion that the model cannot express. `distance_m`
+    is along the ray.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)

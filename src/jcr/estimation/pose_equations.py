@@ -52,7 +52,8 @@ LEAST_FREE = 0.4
 class Region:
     """Linear fit of the effective hand-eye transform to n pose errors (s = 6n numbers).
 
-    The effective X (gripper_from_camera) and Z (base_from_recon) fit best in spite of systematic errors; no scale.
+    The effective transform is the gripper_from_camera X and base_from_recon Z that fit best in spite of systematic
+    robot errors; the scale is not fitted.
     """
 
     by_unknown: Float[ndarray, "s u"]
@@ -136,7 +137,8 @@ def pose_residuals(
 
     Six components of a step are translation, then rotation vector; the 13 columns are steps of X (6), log scale, Z (6).
     X is gripper_from_camera, Z is base_from_recon. `exchanged`: the camera is fixed and the gripper carries the scene.
-    X is then base_from_camera, Z is gripper_from_recon; the predicted gripper_from_base is inverted.
+    X is then base_from_camera, Z is gripper_from_recon, and the predicted gripper_from_base is inverted before it is
+    compared.
     """
     predicted = predicted_gripper_poses(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
@@ -227,8 +229,9 @@ def reported_poses(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 u"], Float[ndarray, "n 6 6"]]:
     """Return the residuals of the n reported poses of all arms, and their derivatives.
 
-    Poses are arm after arm. Residuals are steps (m, rad; base axes) to predicted poses. The first derivatives are by
-    the u unknowns of the arms (X, log scale and Z, as in `weak_prior`). The second are by a step of each pose's rig.
+    Poses are arm after arm. Residuals are steps (m, then rad; base axes) from reported to predicted poses. The first
+    derivatives are by the u unknowns of the arms (X, log scale and Z, as in `weak_prior`). The second are by a step of
+    the rig (camera pose) that belongs to each pose.
     """
     each, begin = [], 0
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
@@ -256,7 +259,8 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     """Return the equations of the reported poses about a state, after the rigs (camera poses) are integrated out.
 
     The distribution of the rigs is that of `images`; None: that of `Problem.known_rigs`. Unknowns are those of the
-    arms, then the columns `Problem.free`. Weak and linear priors are included.
+    arms, then the columns `Problem.free`. Prior information includes the weak prior, the linear priors and that of
+    `images`.
     """
     residual, by_arms, by_rig = reported_poses(problem, state)
     n, arms, free = len(residual), problem.arm_unknowns, problem.free

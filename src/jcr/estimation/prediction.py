@@ -97,8 +97,9 @@ def assumed(
 ) -> Assumptions:
     """Return assumptions before any calibration: typical robot errors, and a camera at the gripper's origin.
 
-    The poses `base_from_gripper` determine the axis along which the camera looks (`assumed_camera`) and the median
-    distance of the scene. `camera` None: camera poses are given and exact. `noise` (m, rad) is a lower bound.
+    The recorded or planned poses `base_from_gripper` determine the axis along which the camera looks
+    (`assumed_camera`) and the median distance of the scene. `camera` None: camera poses are given and exact. `noise`
+    (m, rad) is a lower bound on the random errors of the robot.
     """
     x = assumed_camera(base_from_gripper)
     return Assumptions(
@@ -125,7 +126,8 @@ def typical_camera(
 ) -> PredictedCamera:
     """Return the camera of a prediction before any images are matched, with typical image information.
 
-    `intrinsics` None: guessed from `size` (width, height in px). `std` of `intrinsics` None: MEASURED.
+    `intrinsics` None: guessed from `size`, the (width, height) in px. `std` are standard deviations of given
+    `intrinsics` in the order of camera.parameters; None: MEASURED.
     """
     camera = intrinsics or guessed_intrinsics(size)
     return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
@@ -183,8 +185,9 @@ def predict_covariance(
 ) -> Float[ndarray, "7 7"]:
     """Return the predicted covariance of X (gripper_from_camera) and log scale for exact camera poses in metres.
 
-    The order is X (m, rad; gripper axes, geometry.retract), then log scale. `averaged`: over the posterior of the error
-    sizes, else those of `assumptions.noise`. `systematic` is that of `predict`.
+    The order is that of geometry.retract for X (translation in m, rotation in rad; gripper axes), then log scale.
+    `averaged`: average over the posterior of the robot's error sizes σ; else these are known, as in
+    `assumptions.noise`. `systematic` is that of `predict`.
     """
     x, noise = assumptions.gripper_from_camera, assumptions.noise
     problem, state = pose_problem(
@@ -207,8 +210,9 @@ def predict_covariance(
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
     """Return simulated points, where the rays of a pixel grid in each image meet the scene, and their observations.
 
-    An image also observes a point of another image if lines of sight differ by less than 40° and distances by less than
-    a factor 2. `cameras` are base_from_camera; `distance_m` is along the axis; points are in the base frame.
+    An image also observes a point of another image if the lines of sight differ by less than 40° and the distances by
+    less than a factor 2 (SAME_FEATURE). `cameras` are base_from_camera; `distance_m` is along the optical axis. The
+    points are in the base frame (m).
     """
     size = np.array([intrinsics.width, intrinsics.height])
     rows = max(2, round(COLUMNS * intrinsics.height / intrinsics.width))

@@ -256,7 +256,8 @@ class Problem:
     def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
         """Order, points and rigs of the r rows of the image equations after sorting by point and rig, and their index.
 
-        A row has two residuals. The order holds numbers before sorting: observations, then two for each board corner.
+        A row has two residuals. Before sorting, the rows are the observations, then two rows for each board corner; the
+        order holds their numbers before sorting.
         """
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
@@ -443,7 +444,8 @@ def freed(
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
     `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. The intrinsics part
-    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images`: the camera's.
+    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images` are the indices of
+    the camera's m images among all `n_images`.
     """
     rows, units, weak = rows_of(problem, camera, images, n_images)
     q = len(problem.cameras[camera].directions)
@@ -511,7 +513,8 @@ def stepped(
     """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
 
     `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
-    arms; `columns` (d,) has the order of `Problem.columns`. Transforms step as in geometry.retract. Points stay.
+    arms; `columns` (d,) has the order of `Problem.columns`. Six numbers of a transform are translation, then rotation
+    (rad), as in geometry.retract. None: no step. Points do not move.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -559,7 +562,8 @@ def step_to(
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
     """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation.
 
-    The seven columns are about the world's origin; each rig has rows of translation, then rotation (geometry.retract).
+    The seven columns are 1, 3 and 3 numbers; scale and rotation are about the world's origin. The rows of each rig are
+    translation, then rotation (geometry.retract).
     """
     position = world_from_rig[:, :3, 3]
     rigs = np.zeros((len(position), 6, 7))

@@ -212,7 +212,8 @@ def solve(
 
     If `start` has an estimate of the pixel noise already, it is taken as near the solution. Otherwise a bundle
     adjustment with assumed robot errors precedes the rounds. `averaged`: average over the sizes of the robot's errors,
-    else use their most likely values (fast, understates the uncertainty). `start_noise` are these errors (m, rad).
+    else use their most likely values, which is faster and understates the uncertainty. `start_noise` are these assumed
+    random errors of the poses (m, rad), unless the problem has a lower bound.
     """
     if problem.observations is None:
         return with_covariance(problem, start, None, averaged)
@@ -308,7 +309,8 @@ def size_of_boards(solution: Solution) -> tuple[float, Float[ndarray, " p"]]:
 def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool, int, float]:
     """Estimate error sizes and step all unknowns, in at most ROUNDS rounds until both converge.
 
-    Return state, evidence of images, whether it converged, number of rounds, last step (σ) of an arm's unknown.
+    Return the state, the evidence of the images, whether the rounds converged, their number, and the largest last step
+    of an arm's unknown in standard deviations.
     """
     state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
     ends, steps = list[ndarray](), list[ndarray]()
@@ -361,8 +363,9 @@ def _joint_step(
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
     """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
 
-    `equations` are about `images.state`. The d columns are those of `Problem.columns` (cameras, boards, rigs). The p
-    unknowns are those of the arms, then the columns `Problem.free`.
+    `equations` are those of the reported poses about `images.state`, `log_sizes` the log sizes of the robot's errors.
+    The columns (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the
+    columns `Problem.free`.
     """
     problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
     solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
@@ -382,7 +385,8 @@ def _accelerated(
     """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
 
     `ends` and `steps` hold for each round the n coordinates (`_coordinates`) at its end, and its step. The combination
-    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`.
+    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`. All n
+    coordinates are combined by the same factors.
     """
     if len(steps) == 1:
         return ends[-1]
@@ -404,7 +408,8 @@ def with_covariance(
     """Return the solution with its covariance, from a state near the solution and the evidence of the images.
 
     The arms' unknowns and error sizes are first iterated to convergence. `images` None: camera poses are given.
-    `averaged` is that of `solve`. `expected` is the noise of a predicted solution (residuals 0); None: estimated.
+    `averaged` is that of `solve`. `expected` is the assumed robot noise of a predicted solution, whose residuals are 0
+    and whose state is not iterated; None: the noise is estimated.
     """
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)

@@ -115,7 +115,8 @@ class _Images(tuple[str, ...]):
 def quantities(finding: Finding) -> defaultdict[str, Any]:
     """Return the values for the templates of a finding's message and remedy, by name: its details and numbers.
 
-    Each number is also in mm, degrees and percent (`mm`, `std_percent`). A name without a value gives an empty text.
+    Each number is also given in mm (m times 1000), degrees and percent, under names such as `mm` or `std_percent`. A
+    name without a value gives an empty text.
     """
     named: defaultdict[str, Any] = defaultdict(
         _Text, images=_Images(finding.images), concerns=_Text(finding.concerns)

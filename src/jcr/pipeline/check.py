@@ -240,7 +240,8 @@ def read_and_compare(
     Return the capture, with a note on the selected convention, and the options with which it was read. The fit is the
     median residual between gripper poses and camera poses from a few images of reduced size. Its unit is m: translation
     plus 0.3 m times rotation (rad). `into` is the new folder to which the images of a recording are extracted. Raises
-    InputError if no convention fits three times better than the others.
+    InputError if the images cannot be reconstructed, or the best convention does not fit three times better than the
+    second.
     """
     options = options or ReadOptions()
     with suppress(OpenConventionError):

@@ -133,7 +133,8 @@ def select_reconstruction(
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
     a note names the selected one and the reason. If there is only one back end to try, `keep` receives its
     reconstruction before the calibration. If `before` is given, only the reconstruction that it returns is calibrated.
-    Raises InputError if a back end does or joint angles contradict poses, NothingFoundError without a calibration.
+    Raises InputError if a back end does, or if gripper poses and joint angles contradict each other; NothingFoundError
+    if no back end gives a calibration.
     """
     robot_errors(capture, options.calibrate)  # raises InputError before time is spent on the images
     trials, notes = list[Trial](), list[str]()
@@ -250,7 +251,8 @@ def _try(
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
     `source` is the options of the back end, or a function that returns a reconstruction, which `keep` receives before
-    the calibration. Dense depth is estimated first if a known length needs it.
+    the calibration. Dense depth is estimated first if a known length needs it. An InputError of the calibration is
+    raised, because it would occur with every back end.
     """
     start, report = time.perf_counter(), progress or silent
     own = source if isinstance(source, ReconstructOptions) else None

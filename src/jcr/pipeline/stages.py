@@ -80,7 +80,7 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run those of the named stages that the run needs; return the result with their outputs and times (s)."""
+    """Run those of the named stages that the run needs; return the result with outputs and times (s) of each."""
     unneeded = set() if result.others else {"cameras"}
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):
@@ -163,7 +163,8 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
 
     A reconstruction of the same inputs in the run folder, or in the one that `jcr capture` wrote, is used again. For a
     fixed camera, only the pixels of the object that the gripper carries are used. If no back end gives a calibration,
-    calibration.json and the report state the reason, and NothingFoundError is raised, which may propose `--board`.
+    calibration.json and the report state the reason, and NothingFoundError is raised; it proposes the option `--board`
+    if the images show a board.
     """
     capture, out, options = result.capture, result.out, result.state.options
     seen = capture

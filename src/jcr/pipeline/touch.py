@@ -54,8 +54,9 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
     `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
     run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The surface point is that
-    of the nearest pixel of the image's pointmap. Expected errors include the calibration's covariance and the robot's
-    errors at each touch. Raises InputError for fewer than three points, unknown images, or pixels without a surface.
+    of the nearest pixel of the image's pointmap. The expected errors include the covariance of the calibration, common
+    to all points, and the robot's errors at each touch. Raises InputError for fewer than three points, an image that is
+    not in the run, or a pixel without a surface.
     """
     points = Path(points)
     calibration, capture, reconstruction = RunResult(out).of_wrist_camera()

@@ -82,7 +82,8 @@ class PoseConvention:
 def check_convention(case: Case) -> Case:
     """Return the case with a finding if its calibration is rejected and the gripper poses fit in another convention.
 
-    Degenerate motions may fit by chance, so they only warn. Nothing is searched if a wrong board size is the reason.
+    The finding only warns if the motions are degenerate, because such motions may fit another convention by chance. No
+    convention is searched if a wrong board size explains the rejection.
     """
     fit, capture = case.pose_fit, case.capture
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)

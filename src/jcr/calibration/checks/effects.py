@@ -159,7 +159,8 @@ def check_effects(case: Case) -> Case:
 def of_case(case: Case) -> Adjustment:
     """Return the case's adjustment in the form that the tests of effects need (hypotheses.Adjustment).
 
-    With too many points (MOST_POINTS) or bytes (MOST_BYTES), a case is adjusted again with a random subset of points.
+    A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
+    a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
     """
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
     free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
@@ -189,7 +190,8 @@ def effects_of_fit(
     """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
     Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
-    `known` are further keyword arguments of `pose_problem`, such as `error_covariance` and `priors`.
+    `known` are further keyword arguments of `pose_problem`: `camera_covariance`, `error_covariance`, `noise_floor`,
+    `priors`.
     """
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
@@ -431,7 +433,8 @@ def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
 def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]:
     """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
-    `after` includes the effect; `stds` are of `tested_intrinsics`: relative for fx and fy, image widths for cx and cy.
+    `after` is the adjustment with the effect. `stds` holds the standard deviation of each tested parameter
+    (`tested_intrinsics`). Those of fx and fy are relative, those of cx and cy are in image widths.
     """
     assert after.camera is not None
     camera, shown = after.solution.problem.cameras[after.camera].intrinsics, list[str]()
@@ -504,8 +507,8 @@ def with_effects(
 
     `model` includes the effects that `findings` report. The adjusted X is the effective hand-eye transform, which
     predicts best from reported gripper poses. A finding's remaining shift is the difference from the transform for the
-    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. The adjustment is None
-    without such an effect.
+    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. Return None as
+    adjustment if there is no effect on camera or arm.
     """
     strains = [row for row in model.rows if row.kind.row.group == "strain"]
     if not strains and not any(one.kind.row.group == "camera" for one in findings):
@@ -543,7 +546,8 @@ def with_effects(
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
     """Return the step of the p unknowns from values for the reported gripper poses to values for the true ones.
 
-    `columns` (s,b), s = 6 per pose (m, rad; base axes), are b confirmed errors of one standard deviation each.
+    The first seven unknowns are in COVARIANCE_ORDER. `columns` (s,b) are the b confirmed error patterns of the poses,
+    one standard deviation each; s = 6 per pose (m, rad; base axes).
     """
     straight = replace(solution.equations, confirmed=columns @ columns.T)
     return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step

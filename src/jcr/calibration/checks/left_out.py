@@ -21,7 +21,8 @@ which the other pose belongs to the image."""
 def check_pairing(case: Case) -> Case:
     """Return the case with findings on unused images whose gripper poses are exchanged, if those of used images agree.
 
-    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted.
+    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted. Images
+    with a merely wrong pose give no finding here.
     """
     kinds = {one.kind for one in case.hand_eye.findings}
     disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}

@@ -74,8 +74,9 @@ class Length:
 def check_lengths(case: Case) -> Case:
     """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
 
-    Known lengths are of a board, the option known_length, a depth camera, a network, or the robot's positions. Two
-    contradict if they differ by more than SIGMAS standard deviations and than LEAST. `Calibration.lengths` records it.
+    A known length comes from a board, the option known_length, a depth camera or a network; the robot's positions count
+    as another length. Two of them contradict if they differ by more than SIGMAS standard deviations and by more than
+    LEAST. The comparison is recorded in `Calibration.lengths`.
     """
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
@@ -152,7 +153,8 @@ def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: 
     """Return the finding that two of the `lengths` contradict each other; a length by the robot must be `one`.
 
     The finding rejects only if both lengths are exact (EXACT) and one is the robot's. A board that contradicts the
-    robot by up to MISPRINTED, with no other length near the board's, has a wrong size; the finding then warns.
+    robot by up to MISPRINTED, with no other length near the board's, was printed or stated at a wrong size. The finding
+    then warns, because the result is that of the robot alone.
     """
     off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
     if of_robot and other.name == "network":
@@ -184,7 +186,8 @@ def _fused(
 ) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale.
 
-    Findings and checks of `hand_eye` are kept. `fault` (COVARIANCE_ORDER) is added to the calibration's covariance.
+    `hand_eye` is the calibration without these priors, whose findings and checks are kept. `fault` is a covariance
+    (COVARIANCE_ORDER) that is added to the calibration's covariance.
     """
     adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
     assert adjusted is not None
@@ -215,7 +218,8 @@ def _fused(
 def check_predicted_focal(case: Case) -> Case:
     """Return the case with a finding if a network's focal length contradicts the given one.
 
-    The limit is OF_NETWORK standard deviations; `Finding.intrinsics_shift` adds the difference to the covariance.
+    They contradict if they differ by more than OF_NETWORK standard deviations. The finding adds the difference to the
+    covariance of the intrinsics (`Finding.intrinsics_shift`).
     """
     given, predicted = case.capture.intrinsics, case.reconstruction.predicted_focal
     if given is None or predicted is None:
@@ -236,7 +240,8 @@ def check_predicted_focal(case: Case) -> Case:
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:
     """Return scale error and noise of the depth images, measured by the robot; None if too few features have a depth.
 
-    Features' depths are converted to metres by `hand_eye.scale`. Raises InputError if a depth image cannot be read.
+    Measured depths are compared with the depths of reconstructed features, which `hand_eye.scale` converts to metres.
+    None is also returned without depth images. Raises InputError if a depth image cannot be read.
     """
     if capture.depths is None:
         return None
