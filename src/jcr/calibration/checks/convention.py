@@ -146,7 +146,7 @@ def _better_adjusted(
     """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
 
     Camera poses from images without given intrinsics are too poor to select a convention, before the images are
-    adjusted. Only the ADJUSTED candidates with the smallest closed-form error are adjusted, if it is below that of the
+    adjusted; with given intrinsics the result is None. Only the ADJUSTED candidates with the smallest closed-form error are adjusted, if it is below that of the
     given poses. `by_name` is that of `better_reading`.
     """
     rows = case.reconstruction.image_index
