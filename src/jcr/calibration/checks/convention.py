@@ -146,8 +146,8 @@ def _better_adjusted(
     """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
 
     Camera poses from images without given intrinsics are too poor to select a convention, before the images are
-    adjusted; with given intrinsics the result is None. Only the ADJUSTED candidates with the smallest closed-form error are adjusted, if it is below that of the
-    given poses. `by_name` is that of `better_reading`.
+    adjusted; with given intrinsics the result is None. Only the ADJUSTED candidates with the smallest closed-form error
+    are adjusted, if it is below that of the given poses. `by_name` is that of `better_reading`.
     """
     rows = case.reconstruction.image_index
     given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
