@@ -139,7 +139,9 @@ def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:
             ratio = (together - within) / within * (n - 2)
             log_p = f_distribution.logsf(float(ratio), 6, 6 * (n - 2)) + float(np.log(len(groups)))
             fewer = first if 2 * first.sum() <= n else ~first
-            shift_px = np.sqrt((together - within) / count[seen][fewer].sum())
+            # The motion between the groups; each group deviates less from the mean of all images.
+            corners_of = np.array([count[seen][first].sum(), count[seen][~first].sum()])
+            shift_px = np.sqrt((together - within) * (1 / corners_of).sum())
             if log_p < best and shift_px > LEAST_MOVED_PX:
                 best, moved = log_p, rows[seen[fewer]]
     return moved
