@@ -66,7 +66,8 @@ def skew(v: Vectors) -> Rotations:
 def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
     """Return [I, -skew(v), v] (...,3,7), the derivatives of points v (...,3) by a small similarity transform.
 
-    Columns: translation (3), rotation vector about the origin (3, rad), log scale (1), in the frame of v.
+    Columns: translation (3), rotation vector about the origin (3, rad), natural logarithm of the scale (1), in the
+    frame of v.
     """
     return np.concatenate([np.broadcast_to(np.eye(3), (*v.shape, 3)), -skew(v), v[..., None]], axis=-1)
 

@@ -85,7 +85,8 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
     """Write the images and a COLMAP model with their tracks (sparse/0, binary and text) into a new folder.
 
     The model's world is the base frame, in metres. Observations outside of the written images, and points with fewer
-    than two remaining observations, are left out. `notes` are in README.txt. Raises InputError without such a model.
+    than two remaining observations, are left out. `notes` are stored in README.txt. Raises InputError if COLMAP lacks
+    the distortion model.
     """
     with _new_folder(folder) as made:
         names, intrinsics = _place_images(made / "images", views, options)

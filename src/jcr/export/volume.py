@@ -33,7 +33,8 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 
     The side of a voxel is `options.voxel_size` m, by default the map's cell. A voxel is occupied if its inscribed
     sphere touches a seen surface, and free if the sphere touches neither a surface nor unseen space. All other voxels
-    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap.
+    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap, and
+    if there would be too many voxels.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, options.voxel_size)
@@ -113,13 +114,21 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
-    """Return the centres (x,y,z,3), m, of `count` (3,) voxels of side `voxel` (m) from the corner `lower` on."""
+    """Return the centres (x,y,z,3) in m of a grid of cubic voxels of side `voxel` (m); the axes follow x, y, z.
+
+    `count` (3,) is the number of voxels along each axis. `lower` (3,) is the corner of the grid with the smallest
+    coordinates (m).
+    """
     axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """Return the side (m) of voxels, None: the map's cell; raise InputError unless it fits, with at most 50 million."""
+    """Return the side (m) of voxels: `side` or, if None, the map's cell.
+
+    Raises InputError if it is not positive, exceeds the shortest side of the workspace, or gives over 50 million
+    voxels.
+    """
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():

@@ -230,7 +230,10 @@ def _residuals(
 def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
 ) -> Float[ndarray, "..."]:
-    """Return angles (rad) between gripper · X and X · camera of p pairs: (p,) for X (3,3), (h,p) for X (h,1,3,3)."""
+    """Return the angle (rad) between gripper · X and X · camera, for each rotation X in `x` and each of p pairs.
+
+    The shape is (p,) for one X (3,3), and (h,p) for X of shape (h,1,3,3).
+    """
     return np.arccos(np.clip((np.einsum("...ij,...ij->...", gripper @ x, x @ camera) - 1) / 2, -1, 1))
 
 

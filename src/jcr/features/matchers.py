@@ -155,7 +155,10 @@ class Matcher:
         return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
     def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
-        """Return the inliers of a pair by its key, and the motions its geometry allows in `view`; cached."""
+        """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
+
+        The rays and intrinsics are those of `view`; `geometry` is the result of `verified`.
+        """
         depends = key, id(geometry), view.intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
@@ -213,7 +216,8 @@ def matrices(
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
     """Return a geometry's essential matrix and homography, from rays of image i to image j; None if COLMAP has none.
 
-    They apply to rays (x/z, y/z, 1): x_jᵀ E x_i = 0, and x_j ∝ H x_i. `found` is in pixels of `intrinsics`.
+    They apply to rays (x/z, y/z, 1): x_jᵀ E x_i = 0, and x_j is proportional to H x_i. `found` is in pixels of images
+    with `intrinsics`.
     """
     k = intrinsics.matrix + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     essential, homography = found.E, found.H
@@ -232,7 +236,8 @@ def still_cells(
 
     Such cells show the gripper's own fingers, a logo, or text drawn into the images. The cells have sides of CELL_PX,
     and many means LEAST_PAIRS and the share LEAST_SHARE. `x_px` are the keypoints of each image, and `raw` the matches
-    of each pair as rows of keypoints. `moving` are the pairs with motion, and `size` is width and height, px.
+    of each pair as rows of keypoints. `moving` are the pairs between which the gripper moved, and `size` is width and
+    height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)

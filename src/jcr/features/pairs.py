@@ -39,7 +39,11 @@ def all_pairs(n: int) -> list[Key]:
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
-    """Return pairs of each image with one of each of its `neighbours` nearest viewpoints; `motion[i, j]`: i_from_j."""
+    """Return the pairs of each image with one image of each of its `neighbours` nearest viewpoints.
+
+    The distance is the length of the gripper's motion (geometry.motion_length). `motion[i, j]` is the gripper's
+    i_from_j.
+    """
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
@@ -51,7 +55,10 @@ def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
 
 
 def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return for each image the row of the first image of its viewpoint; `motion[i, j]` is the gripper's i_from_j."""
+    """Return for each image the row of the first image of the same viewpoint (SAME_VIEWPOINT).
+
+    `motion[i, j]` is the gripper's i_from_j.
+    """
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -62,8 +69,9 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
 def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
-    Each image has up to PARTNERS viewpoints. The shared scene is measured by points of confirmed pairs in `found`, at
-    least 20, with a known hand-eye rotation. `motion[i, j]` is the gripper's i_from_j.
+    Each image has up to PARTNERS viewpoints. The shared scene is measured by the points of the pairs in `found` that
+    the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
+    gripper's i_from_j.
     """
     if (gripper_from_camera := hand_eye_of_pairs(found, motion)) is None:
         return []

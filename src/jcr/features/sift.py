@@ -38,7 +38,10 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
 
 
 def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
-    """Return keypoints (x, y in px; pixel centres are whole numbers) and RootSIFT descriptors of a grey image."""
+    """Return keypoints (x, y in px; pixel centres are whole numbers) and unit descriptors (RootSIFT) of a grey image.
+
+    The arrays are empty if nothing is found.
+    """
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -101,7 +104,10 @@ class SiftFeatures:
         del self.x_px[row], self.descriptors[row]
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Return for each pair its m matches, as rows of keypoints of its two images (m,2); `rolls` are not used."""
+        """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
+
+        SIFT does not use the rotations `rolls`.
+        """
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(lambda key: matches(*(self.descriptors[row] for row in key)), pairs)
             return [np.stack(rows, 1) for rows in found]

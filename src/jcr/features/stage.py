@@ -97,7 +97,8 @@ class _Search:
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
         """Match pairs with their two images rotated by angles (rad); keep the better geometry of each pair.
 
-        `rotations` has the angles of both images, clockwise on the screen; those tried before are left out.
+        `rotations` has the angles of the first and of the second image, clockwise on the screen. Rotations that were
+        tried before are left out.
         """
         todo = {}
         for key, both in rotations.items():
@@ -120,7 +121,8 @@ class _Search:
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs with the second image rotated by 0, 90, 180 and 270° until the hand-eye rotation is known.
 
-        At most GUESSED_AT_MOST pairs are matched. Returns the pairs classified by the gripper, `found` before.
+        At most GUESSED_AT_MOST pairs are matched. Returns the pairs, classified by the gripper; `found` is the
+        classification before.
         """
         for start in range(0, min(len(pairs), GUESSED_AT_MOST), GUESSED_AT_ONCE):
             for quarter in range(4):
@@ -134,7 +136,8 @@ class _Search:
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
         """Match pairs with each image rotated by its angle `upright` (rad); classify all pairs by the gripper's motion.
 
-        The angles are those of `gate.rolls`. The earlier `found` gives the hand-eye rotation if the pairs do not.
+        The angles are those of `gate.rolls`. `found` is the classification before, whose hand-eye rotation is used if
+        the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return classify_pairs(
@@ -142,7 +145,10 @@ class _Search:
         )
 
     def hide_still_parts(self) -> None:
-        """Verify all matches without the cells that stay while the gripper moves; remove pairs with too few others."""
+        """Find the cells of the image that stay while the gripper moves; verify all matches without these cells.
+
+        Pairs with too few other matches are removed.
+        """
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
@@ -160,7 +166,8 @@ class _Search:
     def _is_better(self, new: Pair) -> bool:
         """Test whether the new geometry of a pair replaces the one in `pairs`.
 
-        It does if it alone agrees with the gripper's angle, or has over half as many matches if both or neither do.
+        It does if it alone agrees with the gripper's angle. If both or neither agree, the new geometry needs more than
+        half as many matches as the old one.
         """
         if new.key not in self.pairs:
             return True
@@ -182,7 +189,8 @@ class _Search:
     def _intrinsics_by_robot(self) -> Intrinsics | None:
         """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
 
-        They are those at the size of matching; None where too few pairs agree on a focal length (LEAST_SUPPORT).
+        The image size of the result is the size of matching. Returns None where too few pairs agree on a focal length
+        (LEAST_SUPPORT).
         """
         size = self.view.intrinsics.width, self.view.intrinsics.height
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
@@ -301,7 +309,8 @@ def _pairs_to_map(
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
     """Return the rows of images with a wrong gripper pose: their pairs contradict it and agree on one correction.
 
-    An image needs three such pairs, whose corrections differ by under 3° in the median; `motion` is i_from_j.
+    An image needs three such pairs or more, whose corrections differ by less than 3° in the median. `motion[i, j]` is
+    the gripper's i_from_j.
     """
     assert found.of_x is not None
     x = found.of_x.rotation

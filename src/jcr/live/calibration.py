@@ -116,7 +116,8 @@ class LiveCalibration:
     def remove(self, index: int) -> Progress:
         """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image.
 
-        Returns the new state. A negative `index` counts from the end; InputError if there is no such image.
+        Returns the new state of the calibration. A negative `index` counts from the end. Raises InputError if there is
+        no such image.
         """
         with self._lock:
             names = self.live.names
@@ -126,7 +127,10 @@ class LiveCalibration:
             return self.update()
 
     def undo(self) -> Progress:
-        """Undo the last addition or removal of an image, if there is one; return the new state of the calibration."""
+        """Undo the last addition or removal of an image since this object was made, and calibrate again.
+
+        Returns the new state of the calibration, which is the same if there is nothing to undo.
+        """
         with self._lock:
             self.live.undo()
             return self.update()
@@ -167,7 +171,10 @@ class LiveCalibration:
 
     @one_blas_thread
     def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with another next pose, 0.06 m from `base_from_gripper` (m), where no image could be kept."""
+        """Return the state with another proposed pose, because no image could be kept at `base_from_gripper` (m).
+
+        The camera is more than 0.06 m from where it was at that pose and at the poses of earlier calls, if possible.
+        """
         with self._lock:
             self._refused.append(base_from_gripper)
             self.progress = replace(self.progress, **self._propose())

@@ -72,7 +72,8 @@ def _read_by(
 ) -> Iterator[Camera]:
     """Yield the camera whose next frame the function `read` waits for and returns; `read` returns None at the end.
 
-    A thread reads the device or stream `name`, so that no old frames are buffered; None: a recording, without thread.
+    A thread reads the device or stream called `name`, so that no old frames are buffered. If `name` is None, the source
+    is a recording, which is read without a thread.
     """
     newest, arrived, is_closed = deque[Frame](maxlen=1), threading.Condition(), threading.Event()
 
@@ -301,8 +302,9 @@ def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None
     """Return the intrinsics that a RealSense stores, as an entry of capture.json with OpenCV's distortion model.
 
     OpenCV's coefficients k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for
-    a grid of pixels, because its distortion models differ ("Projection in Intel RealSense SDK 2.0"). None: the fit
-    deviates by 0.05 px or more. `rs` is pyrealsense2, `stored` its rs.intrinsics.
+    a grid of pixels. The distortion models of librealsense differ from OpenCV's ("Projection in Intel RealSense SDK
+    2.0"). Returns None if the fit deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its object
+    rs.intrinsics of the colour camera.
     """
     intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
     if not any(stored.coeffs):
@@ -353,7 +355,10 @@ class ImageSummary:
         return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images have equal size and grey levels that differ by noise only, under 2.5 of 255."""
+        """Test whether two images are the same view: equal size, and grey levels that differ by noise only.
+
+        The mean absolute difference of the reduced images must be below 2.5 of 255 grey levels.
+        """
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 

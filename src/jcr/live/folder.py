@@ -98,7 +98,8 @@ class LiveFolder:
         """Check an image and its gripper pose, write both, and return the name of the image.
 
         The arguments are those of `LiveCalibration.add`; `joints` are written only if all images have them. Raises
-        InputError, or OSError if a file cannot be written; the capture is then unchanged.
+        InputError if the image or the pose does not fit the capture, and OSError if a file cannot be written. The
+        capture is then unchanged.
         """
         number, stem = f"image {len(self.images) + 1}", f"{self._next_number:03d}"
         pixels = checked_image(image, color, number)
@@ -158,7 +159,10 @@ class LiveFolder:
         return None if not images or self.size is None else self._capture_of(images, self.size)
 
     def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
-        """Raise InputError, begun with `number`, if image and pose (m), or the image alone, repeat one of the folder."""
+        """Raise InputError if the image `new` is the same as an image of the folder, whether the gripper moved or not.
+
+        `base_from_gripper` (4,4) is the gripper pose (m) of the new image; `number` names the image in the message.
+        """
         for one in self.images:
             if not new.is_like(self.summary(one.image)):
                 continue
@@ -171,7 +175,10 @@ class LiveFolder:
             )
 
     def _capture_of(self, images: tuple[FrameEntry, ...], size: tuple[int, int]) -> Capture:
-        """Return the capture with these images of `size` (width, height); raise InputError if other entries misfit."""
+        """Return the capture with these entries of images of `size` (width, height) px.
+
+        Raises InputError if other entries of capture.json, such as the intrinsics, do not fit the images.
+        """
         return Capture(
             folder=self.folder,
             images=tuple(one.image for one in images),

@@ -121,8 +121,9 @@ def joints_at(
 ) -> Float[ndarray, " dof"] | None:
     """Return joint angles (rad) within the limits of `arm` that move the gripper to the pose `goal`; None if impossible.
 
-    `goal` is a base_from_gripper. `base_from_gripper` and `joints` (rad) are those of the n images; `joints` None: not
-    recorded. The last recorded joints determine tool pose and configuration (elbow up or down, …).
+    `goal` is a base_from_gripper. `base_from_gripper` and `joints` (rad) are those of the n images; `joints` is None if
+    they were not recorded. The last recorded joints determine the pose of the tool on the flange, and the result keeps
+    their configuration (elbow up or down, …).
     """
     if joints is not None:
         now = joints[-1:]

@@ -49,7 +49,10 @@ def whole_page(session: LiveSession) -> str:
 
 
 def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> dict[str, Any]:
-    """Return the page's changing parts: HTML by name, 3D view, flags; `has_report`: the final report can be opened."""
+    """Return the changing parts of the live page for a state: HTML by name, data of the 3D view, flags of the script.
+
+    `has_report` states that the report of the final calibration exists and can be opened.
+    """
     # "kind" selects the colour of the headline; "images" are the cards of the list, the newest first.
     kind, *lines = verdict_lines(state)
     headline, *below = (line[:1].upper() + line[1:] for line in lines)

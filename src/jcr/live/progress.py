@@ -57,7 +57,10 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Bounds (mm, degrees) on 95 % of errors of a point at the working distance; None without a requirement."""
+        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors of a point at the working distance.
+
+        None without a calibration, or if the calibration has no requirement.
+        """
         required = None if self.hand_eye is None else self.hand_eye.requirement
         return None if required is None else (float(required.reached_mm), float(required.reached_deg))
 
@@ -114,7 +117,10 @@ class Progress:
 
 
 def faults(state: Progress) -> list[Finding]:
-    """Return findings that reject or warn, first those on the last image; not those that only ask for more images."""
+    """Return the findings that reject the calibration or warn, first those about the image added last.
+
+    Findings that only state that more images are needed are left out.
+    """
     more_images = FindingKind.NOT_EXACT_ENOUGH, FindingKind.FEW_IMAGES
     acting = (one for one in without_consequences(state.findings) if one.severity != "informs")
     found = [one for one in acting if one.kind not in more_images]
@@ -122,7 +128,10 @@ def faults(state: Progress) -> list[Finding]:
 
 
 def finding_lines(state: Progress) -> list[str]:
-    """Return `faults` as sentences; those about one image with commands, whose image numbers count from 1."""
+    """Return each finding of `faults` as a sentence; one about a single image has the commands to retake or remove it.
+
+    Images are numbered from 1 in the commands.
+    """
     retake = {name: f" (retake {k}, or remove {k})" for k, name in enumerate(state.images, start=1)}
     return [
         sentence(one) + (retake.get(one.images[0], "") if len(one.images) == 1 else "")

@@ -173,7 +173,10 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
 
 
 def franka_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a Franka arm by franky-control; base_from_gripper is O_T_EE, as set in Franka Desk."""
+    """Yield the states of a Franka arm (FER, FR3), read from its control interface by the package franky-control.
+
+    base_from_gripper is O_T_EE: the pose of the end effector that is set in Franka Desk.
+    """
     where = f"--poses franka:{host}"
     franky = extra("franky", "franka", where)
     try:
@@ -192,7 +195,10 @@ def franka_states(host: str) -> Iterator[RobotState]:
 
 
 def xarm_states(host: str) -> Iterator[RobotState]:
-    """Yield the states of a UFACTORY arm by xarm-python-sdk; base_from_gripper is the TCP set in UFACTORY Studio."""
+    """Yield the states of a UFACTORY arm (xArm, Lite 6, 850), read by the package xarm-python-sdk.
+
+    base_from_gripper is the pose of the tool centre point that is set in UFACTORY Studio.
+    """
     where = f"--poses xarm:{host}"
     timeout = socket.getdefaulttimeout()
     # The package prints its version and errors, which the InputError replaces, and changes the timeout of all sockets.
@@ -252,7 +258,8 @@ def typed_poses(
 ) -> Iterator[Float[ndarray, "4 4"]]:
     """Yield base_from_gripper (4,4) from each typed line of numbers, until an empty line or the end of the input.
 
-    The numbers are as in `pose_of_numbers`. `show` prints the prompt, and the reason why a line is refused.
+    The numbers have the pose convention and units given, "auto" as in `pose_of_numbers`. `show` prints the prompt, and
+    the reason why a line is refused.
     """
     while True:
         show(f"pose at rest ({pose_columns(convention, units)}; empty line ends):")

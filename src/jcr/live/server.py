@@ -249,7 +249,10 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(json.dumps(content).encode() + b"\n", "application/json", status)
 
     def _send(self, body: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> None:
-        """Send a response with type `kind`, the headers HEADERS, and `headers` (by name, underscores as hyphens)."""
+        """Send a response with MIME type `kind`, HTTP `status`, and the security headers HEADERS.
+
+        `headers` are further headers by name; an underscore in a name becomes a hyphen.
+        """
         self.send_response(status)
         own = {"Content-Type": kind, "Content-Length": str(len(body))} | headers
         for name, value in (own | HEADERS).items():

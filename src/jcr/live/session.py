@@ -202,7 +202,10 @@ class LiveSession:
         return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
-        """Execute a command such as "remove"; `number` is its image, counted from 1, None: the last."""
+        """Execute a command of a person, such as "take" or "remove".
+
+        `number` is the number of the image that it concerns, counted from 1; None selects the last image.
+        """
         with self._lock:
             names = self.folder.names
             number = len(names) if number is None else number
@@ -310,7 +313,10 @@ class LiveSession:
         self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
-        """Publish an event (text) on the page and, with `answer` (JSON), through `tell`; `changes` as in `_show`."""
+        """Publish an event (text) on the page, and with `answer` (JSON) through `tell`.
+
+        `changes` are new values of fields of SessionState.
+        """
         self._show(event, is_refusal=not answer.get("accepted", True), **changes)
         self._tell(answer, [event])
 

@@ -56,7 +56,10 @@ def axes_intersection(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float
 
 
 def cost_of(level: Level, cameras: Cameras, stage: PyramidLevel) -> float:
-    """Return the mean robust cost (0 to 1) of colour differences at each point's best depth, as set by `stage`."""
+    """Return the mean robust cost (0 to 1) of the colour differences between images, each point at its best depth.
+
+    `stage` sets the number of points and the scale of the cost (`search_depths`).
+    """
     host, x_px = strong_edges(level, _per_image(level, stage))
     return search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1]
 
@@ -66,7 +69,10 @@ def _per_image(level: Level, stage: PyramidLevel) -> int:
 
 
 def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
-    """Return depths (m) evenly spaced in inverse depth, for n images: DEPTH_RANGE times that where the axes meet."""
+    """Return the depths (z in the camera frame, m) to try in each of n images (columns), evenly spaced in inverse depth.
+
+    They are DEPTH_RANGE times the depth of the point where the optical axes meet.
+    """
     pose = cameras.base_from_camera
     middle = np.clip(((axes_intersection(pose) - pose[:, :3, 3]) * pose[:, :3, 2]).sum(1), *MEET_WITHIN)
     return middle / np.linspace(1 / DEPTH_RANGE[0], 1 / DEPTH_RANGE[1], DEPTHS)[:, None]

@@ -131,7 +131,8 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
 def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
     """Return a factor per image that makes all images equally bright; all are 1 if no |log factor| exceeds LEAST_GAIN.
 
-    Brightness is compared at points that two images show within twice BEFORE_GAINS.sigma; the logs have mean 0.
+    The brightness of two images is compared at points of one that the other shows within twice BEFORE_GAINS.sigma. The
+    logs of the factors have mean 0.
     """
     factor, dark, images = np.ones(level.count), 10 * FAINT, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):
@@ -181,7 +182,10 @@ def images_that_fit(
 
 
 def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
-    """Undistort images (RGB, 0 to 255) by their intrinsics, reduce them to each stage's height; return levels by px."""
+    """Undistort images (RGB, 0 to 255) and reduce them to the height of each stage; return the levels by height in px.
+
+    `intrinsics` are those of the images as given, with distortion.
+    """
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255

@@ -89,7 +89,8 @@ class Points:
 class PhotometricEquations:
     """Normal equations of a Gauss-Newton step in p camera parameters; the log depths of k points are eliminated.
 
-    The parameters are six per camera, or six for all, and the log focal length; log depths are eliminated.
+    The parameters are six per camera, or six for all cameras, and last the log focal length. The steps of the log
+    depths follow from the step of the parameters (Schur complement).
     """
 
     normal: Float[ndarray, "p p"]
@@ -105,7 +106,10 @@ class PhotometricEquations:
 
 
 def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
-    """Return a level: images (RGB, 0 to 1) with intrinsics `grid`, reduced to `height` pixels and blurred (BLUR_PX)."""
+    """Return a level: the images (RGB, 0 to 1) reduced to `height` pixels and blurred (BLUR_PX).
+
+    `grid` are the intrinsics of the images before the reduction.
+    """
     small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
     blurred = []
     for image in images:
@@ -153,7 +157,8 @@ def search_depths(
 
     `host` is the image row of each pixel; `depths` (z in the host's camera frame, m) has one row per trial and one
     column per image. The cost of a point is the mean of r²/(r² + sigma²) over the share SEEN_BY of the images with the
-    smallest colour difference r. It is 1 where fewer than two images see the point. Points below `least` agree.
+    smallest colour difference r. It is 1 where fewer than two images see the point. Points with a cost below `least`
+    are marked as agreed.
     """
     color = level.color[level.grid.height * host + x_px[:, 1], x_px[:, 0]]
     agreed = np.ones(len(host), bool)
@@ -175,7 +180,10 @@ def search_depths(
 def squared_misfit(
     level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
 ) -> Float32[ndarray, "n k"]:
-    """Return the squared difference of RGB (0 to 1) between each image at its pixels u, v, and each point."""
+    """Return for each image and point the squared colour difference, summed over RGB (0 to 1).
+
+    The colour of image n at the pixel u[n, k], v[n, k], by bilinear interpolation, is compared with that of point k.
+    """
     difference = sample(level.color, level, u, v) - points.color
     return np.einsum("nkc,nkc->nk", difference, difference)
 
@@ -196,7 +204,8 @@ def in_view(
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
     """Return per image and point: the point in the camera frame (m), its pixel u and v, and whether the image shows it.
 
-    A point is seen in front of the camera and inside the image, also if occluded; not in its own host image.
+    The image shows a point in front of the camera and inside the image; occlusion is not tested. A host image does not
+    count as seeing its own points.
     """
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
@@ -213,14 +222,21 @@ def in_view(
 def sample(
     stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
 ) -> Float32[ndarray, "n k 3"]:
-    """Return colours (n,k) at pixels u, v of each of n images in `stack`, bilinear; outside, the border's colour."""
+    """Return the colour of each of the n images of `stack` at its k pixels u, v (n,k), by bilinear interpolation.
+
+    `stack` has the images of `level`, or their derivatives, one below the other. Pixels outside the image take the
+    colour of the nearest border pixel.
+    """
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
-    """Return the mean robust cost r²/(r² + sigma²) of colour differences r of agreed points, in images that see them."""
+    """Return the mean robust cost, 0 to 1, of the agreed points over all images that see them.
+
+    The cost of a colour difference r (RGB, 0 to 1) is r²/(r² + sigma²).
+    """
     _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     weight = seen & points.agreed
@@ -278,7 +294,8 @@ def _linearised(
 
     The derivatives are by the twist of the viewing camera, the twist of the point's host camera, the log focal length
     and the log depth. Residuals and derivatives are arrays (images, points, 3 colours); those by a twist have a last
-    axis of 6. The weight is the root of the Geman-McClure weight of scale `sigma`, 0 for points not shown.
+    axis of 6. The weight is the root of the Geman-McClure weight of scale `sigma`; it is 0 where an image does not show
+    an agreed point.
     """
     poses = cameras.base_from_camera
     rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)

@@ -47,7 +47,8 @@ def search(
     """Return the cameras (gripper poses times one hand-eye transform) for which the images agree best in colour.
 
     `levels` are the images by their height in pixels (those of SIZES); the focal length changes unless the intrinsics
-    are known. Raises RejectedError where another transform fits as well, or without edges.
+    are known. Raises RejectedError where a different hand-eye transform fits as well, or where the images have no
+    edges.
     """
     if not len(strong_edges(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise RejectedError(
@@ -115,7 +116,10 @@ def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndar
 
 
 def _distinct(found: Sequence[tuple[float, Cameras]]) -> list[tuple[float, Cameras]]:
-    """Return (cost, cameras), best first, without results that equal a better one within SAME_M and SAME_DEG."""
+    """Return (cost, cameras) of the best of each group of nearly equal results, best first.
+
+    Two results are nearly equal if the poses of their first cameras differ by less than SAME_M and SAME_DEG.
+    """
     kept: list[tuple[float, Cameras]] = []
     for cost, cameras in sorted(found, key=lambda each: each[0]):
         gaps = [inverse(cameras.base_from_camera[0]) @ other.base_from_camera[0] for _, other in kept]
