@@ -166,7 +166,10 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 def _slopes(
     camera: Intrinsics, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return derivatives of `_distorted` at rays (x, y, 1): of its x by x, x by y, y by x, and y by y."""
+    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y.
+
+    `x` and `y` are the undistorted coordinates of rays (x, y, 1).
+    """
     r2 = x * x + y * y
     radial, slope = _radial(camera, r2)
     by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
@@ -203,7 +206,11 @@ def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Return the rays with z = 1 of distorted fisheye coordinates, by Newton's method on their angle, up to 84°."""
+    """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
+
+    The unknown of Newton's method is the angle between ray and optical axis. Coordinates whose angle exceeds 84° get a
+    ray at 84°.
+    """
     k = camera.distortion
     bent = np.linalg.norm(target, axis=-1)
     angle = np.minimum(bent, _WIDEST_ANGLE)
@@ -259,7 +266,10 @@ def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tup
 
 
 def guessed_intrinsics(size: tuple[int, int], focal: float = USUAL_FOCAL) -> Intrinsics:
-    """Return a centred pinhole for images of `size` (width, height); `focal` is relative to the long side."""
+    """Return a pinhole with square pixels for images of `size` (width, height); `focal` is relative to the long side.
+
+    The principal point is the image centre.
+    """
     (width, height), focal_px = size, focal * max(size)
     return Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
 

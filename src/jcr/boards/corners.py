@@ -124,7 +124,7 @@ def _triangulated(
 ) -> Float[ndarray, "c 3"]:
     """Return the c corners in the recon frame, triangulated from b images; NaN for one in fewer than FEWEST_IMAGES.
 
-    `x_px` are pixels of the distorted images, NaN where not detected; `cameras` are recon_from_camera.
+    `x_px` are pixels of the distorted images, NaN where a corner was not detected; `cameras` are recon_from_camera.
     """
     points = np.full((x_px.shape[1], 3), np.nan)
     shown = np.isfinite(x_px[..., 0])

@@ -70,7 +70,7 @@ def boards(spec: str) -> list[Board]:
 
     A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its marker
     length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word SIDE
-    stands for an unknown side, which is then the unit of length. Raises InputError for a name of no board.
+    stands for an unknown side, which is then the unit of length. Raises InputError for a name that means no board.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:
@@ -163,7 +163,10 @@ def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
 
 @cache
 def _charuco_shift_px() -> float:
-    """Return how far (0 or 0.5 px) the installed OpenCV displaces ChArUco corners right and down, from a drawn board."""
+    """Return how far (0 or 0.5 px) the installed OpenCV reports ChArUco corners too far right and down.
+
+    OpenCV's pull request 28380 removed this shift. It is measured once, in a drawn board.
+    """
     square, margin = 40, 20
     board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
     drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)
@@ -206,7 +209,10 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
 
 
 def _circles(count: tuple[int, int], spacing: float) -> Detector:
-    """Return the detector of an asymmetric grid of `count` circles (per row, rows), `spacing` m apart in both axes."""
+    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart.
+
+    Circles in a row are twice `spacing` apart, and every second row is displaced by `spacing`.
+    """
     across, down = count
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
@@ -266,7 +272,8 @@ def most_seen(
     """Return the board of the candidates `readings` with most points in the images, and its detections in each image.
 
     The images are RGB. The first board is tried first. The others are tried only while the best board is found in fewer
-    than half of the images. Under the same condition, images whose strongly coloured pixels are filled in follow.
+    than half of the images. All boards are then tried in images whose strongly coloured pixels are filled in, under the
+    same condition.
     """
     best, seen, points = readings[0], [], -1
     for fill in (False, True):

@@ -24,7 +24,10 @@ LONG_SIDE_PX = 800
 
 
 def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
-    """Return the value of --board, with SIDE as length, for a board in three (LOOKED_AT) of the RGB images, or None."""
+    """Return the value of --board for the board in the RGB images, with SIDE as its length; None if no board is found.
+
+    Three images (LOOKED_AT) are searched, first for tags, then for a chessboard.
+    """
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in chosen]
     if (factor := LONG_SIDE_PX / max(grey[0].shape)) < 1:

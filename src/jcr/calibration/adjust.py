@@ -108,7 +108,8 @@ def adjust_case(
     None: none. `confirmed_errors` (s,b) are b patterns of gripper pose errors of one standard deviation each; None:
     none. Their rows, s = 6 per used image, are translation (m) and rotation vector (rad) in base axes.
 
-    The initial robot pose noise is that of the fit; a smaller one needs ten times the steps if images contradict poses.
+    The initial robot pose noise is that of the fit, and at least START_NOISE. A smaller initial noise needs ten times
+    the steps if poses and images contradict each other.
     """
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
@@ -174,7 +175,10 @@ def with_intrinsics_considered(
 
 
 def refined_by(case: Case, found: Solution) -> Calibration:
-    """Return the calibration of a case's adjustment `found`, with the fit's findings, which `judged` derives again."""
+    """Return the calibration that the adjustment `found` of a case gives, with the findings of the fit to camera poses.
+
+    The findings of the kinds JUDGED still describe the fit; `judged` derives them again.
+    """
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
     uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]

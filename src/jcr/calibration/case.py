@@ -68,7 +68,10 @@ class Case:
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
-        """Camera poses of the registered images in the recon frame and unit: those of `evidence` if there is any."""
+        """Camera poses of the registered images in the recon frame, in units of the reconstruction.
+
+        They are those from the images alone (`evidence`) if the reconstruction has them, else its camera poses.
+        """
         evidence = self.reconstruction.evidence
         return self.reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
 
@@ -114,7 +117,10 @@ class Case:
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Observations to adjust, by used image: `chosen_tracks`, or those in used images, at most MOST_OBSERVATIONS."""
+        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS.
+
+        Their image indices count the used images, from 0.
+        """
         if self.chosen_tracks is not None:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
@@ -150,7 +156,8 @@ class Case:
         """Whether bundle adjustment can refine the fit to camera poses.
 
         It needs MIN_OBSERVATIONS observations and MIN_IMAGES used images. Camera poses with a covariance (`evidence`)
-        are not adjusted, nor are cases with a known scale or height (`priors`), which the bundle adjustment lacks.
+        are not adjusted. Cases with a known scale or height (`priors`) are not adjusted either, because the bundle
+        adjustment does not model these.
         """
         return (
             self.reconstruction.evidence is None
@@ -172,7 +179,10 @@ class Case:
 
     @property
     def is_open(self) -> bool:
-        """Whether the motions are observable and no finding that explains others (`is_explained`) is a known cause."""
+        """Whether the motions are observable and no known cause, such as static images, rejects the calibration.
+
+        A known cause is a finding that explains others (`is_explained`).
+        """
         return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
 
     def after(
@@ -183,7 +193,8 @@ class Case:
     ) -> "Case":
         """Return the case with the findings of a check added, and with a new calibration or adjustment if given.
 
-        A finding's shift is also added to the covariance (`with_findings`). None keeps the case's own.
+        A finding's shift is also added to the covariance (`with_findings`). None for `hand_eye` or `adjusted` keeps the
+        case's own.
         """
         found = with_findings(hand_eye or self.hand_eye, findings)
         fit = self.pose_fit if found.source == "images" else self.fit
@@ -211,7 +222,10 @@ def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calib
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """Return the observations in the images of the mask `used`, the only ones counted by image; all points are kept."""
+    """Return the observations in the used images; their image indices count the used images only, from 0.
+
+    `used` is a mask of the m registered images. All points are kept.
+    """
     kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
     return replace(kept, image=row[kept.image])

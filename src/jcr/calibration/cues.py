@@ -44,7 +44,10 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
 
 
 def check_known_length(capture: Capture, known_length: LengthInImage | None) -> None:
-    """Raise InputError if the image of `known_length` (None: no length) or one of its pixels is not in the capture."""
+    """Raise InputError if the image of `known_length` is not in the capture, or if a pixel lies outside the image.
+
+    None: no length is known, and nothing is checked.
+    """
     if known_length is None:
         return
     image, *ends, _ = known_length

@@ -103,7 +103,8 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
     """Return the test that gripper_from_camera (SLIP) or base_from_recon (BASE_MOVED) changed before image `first`.
 
     `first` is the index of the first new image. The test contains the estimated change: translation (m) and rotation
-    vector (rad), in gripper axes (SLIP) or base axes (BASE_MOVED). It is iterated until it converges.
+    vector (rad), in gripper axes (SLIP) or base axes (BASE_MOVED). The equations are linearized at each estimate until
+    it converges.
     """
     (arm,), (x,), (z,), of_x = problem.arms, state.x, state.z, kind is FindingKind.SLIP
     columns, motion = columns_of_arm(0)[:6] if of_x else columns_of_arm(0)[6:], np.zeros(6)

@@ -86,7 +86,10 @@ FindingJson = Annotated[Finding, PlainSerializer(as_json)]
 
 
 def require_one_verdict(findings: Sequence[Finding], verdict: object, converged: object) -> None:
-    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file."""
+    """Raise ValueError if the `verdict` or `converged` that a file states contradicts the findings in the file.
+
+    The values are of any type, because they are read from JSON.
+    """
     if verdict != verdict_of(findings) or converged is not (verdict != "rejected"):
         raise ValueError("converged, verdict and findings contradict one another")
 
@@ -200,7 +203,10 @@ class Outcome:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings and further rejections in words, without a missed accuracy, the first reason and its consequences."""
+        """Warnings in words, without a missed accuracy, the reason of a rejection, and warnings that follow from it.
+
+        Further findings that reject are included.
+        """
         first = self.short if self.converged else self.findings[0]
         said = without_consequences(self.findings)
         return [sentence(one) for one in said if one.severity != "informs" and one is not first]
@@ -274,7 +280,8 @@ class Calibration(Outcome):
         """Systematic robot errors as JSON: `systematic_deg`, `translation_mm` and `rotation_deg`, and `joints`.
 
         `systematic_deg` is their size (`RobotNoise.systematic`); `translation_mm` and `rotation_deg` are the part per
-        axis that the fit leaves. `joints`: offset and standard deviation of each (degrees); null for an unknown arm.
+        axis that the fit leaves. `joints` lists the offset and standard deviation of each joint (degrees); null for an
+        unknown arm.
         """
         offsets, joints = self.joint_offsets, None
         if offsets is not None:
@@ -295,12 +302,18 @@ class Calibration(Outcome):
 
     @property
     def gripper_from_object(self) -> Similarity:
-        """Similarity of the carried object's recon coordinates to the gripper (m); InputError for a camera on it."""
+        """Similarity from recon coordinates (any unit) of the carried object to the gripper frame (m).
+
+        Raises InputError for a camera on the gripper.
+        """
         return Similarity(self._require(self.carried, "base"), self.scale)
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance of translation (m), rotation vector (rad), log scale; axes of the gripper, or base if fixed."""
+        """Covariance of the translation (m), rotation vector (rad) and log scale, as in records.COVARIANCE_ORDER.
+
+        Axes are those of the gripper, or of the base for a fixed camera.
+        """
         return self.uncertainty.covariance
 
     @property
@@ -418,7 +431,10 @@ class FailedCalibration(Outcome):
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 
     def __getattr__(self, name: str) -> Any:
-        """Return None or () for a field of Calibration; raise RejectedError for its methods, else AttributeError."""
+        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
+
+        Raises AttributeError for a name that a Calibration does not have.
+        """
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
             return () if name in {"next_poses", "lengths"} else None
         if name.startswith("_") or not hasattr(Calibration, name):
@@ -470,7 +486,10 @@ def write_calibration(path: Path, content: Outcome) -> None:
 
 
 def read_calibration(path: Path) -> AnyCalibration:
-    """Read a calibration.json or that of a run folder; raise InputError if missing, damaged, of another format."""
+    """Read a calibration.json, given as a file or as its run folder.
+
+    Raises InputError if the file is missing, damaged, or of another format.
+    """
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")

@@ -78,7 +78,10 @@ def better_poses(
 def predictions(
     assumptions: Assumptions, base_from_gripper: Poses, robot: RobotErrorPrior, added: Float[ndarray, "c 4 4"]
 ) -> Callable[[int], Uncertainty]:
-    """Return a function that predicts the uncertainty of the present poses and the first k `added` ones, given k."""
+    """Return a function that predicts the calibration's uncertainty with the first k of the `added` poses, given k.
+
+    `base_from_gripper` and `robot` are the present gripper poses and the prior of their errors.
+    """
     now = base_from_gripper
     poses = np.concatenate([now, added])
     return cache(lambda k: predict(assumptions, poses[: len(now) + k], robot.with_poses(now, added[:k])))

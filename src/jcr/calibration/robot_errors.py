@@ -82,8 +82,9 @@ def robot_errors(
 def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrorPrior:
     """Return the prior covariance of systematic errors of gripper poses, for an arm or (None) an unknown robot.
 
-    The covariance is that for an error size of 1 rad. `gripper` holds base_from_gripper (m), `joints` (n,dof) the joint
-    angles (rad); None: by inverse kinematics. Raises InputError if the poses do not fit the arm and the angles.
+    The covariance is that for an error size of 1 rad (`RobotErrorPrior.systematic`). `gripper` holds base_from_gripper
+    (m). `joints` (n,dof) are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the
+    poses do not fit the arm and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))
@@ -92,6 +93,9 @@ def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = No
 
 
 def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the part of a covariance, six rows per pose, for the poses of these indices, in their order."""
+    """Return the part of a covariance of poses for the poses of these indices, in their order.
+
+    Both matrices have six rows and columns per pose.
+    """
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]

@@ -74,7 +74,10 @@ def calibrate_reconstruction(
 def calibrate_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case of `checked_case` with its required accuracy and proposed gripper poses."""
+    """Return the case after fit, adjustment and checks, with required accuracy and proposed gripper poses.
+
+    `robot` is the error prior of the registered images' gripper poses.
+    """
     case = checked_case(capture, reconstruction, options, robot)
     gripper, assumptions = case.base_from_gripper, assumptions_of(case)
     found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)
@@ -175,7 +178,8 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
     """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention.
 
-    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`.
+    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`, which
+    needs images.
     """
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")

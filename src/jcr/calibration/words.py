@@ -259,9 +259,10 @@ def seen_in_words(seen: PointUncertaintyOverImage) -> str:
 
 
 def given_in_words(given: GivenIntrinsicsResult) -> str:
-    """Return a sentence on one point's positions by given and by estimated intrinsics, each with their own transform.
+    """Return a sentence with the distance between one point's positions by the given and the estimated intrinsics.
 
-    The sentence states the distance between both, and the point uncertainty (95 %, mm) with the given intrinsics.
+    Each set of intrinsics is used with its own transform. The sentence also states the point uncertainty (95 %, mm)
+    with the given ones.
     """
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "

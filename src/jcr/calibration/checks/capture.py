@@ -98,7 +98,10 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Return the case with findings on an arm model that does not fit, on rotated images, and back-end warnings."""
+    """Return the case with findings on an arm model that does not fit, images rotated on reading, and back-end warnings.
+
+    An arm model that the gripper poses do not fit is not used (`RobotErrorPrior.unused`).
+    """
     first = (case.robot.unused, how_rotated(case.capture))
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)

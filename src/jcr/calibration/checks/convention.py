@@ -145,9 +145,9 @@ def _better_adjusted(
 ) -> tuple[PoseConvention, PoseConvention] | None:
     """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
 
-    Camera poses from images without given intrinsics are too poor to select a convention, before the images are
-    adjusted; with given intrinsics the result is None. Only the ADJUSTED candidates with the smallest closed-form error
-    are adjusted, if it is below that of the given poses. `by_name` is that of `better_reading`.
+    The result is also None with given intrinsics. Without given intrinsics, camera poses are too poor to select a
+    convention before the images are adjusted. Only the ADJUSTED candidates with the smallest closed-form error are
+    adjusted, if it is below that of the given poses. `by_name` is that of `better_reading`.
     """
     rows = case.reconstruction.image_index
     given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
@@ -213,8 +213,9 @@ def _reading(
 def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> list[_Candidate]:
     """Return the candidates whose rotation angles between poses agree best with those of the camera poses.
 
-    The measure is the 60 % quantile of the angle differences over all image pairs. At most SOLVED candidates, up to
-    twice the smallest value plus SAME_ANGLE, are returned: the first USUAL ones first, then others by this measure.
+    The measure is the 60 % quantile of the angle differences over all image pairs. Candidates up to twice the smallest
+    value, plus SAME_ANGLE, are returned, at most SOLVED. Usual mistakes come first (the first USUAL candidates), then
+    the others by this measure.
     """
     camera_angle, gaps = _angles(recon_from_camera), []
     for _, _, gripper, image in candidates:

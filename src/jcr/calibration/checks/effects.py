@@ -127,7 +127,8 @@ def check_effects(case: Case) -> Case:
     """Return the case with findings on effects that the model lacks, such as rolling shutter, camera slip or arm sag.
 
     With adjusted images, the calibration then includes the effects as parameters. Only the findings are added if the
-    tests also use consecutive rejected images (`with_rejected_runs`). A fit to camera poses has tests of the order only.
+    tests also use consecutive rejected images (`with_rejected_runs`). A fit to camera poses is tested only for effects
+    of the image order.
     """
     if not case.is_open:
         return case
@@ -220,7 +221,8 @@ def effects(
     """Return the adjustment with the confirmed effects on its camera and arm, and one finding for each effect.
 
     Each round adds the most significant effect on the camera or on the poses; of two, the one that explains the other.
-    The rounds end if no effect is significant or `at_most` are found. Kinds `passed` or in `model` are not tested.
+    The rounds end if no effect is significant or `at_most` are found. Effects of the kinds `passed`, and of kinds that
+    `model` includes already, are not tested.
     """
     findings, passed = list[Finding](), {*passed, *(row.kind for row in model.rows)}
     while len(findings) < at_most:
@@ -311,7 +313,10 @@ def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bo
 
 
 def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
-    """Return the log of the largest p-value at which an effect is significant: `Policy.alpha` or ALPHA_IF_GIVEN."""
+    """Return the natural logarithm of the largest p-value at which an effect of this kind is significant.
+
+    The p-value is `Policy.alpha` of the kind, or ALPHA_IF_GIVEN for wrong intrinsics that were given.
+    """
     is_given = kind is FindingKind.INTRINSICS and model.is_given
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
 
@@ -386,8 +391,9 @@ def finding_of(test: Test, model: Adjustment) -> Finding | None:
 def _size_of_strain(test: Test) -> dict[str, Any]:
     """Return the fields of a finding for the size of an effect of the arm: keyword arguments of `Finding.of`.
 
-    They are `value` and its standard deviation `std`: a relative length error (strain), rad per metre of reach (lean) or
-    rad (sag). Strain and sag also have a unit axis `x`, `y`, `z` in the `frame` "base" or "gripper".
+    They are `value` and its standard deviation `std`. A strain is a relative length error, a lean is in rad per metre
+    of reach, and a sag is in rad. Strain and sag also have a unit axis `x`, `y`, `z` in the `frame` "base" or
+    "gripper".
     """
     estimate, covariance = test.estimate, test.covariance
     if test.row.kind is FindingKind.BASE_LEANS:
@@ -462,8 +468,9 @@ def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]
 def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Case:
     """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
 
-    `model` includes the effects, which were found with a subset of the points and are now estimated from all that memory
-    permits. Camera effects are dropped if the calibration then changes by at most MATERIAL standard deviations per axis.
+    `model` includes the effects, which were found with a subset of the points. They are now estimated from all points
+    that memory permits. Camera effects are dropped if the calibration then changes by at most half a standard deviation
+    (MATERIAL) on each axis.
     """
     free = model.combinations
     most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))

@@ -39,7 +39,8 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
 
     Unused images without a camera pose in `made` are registered by their features alone. Camera pose and hand-eye
     transform then give the true gripper pose. A reported pose is contradicted if it differs from the true one by more
-    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images.
+    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images. Images
+    that cannot be registered give no finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
     used = set(made.image_index[hand_eye.inliers].tolist())

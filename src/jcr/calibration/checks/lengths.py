@@ -124,7 +124,10 @@ def check_lengths(case: Case) -> Case:
 
 
 def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with `depth_check` set, and a Length for each known length of the case."""
+    """Return the calibration with `depth_check` set, and a Length for each known length of the case.
+
+    `Length.off` is the logarithm of the length by the robot's positions over the stated length.
+    """
     hand_eye, found = case.hand_eye, list[Length]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
@@ -177,7 +180,10 @@ def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: 
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
-    """Return the correction (COVARIANCE_ORDER) for robot positions too large by exp(off): translation, scale shrink."""
+    """Return the correction (COVARIANCE_ORDER) of a calibration from robot positions too large by a factor exp(off).
+
+    Translation and scale shrink by that factor.
+    """
     return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
 
 

@@ -21,7 +21,8 @@ def check_robot(case: Case) -> Case:
     """Return the case with estimated joint offsets of a known arm, and a finding on the significant ones.
 
     An offset (true minus reported angle) is significant above SURE standard deviations. No joint is reported if there
-    are findings about the camera, whose effects also change the camera poses. The arm must be known.
+    are findings about the camera, whose effects also change the camera poses. Nothing is estimated for an unknown arm,
+    or with fewer than MIN_EXAMINED used images.
     """
     used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
     if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
