@@ -103,7 +103,10 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 
 
 def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
-    """Return the EXIF orientation (1 to 8) that all images (keys) share; raise InputError if it differs or mirrors."""
+    """Return the EXIF orientation (1 to 8) that all images share; `orientation_of` has it by the name of each image.
+
+    Raises InputError if the orientations differ or mirror the images.
+    """
     (first, orientation), *others = orientation_of.items()
     remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
     if orientation not in (1, *ROTATED):

@@ -45,12 +45,18 @@ class Convention:
         return self.rotation not in (*QUATERNIONS, "matrix")
 
     def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg"; "auto": usual ones)."""
+        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg").
+
+        For `asked` "auto" they are the usual units of this convention.
+        """
         length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
         return length, angle
 
     def scales(self, asked: UnitsName) -> tuple[float, float]:
-        """Return the factors from the pose's numbers to metres and to radians; `asked` is as in `units`."""
+        """Return the factors from the pose's numbers to metres and to radians, for the units `asked`, such as "mm-deg".
+
+        For `asked` "auto" they are those of the convention's usual units.
+        """
         length, angle = self.units(asked)
         return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 

@@ -98,7 +98,10 @@ def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
-    """Read a 16-bit depth image of `size` (mm): return the depth along the optical axis (m), 0 where not measured."""
+    """Read a depth image (in mm): return the depth along the optical axis (m) at each pixel, 0 where none was measured.
+
+    Raises InputError if the file is not a 16-bit grey image of `size` (width, height).
+    """
     require_file(path)
     if not path.is_file():
         raise InputError(f"{path}: no such depth image; correct its name in the capture or add it")
@@ -112,7 +115,10 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 
 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
-    """Return the size (width, height in px) that all `sizes` by image name share; raise InputError if one differs."""
+    """Return the size (width, height in px) that all images share; raise InputError if one has another size.
+
+    `sizes` maps the name of each image to its size. The message begins with `where`.
+    """
     (first, size), *others = sizes.items()
     if other := [one for one in others if one[1] != size]:
         raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
@@ -120,7 +126,10 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
 
 
 def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian, lower with blur."""
+    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian.
+
+    The variance falls as blur increases.
+    """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
 

@@ -43,7 +43,8 @@ def pair_with_images(folder: Path, file: Path, table: PoseTable, options: ReadOp
     """Pair the poses of a file with a folder's images by name, else by time stamp, else by order of the names.
 
     Return image paths relative to `folder`, base_from_gripper of each, messages by index for images without a usable
-    pose, and notes for the user. Poses paired by time are interpolated. Raises InputError if that is impossible.
+    pose, and notes for the user. Poses paired by time are interpolated. Raises InputError if poses and images cannot be
+    paired.
     """
     if table.images is not None:
         return _paired_by_name(folder, file, table)
@@ -84,7 +85,10 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the paths of the images in a folder, or in its subfolder images/, relative to it, in natural order."""
+    """Return the paths of the images in a folder, relative to it, in natural order ("2.png" before "10.png").
+
+    If the folder has a subfolder images/, only the images in this subfolder are returned.
+    """
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     return sorted((str(file.relative_to(folder)) for file in files), key=natural)
@@ -106,7 +110,10 @@ def stamp_ns(text: str, where: str) -> int:
 
 
 def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
-    """Pair poses with images by names, whose folder, case and ending may differ; return as `pair_with_images`."""
+    """Pair the poses of a table with images by the image names in its rows; the result is that of `pair_with_images`.
+
+    Folder, slashes, case and file ending of a name may differ from those of the image file.
+    """
     assert table.images is not None
     own: dict[str, list[str]] = {}
     for image in image_names(folder):

@@ -138,7 +138,10 @@ def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], w
 
 
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
-    """Convert a file's content by the pydantic model or type adapter `schema`; raise InputError if it does not fit."""
+    """Return the content of a file, converted by the pydantic model or type adapter `schema`.
+
+    Raises InputError, begun with `where`, if the content does not fit.
+    """
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:
         return validate(content)

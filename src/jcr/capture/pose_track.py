@@ -63,7 +63,11 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """Return the speed (m/s, plus 0.3 m · rad/s) of a frame at n time stamps (ns), averaged over 0.1 s around each."""
+    """Return the speed (m/s) of a moving frame at n time stamps (ns), averaged over 0.1 s around each.
+
+    The speed is that of the translation plus 0.3 m times the angular speed (rad/s). `poses_at` is a function from time
+    stamps to poses and gaps.
+    """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
 
@@ -98,7 +102,8 @@ class TfTree:
         """Return a function from time stamps (ns) to base_from_gripper and the gaps (ns) between samples around each.
 
         A gap is the largest of all transforms between the frames; static transforms have none. `base` and `gripper` are
-        names of frames. Raises InputError, begun with `source`, if they are unknown or not connected.
+        names of frames. Raises InputError, begun with `source`, if one is None or unknown, or if they are not
+        connected.
         """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
@@ -129,7 +134,11 @@ class TfTree:
         return poses_at
 
     def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
-        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static."""
+        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static.
+
+        Samples are in the order of the messages. Raises InputError, begun with `source`, for numbers that are no
+        transform.
+        """
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():

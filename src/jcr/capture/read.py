@@ -61,7 +61,8 @@ def read_source(
 ) -> Capture | PosePairs:
     """Return the capture at a path, or PosePairs if the file has camera poses but no images.
 
-    The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the same frames.
+    The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the frames of the same
+    files and options already.
     """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
@@ -93,7 +94,10 @@ def read_source(
 
 
 def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches."""
+    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches.
+
+    With `options.poses`, the format is "table" if no earlier one of FORMATS matches.
+    """
     has_poses = options is not None and options.poses is not None
     for name, form in FORMATS.items():
         if form.recognises(path) or (name == "table" and has_poses):

@@ -40,7 +40,10 @@ class CameraInfo(BaseModel):
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """Read a camera_info YAML as `intrinsics_of_ros` does, for images of `size` (width, height)."""
+    """Read a camera_info YAML as the intrinsics of images of `size` (width, height); None if never calibrated.
+
+    Raises InputError as `intrinsics_of_ros` does.
+    """
     return intrinsics_of_ros(read_yaml(file), size, str(file))
 
 
@@ -111,7 +114,8 @@ def read_ros_camera_info(message: Any) -> Intrinsics | None:
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """Return the image in a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError for depth and unknown encodings.
+    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth and for
+    encodings that jcr does not read.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)
@@ -152,7 +156,10 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
 
 def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return an image message's pixels, `used` bytes of each row; raise InputError about `what` if bytes are missing."""
+    """Return the pixel data of an image message, the first `used` bytes of each of its h rows, without padding.
+
+    Raises InputError, begun with `where` and the name `what` of the data, if bytes are missing.
+    """
     data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
     if message.step < used or data.size < message.height * message.step:
         raise InputError(f"{where}: {what} is cut short; record again")

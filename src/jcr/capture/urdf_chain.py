@@ -143,7 +143,10 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper (m) from recorded positions, in order of `joints`; raise InputError for degrees."""
+        """Compute base_from_gripper (m) from positions in recorded units, one column per joint in order of `joints`.
+
+        Raises InputError if the positions are so large that they are degrees, although the unit is radians.
+        """
         positions = recorded * self.unit
         if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(f"angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg")

@@ -121,7 +121,8 @@ def refined(
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
     """Return the images of a fixed camera with the static background faded to grey; moving parts keep their colour.
 
-    The background of a pixel is its most frequent colour over the images; without a frequent colour the pixel moves.
+    The background of a pixel is its most frequent colour over the images; a pixel without a frequent colour counts as
+    moving.
     """
     height, width = images[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))

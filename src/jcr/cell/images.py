@@ -21,7 +21,10 @@ EXACT = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class CellImages:
-    """Problem of a cell (cameras and arms at one scene), initial state, observations; camera 0 is the capture's own."""
+    """Estimation problem of a cell (cameras and arms at one scene), its initial state and its observations.
+
+    Camera 0 is the capture's own camera.
+    """
 
     problem: Problem
     """Estimation problem of the cell, without its observations."""

@@ -81,7 +81,10 @@ class ImageUse(Part):
 
 
 class CameraPlacement(Part):
-    """Placement of another camera: pose (null if not placed), uncertainty, intrinsics, findings."""
+    """Placement of one camera other than the capture's own: pose, uncertainty, intrinsics, findings.
+
+    The pose is null if the camera could not be placed.
+    """
 
     name: str
     mount: Mount
@@ -209,7 +212,8 @@ class CamerasFile(Part):
     ) -> list[Float[ndarray, "4 4"]]:
         """Return base_from_camera of every used image of `camera` (placement `found`), if its gripper pose is known.
 
-        `base_from_gripper` has the own arm's poses by image number of the capture. The list is empty if not placed.
+        `base_from_gripper` has poses of the capture's own arm by image number of the capture. The list is empty if the
+        camera was not placed.
         """
         parent_from_camera = found.parent_from_camera
         names = {image.image for image in found.images if image.used}

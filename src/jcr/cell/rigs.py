@@ -149,7 +149,10 @@ class Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Return the views with a rig (new if needed) of each used image; a rejected placement if impossible."""
+        """Return the views with a rig (cameras that move together) for each used image; new rigs are added if needed.
+
+        Return a rejected placement if the images cannot be assigned.
+        """
         if not seen.used:
             most = int(np.argmax(seen.points))
             best, count = seen.camera.images[most], float(seen.points[most])
@@ -170,7 +173,10 @@ class Rigs:
         return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Return a gripper camera's views on rigs of own images; a rejected placement if few images or not rigid."""
+        """Return the views of another camera on the own gripper; each image gets the rig of the own image taken with it.
+
+        Return a rejected placement if the other camera is not rigidly connected, or its images do not suffice.
+        """
         assert seen.camera.frame is not None
         capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}
         frame = {k: int(seen.camera.frame[k]) for k in seen.used}
@@ -213,7 +219,10 @@ class Rigs:
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
     def _on_other_arm(self, seen: CameraViews, arm: str) -> CameraViews | CameraPlacement:
-        """Return another arm's views with a rig for each used image; a rejected placement if the hand-eye fit fails."""
+        """Return the views of another arm's camera with a rig (camera pose) for each used image.
+
+        Return a rejected placement if the hand-eye fit of that camera fails.
+        """
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)

@@ -146,7 +146,8 @@ def _examined(
 
     `mounted` are the cameras other than the capture's own. Confirmed effects on the camera's parameters are adopted in
     the solution. Findings are in the order of `mounted`, and empty for a camera with exact intrinsics or one that is
-    known to have moved. Another arm's poses are tested with its camera.
+    known to have moved. Another arm's poses are tested with its camera; those of the capture's own arm were tested in
+    its calibration.
     """
     solution, found = images.solved(), list[tuple[Finding, ...]]()
     for one in mounted:
@@ -186,7 +187,10 @@ def _examined(
 def _placement(
     views: CameraViews, solution: Solution, hand_eye: Calibration, faults: Sequence[Finding] = ()
 ) -> CameraPlacement:
-    """Return a camera's placement from the joint solution, whose covariance includes that of the findings `faults`."""
+    """Return the placement of a camera from the joint solution; `faults` are findings on effects such as a slip.
+
+    The covariances of `faults` add to the covariance of the camera's pose.
+    """
     c, problem = views.number, solution.problem
     assert problem.observations is not None
     transform, covariance = solution.transform(views.parent_from_camera)

@@ -88,7 +88,10 @@ LONGEST_LINE = 2000
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line, without Python's clean-up, which takes a second; `arguments` None: those of this process."""
+    """Run the command line `arguments` and exit with its status, without Python's clean-up, which takes a second.
+
+    `arguments` are the words after "jcr"; None: those of this process.
+    """
     # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -269,7 +269,10 @@ class VerifyCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print for each camera whether it has moved since the calibration, and the remedy; return 3 if one has."""
+        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status.
+
+        The status is 3 if a camera has moved, else 0.
+        """
         from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
 

@@ -87,7 +87,10 @@ def _wrapped_paragraphs() -> Iterator[None]:
 
 
 def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:
-    """Write a shell script that completes all commands of `records`; raise InputError for wrong SHELL and FILE."""
+    """Write a shell script that completes all commands and options, as `--tyro-write-completion SHELL FILE` requests.
+
+    `records` are the classes of the commands by name. Raises InputError for an unknown shell, or if FILE is missing.
+    """
     if len(arguments) != 3 or arguments[1] not in SHELLS:
         raise InputError(f"{arguments[0]}: give a shell ({', '.join(SHELLS)}) and the file of the script")
     commands = tuple(Annotated[record, tyro.conf.subcommand(name)] for name, record in records.items())

@@ -178,7 +178,10 @@ class QueryCommand:
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
-    """Read points x, y, z (n,3) in metres, base frame, from .csv, .npy or .ply; raise InputError for other files."""
+    """Read points x, y, z (n,3) in metres, base frame, from .csv (three columns), .npy (n,3) or .ply (vertices).
+
+    Raises InputError for another file, and for a point that is not finite.
+    """
     from jcr.capture.plain_files import read_lines, read_npy, split_cells
 
     if not path.is_file():
@@ -238,7 +241,10 @@ class MeasureCommand:
 
 
 def sizes_lines(measured: "Measurement") -> list[str]:
-    """Return a line for the support plane, and one for each object: sides (mm) with std, centre x, y (m, base)."""
+    """Return the lines of a measurement: one for the support plane, and one for each object.
+
+    An object has height, length and width in mm with standard deviations, and its centre x, y (m, base frame).
+    """
     support = measured.support
     x, y, z = support.base_from_support[:3, 2]
     lines = [

@@ -38,8 +38,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture.
 
-    Raises InputError that lists the existing topics or frames if an option names another one. It also raises InputError
-    if every image is more than `options.max_gap_ms` away from pose samples.
+    Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones). It
+    also raises InputError if every image is more than `options.max_gap_ms` away from pose samples. `report` receives
+    the progress.
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)

@@ -55,7 +55,10 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 
 def read_intrinsics(file: Path) -> IntrinsicsEntry:
-    """Read intrinsics from a JSON file that holds them, alone or as "intrinsics"; raise InputError if there are none."""
+    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics".
+
+    Raises InputError if the file is missing or holds no valid intrinsics.
+    """
     content = read_json(file)
     if isinstance(content, dict):
         content = content.get("intrinsics", content)
@@ -152,7 +155,10 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
 
 def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
-    """Return the camera `name` from its entry in "cameras"; `used` tells which frames of the file `capture` has."""
+    """Return the camera `name` from its entry in "cameras" of capture.json; raise InputError if its image sizes differ.
+
+    `used` is True for each frame of the file that `capture` contains. Messages begin with `where`.
+    """
     poses, frame = None, None
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:
@@ -236,7 +242,10 @@ def camera_entries(capture: Capture) -> dict[str, CameraEntry]:
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
-    """Write the capture.json and URDF of a capture to `folder`, which has the images; readers ignore `remarks`."""
+    """Write the capture.json of a capture whose images are in `folder` already, and copy the arm's URDF beside it.
+
+    `remarks` are further entries of the file, which readers of captures ignore.
+    """
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}

@@ -154,7 +154,10 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 def _read_table(
     path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
 ) -> dict[str, list]:
-    """Read columns of an episode from a Parquet table: a list of values by name; `rows`: frame indices, None: all."""
+    """Read columns of one episode from a Parquet table: a list of values for each name in `columns`.
+
+    `rows` are the frame indices to read; None: all frames of the episode.
+    """
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
@@ -167,7 +170,10 @@ def _read_table(
 
 
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
-    """Return the file of a template such as file-{index:03d}.parquet in the data set `path`; InputError if outside."""
+    """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`.
+
+    The template is relative to the data set `path`. Raises InputError if the result leads out of it.
+    """
     name = re.sub(
         r"\{(\w+)(?::0?(\d?\d)d)?\}",  # the value of a field is padded with zeros to the width in the template
         lambda field: str(fields.get(field[1], field[0])).zfill(int(field[2] or 0)),
@@ -207,7 +213,10 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield the video's RGB frames at n ascending times (s); raise InputError if one has none within `tolerance_s`."""
+    """Yield the RGB frames at n ascending times (s) since the start of a video.
+
+    Raises InputError if the file is no video, or if a time has no frame within `tolerance_s`.
+    """
     av = extra("av", "lerobot", "a video")
     due = time_s.tolist()
     try:

@@ -35,7 +35,10 @@ def read_yaml_or_json(file: Path) -> Any:
 
 
 def pair_keys(content: Any) -> tuple[str, str] | None:
-    """Return the keys of gripper and marker pose, such as ("robot", "tracking"), in a file's samples; None without."""
+    """Return the keys of gripper pose and marker pose in the samples of a YAML or JSON file; None if it has no samples.
+
+    `content` is that of the file. For easy_handeye2 the keys are ("robot", "tracking").
+    """
     first = next(iter(_entries(content)), None)
     return next((keys for keys in PAIRS if isinstance(first, dict) and set(keys) <= first.keys()), None)
 
@@ -59,7 +62,10 @@ def read_rows(content: Any, where: str, key: str | None = None) -> tuple[list[st
 
 
 def _entries(content: Any) -> list[Any]:
-    """Return the entries of YAML or JSON: a list, an object with a list, or poses by image name; empty without any."""
+    """Return the entries (one per image) of the content of a YAML or JSON file; empty if it has none.
+
+    The content is a list, an object that contains a list, or an object that maps image names to poses.
+    """
     if isinstance(content, list):
         return content
     if not isinstance(content, dict):
@@ -71,7 +77,10 @@ def _entries(content: Any) -> list[Any]:
 
 
 def _entry(entry: Any, where: str) -> Entry:
-    """Return an entry of a list of poses as numbers by column name, or a row of bare numbers as a list."""
+    """Return one entry of a list of poses as a dictionary from column name to number; a row of bare numbers as a list.
+
+    Raises InputError, begun with `where`, if the entry has no pose, or two values for one column.
+    """
     if isinstance(entry, list) and len(entry) not in (3, 4, 12, 16) and all(map(_is_plain, entry)):
         return entry
     cells = dict[str, Any]()
@@ -87,7 +96,10 @@ def _entry(entry: Any, where: str) -> Entry:
 
 
 def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield column name and number, such as ("qx", 0.1), of each number in a pose or a part of it, named `key`."""
+    """Yield column name and number, such as ("qx", 0.1), of each number in a nested pose of a YAML or JSON file.
+
+    `value` is the pose or a part of it, such as its rotation, and `key` its key in the file.
+    """
     names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}

@@ -49,7 +49,10 @@ class OpenConventionError(InputError):
 
 
 def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
-    """Return the options with both conventions that columns rx, ry, rz may have: a list per convention, by units."""
+    """Return the options with each convention and units that columns rx, ry, rz may have, to try them all.
+
+    One list per convention ("ur", "yaskawa"), with one entry per pair of units of length and angle.
+    """
     units = [options.pose_units]
     if options.pose_units == "auto":
         units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
@@ -150,7 +153,10 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the convention that column names identify; raise OpenConventionError for rx, ry, rz, or InputError."""
+    """Return the pose convention that column names identify; raise InputError, begun with `where`, if they do not.
+
+    For columns rx, ry, rz, which two conventions use, the error is an OpenConventionError.
+    """
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
@@ -214,7 +220,11 @@ def _named_columns(
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
-    """Read header (None without one) and cells of a table, UR's p[…], YAML, JSON or .npy (matrices row by row)."""
+    """Read the header of a pose file (None without one) and the cells of every row.
+
+    The file is a text table, UR's p[…], YAML, JSON or .npy. Matrices of a .npy file become rows of numbers, matrix row
+    by matrix row.
+    """
     if file.suffix in pose_lists.SUFFIXES:
         return pose_lists.read_rows(pose_lists.read_yaml_or_json(file), str(file))
     if file.suffix == ".npy":
@@ -238,7 +248,11 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
 
 
 def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[str]]]:
-    """Return header (x, y, z, ur_x, …, after "image" or "timestamp") and cells of lines with p[…] of a UR."""
+    """Return header and cells of lines with UR's p[x, y, z, rx, ry, rz], after an optional image name or time stamp.
+
+    The header has "image" or "timestamp" if present, then x, y, z, ur_x, ur_y, ur_z. Raises InputError for a line that
+    differs.
+    """
     rows = list[list[str]]()
     for number, line in enumerate(lines, start=1):
         match = _UR_POSE.search(line)
@@ -255,7 +269,10 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name that jcr uses for a column, and its unit or "": "Pos_X (mm)" gives "x" and "mm"."""
+    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm".
+
+    The unit is "" if the header has none.
+    """
     plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
     match = _UNIT.match(plain)
     name, unit = match.groups() if match else (plain, "")
