@@ -114,7 +114,8 @@ def _contradicted(
 
     `earlier` and `later` are image indices; all images are on the pixel grid of `pinhole`. `known` marks pixels with
     depth. The later image contradicts a point if its surface, within two pixels of the projection, is 1.5 % or more
-    behind (depth z). So does a later image if two of its points project within one pixel and are that much in front.
+    behind (depth z). The later image also contradicts a pixel if two of its points project within one pixel and are
+    that much in front.
     """
 
     def before(row: int, other: int) -> tuple[ndarray, ndarray, Bool[ndarray, " n"]]:
@@ -156,7 +157,8 @@ def _with_projections(
 ) -> Tracks:
     """Return the tracks with the projections of all points into the images from index `first` on as more observations.
 
-    Each projection is the nearest pixel on the grid of `pinhole`, also of hidden points; points outside are left out.
+    Each projection is the nearest pixel on the grid of `pinhole`. Points outside of an image are left out; points that
+    are hidden by others are not.
     """
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
     for row in range(first, len(recon_from_camera)):

@@ -71,7 +71,8 @@ def undistorted(
 ) -> UInt8[ndarray, "m h w 3"]:
     """Read the RGB images `names` in `folder`; return them without distortion, on the pixel grid of `pinhole`.
 
-    `intrinsics` are those of the files. Colours are bilinear, or averages over areas if `pinhole` has fewer pixels.
+    `intrinsics` are those of the files' images. Colours are interpolated bilinearly, and averaged over areas if
+    `pinhole` has fewer pixels.
     """
     undistort = undistortion(intrinsics, pinhole)
     return np.stack([undistort(read_image(folder / name)) for name in names])
@@ -141,7 +142,8 @@ def dense_pointmaps(
     `sweep_planes`. The confidence of a match is its correlation times the number of images that agree, twice that on a
     fitted plane. With `priors`, fitted planes give depth where no match is found, with confidence 0.5 per image that
     agrees. The confidence is 0 without an estimate. `before` are pointmaps of the first images, from an earlier time.
-    With `before`, only later images are matched, the scene may have changed, and `priors` is ignored.
+    With `before`, only later images are matched, the scene may have changed, and `priors` is ignored; the result has
+    all m images.
     """
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth

@@ -32,7 +32,11 @@ class DepthHeader(BaseModel):
 
 
 def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
-    """Write z, its std and origin, and confidence to depth.npz, with the fingerprint `made_from` of the input."""
+    """Write depth z, its std and origin, and confidence of a reconstruction's pointmaps to a file depth.npz.
+
+    After an error there is no incomplete file. `made_from` is the fingerprint of reconstruction and options that
+    `is_made_from` compares.
+    """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
     about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}
@@ -51,7 +55,10 @@ def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> N
 
 
 def is_made_from(path: Path, made_from: str) -> bool:
-    """Test whether the file was made from the input with this fingerprint; raise InputError for a damaged file."""
+    """Test whether the file exists and was made from the input with the fingerprint `made_from`.
+
+    Raises InputError for a damaged file.
+    """
     if not path.is_file():
         return False
     with read_npz(path, FORMAT) as (text, _):

@@ -83,7 +83,10 @@ class _Level:
         return self.packed[others], motions, windows(image, space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
-        """Return a map (c,h,w), w rounded up to LANES, from one (c,h/2,w/2): each pixel is repeated at 2 x 2 pixels."""
+        """Return a map (c,h,w) from one (c,h/2,w/2) of half the resolution; each pixel is repeated at 2 x 2 pixels.
+
+        The width of the result is rounded up to a multiple of LANES.
+        """
         h, w = self.pinhole.height, self.pinhole.width
         row = np.minimum(np.arange(h) // 2, map_of_half.shape[1] - 1)
         column = np.minimum(np.arange(blocks_of(w)) // 2, map_of_half.shape[2] - 1)

@@ -84,7 +84,8 @@ def with_measured_depth(
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
     """Return the depth (m) of a depth image (m, 0: none) at the integer pixels `at` (p,q,2), and where it is valid.
 
-    `at` has u, v in its last axis. A depth is valid within REACH_M, if the 3 x 3 depths around differ by under 5 %.
+    `at` has u, then v, in its last axis. A depth is valid if it is within REACH_M, and the 3 x 3 depths around are
+    known and differ by less than 5 %.
     """
     height, width = depth.shape
     u, v = at[..., 0], at[..., 1]

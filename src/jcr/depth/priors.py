@@ -53,7 +53,8 @@ def evened(
 
     `inverse_depth` is 1/z of the pixels; `views` are the projections of each image into its neighbours. The log
     brightness of one point differs between images 1 and 2 by the difference of their exposures plus a·(r₁² - r₂²). Here
-    r is the tangent of the angle off the optical axis. The fit of a uses least absolute deviations.
+    r is the tangent of the angle off the optical axis, and a is common to all images. The fit uses least absolute
+    deviations.
     """
     color = colors.astype(np.float32) / 255
     m, h, w = matched.shape
@@ -154,7 +155,10 @@ def planar_prior(
 
 
 def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
-    """Return for each of r regions whether one of its pixels is next to one of a `chosen` region in a row or column."""
+    """Return for each of r regions whether it touches one of the `chosen` regions; `label` is each pixel's region.
+
+    Two regions touch if a pixel of one is next to a pixel of the other in a row or column.
+    """
     beside = np.zeros(len(chosen), bool)
     for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
         beside[one[chosen[other]]] = True

@@ -119,7 +119,8 @@ def ransac_pose(
 ) -> tuple[Float[ndarray, "4 4"], Bool[ndarray, " k"]] | None:
     """Return a_from_camera by SQPNP in RANSAC, and the mask of agreeing points; None if no pose is found.
 
-    `points` are in frame a, `x_px` undistorted pixels relative to the principal point; errors below `gate_px` agree.
+    Frame a is that of `points`. `x_px` are undistorted pixels relative to the principal point. Points agree with a
+    reprojection error below `gate_px`.
     """
     done, rotation, shift, rows = cv2.solvePnPRansac(
         points, x_px, np.diag([focal_px, focal_px, 1.0]), None,
@@ -143,8 +144,9 @@ def _refined(
 ) -> CameraPose | None:
     """Return the pose with the least robust reprojection error, by iteration from `start`; None if it has few inliers.
 
-    Pixel noise and inliers (whitened residual times pixel noise below `gate_px`) are estimated in each round. `spread`
-    is the covariance of each point, `p` the number of unknowns (7 with the focal length), `least` the fewest inliers.
+    Pixel noise and inliers are estimated anew in each round. Inliers have whitened residuals times pixel noise below
+    `gate_px`. `spread` is the covariance of each point, `p` the number of unknowns (6, or 7 with the focal length),
+    `least` the smallest number of inliers.
     """
     scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
     (pose, camera, inlier), found = start, None

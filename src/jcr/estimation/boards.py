@@ -114,7 +114,10 @@ class BoardShapes:
         )
 
     def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Return corner heights (z) over their body's plane, in the unit of `x_in_body`, for parameters `shape`."""
+        """Return the height (z) of each corner over its body's plane, in the unit of `x_in_body`.
+
+        `shape` are the s shape parameters, as in `residual`.
+        """
         return self.by_shape[:, 2] @ shape
 
 

@@ -53,7 +53,8 @@ def initial_estimate(
 ) -> tuple[Transform, float, Transform]:
     """Return gripper_from_camera, scale and base_from_recon of `closed_form`, with a positive scale.
 
-    Scale is a length in base over that in recon. A scale ≤ 0 is replaced by the ratio of the positions' extents.
+    Scale is a length in base over that in recon. A scale ≤ 0 is replaced by the extent of the gripper positions over
+    that of the camera positions.
     """
     x, scale, z = closed_form(base_from_gripper, recon_from_camera)
     if scale <= 0:
@@ -81,8 +82,9 @@ def rotations(
     """Return R_X and R_Z, the rotations of gripper_from_camera and base_from_recon, from R_G · R_X = R_Z · R_C.
 
     R_G is `gripper` (rotations of base_from_gripper), R_C is `camera` (rotations of recon_from_camera). The method is
-    Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. If a motion is near 180°, the
-    better fit of it and the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is returned.
+    Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. If a motion is near 180°,
+    the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is tried too. The better fit is
+    returned.
     """
     *batch, n = gripper.shape[:-2]
     gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
@@ -110,7 +112,10 @@ def _polished(
     camera: Float[ndarray, "h n 3 3"],
     rounds: int,
 ) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
-    """Return R_X refined by alternating least squares of R_gripper R_X = R_Z R_camera, R_Z, squared residuals."""
+    """Refine rotations R_X from h initial values by alternating least squares of R_gripper R_X = R_Z R_camera.
+
+    Return R_X (gripper_from_camera), R_Z (base_from_recon) and the sum of squared residuals of each.
+    """
     from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
     base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
     for _ in range(rounds):

@@ -115,7 +115,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations `hessian · step = right` of the d unknowns other than the points, which were eliminated."""
+    """Normal equations `hessian · step = right` of the d unknowns that are not point coordinates.
+
+    The points were eliminated; `stepped` computes their step from that of the other unknowns.
+    """
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
@@ -125,7 +128,10 @@ class Normal:
     L⁻¹ times coupling to the columns, and in the last column L⁻¹ times the gradient."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
-        """Return `points` after their Gauss-Newton step, which `step` (d,) of all other unknowns determines."""
+        """Return the p points after their Gauss-Newton step, in the same frame as `points`.
+
+        `step` (d,) is the step of all other unknowns, which determines that of the points.
+        """
         points = points.copy()
         for chosen, columns, root, half in self._blocks:
             along = half @ np.append(step[columns], 1.0)
@@ -202,13 +208,17 @@ def without_points(
 def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
     """Return the 3x3 block JᵀJ of each of n points, with a small increase of the diagonal that makes it invertible.
 
-    J is `by_point`, weighted derivatives of k observations by their points, sorted by point; `starts` the first of each.
+    J is `by_point`, the weighted derivative of k observations by their points, sorted by point. `starts` are the
+    indices of the points' first observations.
     """
     return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
 
 
 def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
-    """Return 3x3 blocks JᵀJ, changed in place: diagonals times 1 + `damping`, and slightly more, to be invertible."""
+    """Return the points' 3x3 blocks JᵀJ with their diagonals times 1 + damping, slightly increased; changed in place.
+
+    The small increase makes a block invertible if all rays of its point are parallel.
+    """
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v

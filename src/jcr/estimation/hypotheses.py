@@ -110,7 +110,8 @@ class Scores:
     def gain(self, free: Float[ndarray, "c r"]) -> tuple[float, int]:
         """Return the decrease of the cost (squared standard deviations) by the best step along the columns of `free`.
 
-        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient (A `free`, P the information); the second is the rank of S.
+        The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information. The second result is
+        the rank of S.
         """
         information, right = free.T @ self.information @ free, free.T @ self.gradient
         scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
@@ -199,7 +200,10 @@ class Adjustment:
 
     @cached_property
     def pose_scores(self) -> Scores:
-        """Quadratic cost of all used poses' residuals (m, rad; base axes), unknowns of `solution` eliminated."""
+        """Quadratic cost of errors of the reported poses, with the unknowns of `solution` eliminated.
+
+        Its c coordinates are the residuals of the used poses of all arms (m, rad; base axes).
+        """
         at = self.solution.at_mode
         freedom = max(len(at.weighed_left) - self.solution.problem.arm_unknowns, 1)
         return Scores(information=at.projection, gradient=at.weighed_left, freedom=freedom)
@@ -208,7 +212,7 @@ class Adjustment:
     def camera_scores(self) -> Scores:
         """Quadratic cost of changes of the tested camera's e parameters (`Row`) from their values in `solution`.
 
-        Units and weak prior are those of problem.rows_of. All other unknowns are eliminated, also the freed directions.
+        Units and weak prior are those of problem.rows_of. All other unknowns, and the freed directions, are eliminated.
         """
         assert self.camera is not None
         solution, state = self.solution, self.solution.images.state
@@ -340,7 +344,8 @@ def explains_by_order(scores: Scores, row: Row) -> bool:
     """Return whether at most the share BY_CHANCE of random orders of the images reach the score gain of a motion.
 
     `row` must have `motion` and `share`. ORDERS permutations of the share among the poses that move are compared by
-    `Scores.gain` of motion times share, which allows for errors with heavy tails and single wrong poses.
+    `Scores.gain` of motion times share. This permutation test allows for errors with heavy tails and single wrong
+    poses.
     """
     assert row.motion is not None and row.share is not None
     rng, own = np.random.default_rng(0), row.motion[::6].any(axis=1)
@@ -421,7 +426,8 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
 
     `joints` (n,dof) are the reported angles (rad) of the n used poses; the systematic errors of `poses` must be those
     of `arm_errors`. The method is best linear unbiased prediction (Searle, Casella and McCulloch 1992, chapter 7) at
-    the most likely error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation.
+    the most likely error sizes. An unobservable offset, such as the first joint's, keeps its prior standard deviation:
+    the size σ_s of the systematic errors.
     """
     sizes = most_likely(poses.equations)[0]
     solution = solve_equations(poses.equations, sizes)
@@ -461,8 +467,9 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
     Effects on images are focal lengths, shears (rolling shutter) and offsets by gravity. They include a zoom, with one
-    row for each possible image. Each has the common error of the focal length as nuisance; offsets and prism (only of a
-    single camera) also the principal point. With fewer than `min_images` images there are intrinsics alone.
+    row for each image at which it may happen. Each has the common error of the focal length as nuisance; offsets and
+    prism also have the principal point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
+    prism is tested only if there is one camera.
     """
     problem, state = model.solution.problem, model.solution.state
     observations, view = problem.observations, model.solution.images.view
@@ -516,7 +523,10 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
 def _rows_of(
     problem: Problem, camera: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return rows, units and weak prior std of problem.rows_of for a camera with all its images."""
+    """Return the rows, units and weak prior standard deviations of problem.rows_of for the camera with index `camera`.
+
+    The problem must have observations; all images of the camera are included.
+    """
     assert problem.observations is not None
     return rows_of(problem, camera, np.flatnonzero(problem.observations.camera == camera), problem.n_images)
 

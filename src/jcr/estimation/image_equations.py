@@ -46,7 +46,10 @@ class RigInformation(NamedTuple):
     """Vector g of the cost ½ sᵀ H s + gᵀ s."""
 
     def steps(self, state: State) -> Float[ndarray, " r"]:
-        """Return the steps (unit of the world, rad; world axes) from the reference poses to the rigs of a state."""
+        """Return the steps (r,) from the reference poses to the rigs of a state: six numbers of each rig in turn.
+
+        They are translation (unit of the world), then rotation vector (rad), in axes of the world.
+        """
         return step_between(self.world_from_rig, state.world_from_rig[: len(self.world_from_rig)]).ravel()
 
 
@@ -122,7 +125,10 @@ def with_pixel_noise(problem: Problem, state: State, view: ProjectedObservations
 
 
 def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, " k"]:
-    """Return weights (1/px²) of the k observations in `view` of a state, by its pixel noise and the Cauchy loss."""
+    """Return the weight (1/px²) of each of k observations, by the pixel noise of the state and the Cauchy loss.
+
+    `view` is the projection of the state; points behind or very near a camera have weight 0 (`PixelNoise.weights`).
+    """
     assert state.pixel_noise is not None
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
@@ -130,7 +136,8 @@ def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> F
 def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
     """Return the state after bundle adjustment with constant weights, those of the observations at the initial `state`.
 
-    The arms' X, scale and Z stay. `known` is more information about the rigs than images and `problem.known_rigs` have.
+    The arms' X, scale and Z stay. `known` is information about the rigs in addition to that of the images and
+    `problem.known_rigs`.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
@@ -158,7 +165,10 @@ def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformati
 
 
 def image_evidence(problem: Problem, state: State) -> ImageEvidence:
-    """Return the normal distribution of `Problem.columns` by images and priors, linearised at a state."""
+    """Return the normal distribution of `Problem.columns` by images and priors, linearised at a state.
+
+    The columns are intrinsics, boards and rigs. The points are eliminated; reported poses are not used.
+    """
     return linearised(problem, state, view_of(problem, state))[0]
 
 
@@ -213,7 +223,10 @@ def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
 
 
 def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Float[ndarray, " n"]:
-    """Return the median reprojection error (px) of each of n images, from residuals in `view`; NaN if none observed."""
+    """Return the median length (px) of the reprojection errors of each of n images; NaN for one without observations.
+
+    `view` has the residuals.
+    """
     assert problem.observations is not None
     length, image = np.linalg.norm(view.residual_px, axis=1), problem.observations.image
     out = np.full(problem.n_images, np.nan)
@@ -223,7 +236,10 @@ def median_reprojection_px(problem: Problem, view: ProjectedObservations) -> Flo
 
 
 def cost_of_images(images: ImageEvidence, state: State) -> float:
-    """Return the cost of a state in squared standard deviations, with the weights and priors of `images`."""
+    """Return the cost of a state: squared residuals of images, priors and boards in units of their standard deviations.
+
+    Weights and priors are those of `images`.
+    """
     view, sizes = view_of(images.problem, state), images.state.model_error_std
     state = replace(state, model_error_std=sizes)
     return _cost(images.problem, state, view, images.weight, _known_rigs(images.problem))
@@ -263,7 +279,10 @@ def _cost(
 
 
 def _known_rigs(problem: Problem) -> list[RigInformation]:
-    """Return the distribution `Problem.known_rigs`, which needs a covariance, as a list of one cost; empty if None."""
+    """Return the normal distribution `Problem.known_rigs` as a list with one quadratic cost; an empty list if None.
+
+    The distribution must have a covariance.
+    """
     if problem.known_rigs is None:
         return []
     poses, covariance = problem.known_rigs

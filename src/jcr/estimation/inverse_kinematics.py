@@ -69,7 +69,8 @@ class Posture:
 def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> Posture:
     """Return joint angles (n,dof) within the limits for n poses, with little change between poses, and the misfits.
 
-    Angles are in rad. If misfits exceed FITS, a constant tool (flange_from_tool) is estimated together with the angles.
+    Angles are in rad. If the arm does not reach all poses (misfits above FITS), a constant tool (flange_from_tool) is
+    estimated together with the angles.
     """
     rng = np.random.default_rng(0)
     tried = [_posture(arm, base_from_gripper, np.eye(4), rng)]
@@ -86,7 +87,8 @@ def inverse_kinematics(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"]) -> 
 def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Joints) -> Joints:
     """Return joint angles (n,dof) within the limits that bring the gripper nearest to each pose, from `start`.
 
-    `start` (n,dof) are initial angles (rad). An angle counts as 0.3 m per rad. Redundant joints move towards rest.
+    `start` (n,dof) are the initial angles (rad). An angle counts as 0.3 m (geometry.ARM) per rad. Redundant joints move
+    towards the rest posture.
     """
     low, high = arm.limits.T
 
@@ -109,7 +111,10 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Return the step (m, rad · ARM; base axes) from reached to given poses, and the Jacobian of the reached poses."""
+    """Return the step from the reached to the given pose, and the derivative of the reached pose by the joint angles.
+
+    Both are in base axes and m: translation, then rotation vector (rad) times geometry.ARM.
+    """
     now, jacobian = kinematic_jacobian(arm, joints)
     rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM
@@ -215,7 +220,8 @@ def _with_tool(
 def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
     """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof; rad).
 
-    `joints` None: angles and tool by inverse kinematics; the base stays. Raise InputError if they do not agree.
+    If `joints` is None, inverse kinematics computes angles and tool, and the base stays. Raises InputError if poses,
+    joints and arm do not agree.
     """
     if joints is not None:
         return mounted_arm(arm, joints, base_from_gripper), joints

@@ -65,7 +65,10 @@ def with_tool(arm: Arm, flange_from_tool: Transform) -> Arm:
 
 
 def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Poses]:
-    """Return base_from_joint without each joint's own rotation, and base_from_gripper, at angles `joints` (rad)."""
+    """Return base_from_joint (n,dof,4,4) without each joint's own rotation, and base_from_gripper (n,4,4).
+
+    `joints` (n,dof) are the joint angles in rad.
+    """
     rotated = transform(rotation_exp(joints[..., None] * arm.axes), np.zeros(3))
     frames = np.empty((*joints.shape, 4, 4))
     at = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
@@ -81,7 +84,10 @@ def forward_kinematics(arm: Arm, joints: Joints) -> Poses:
 
 
 def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, "n 6 dof"]]:
-    """Return base_from_gripper and its velocity (m; then ω, rad; base axes) per rad of each of `joints` (rad)."""
+    """Return base_from_gripper and its Jacobian: velocity (of its origin, m; then ω, rad; base axes) per rad of a joint.
+
+    `joints` (n,dof) are the joint angles in rad.
+    """
     frames, gripper = joint_frames(arm, joints)
     return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
 
@@ -112,7 +118,10 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
 
 
 def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
-    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint of `joint_frames`."""
+    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint.
+
+    `frames` and `gripper` are base_from_joint and base_from_gripper, the results of `joint_frames`.
+    """
     return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
 
 

@@ -90,7 +90,10 @@ def observability(
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
-    """Return the finding on an unobservable `motion`; `at`: axis or point (m) in the `frame` base or gripper."""
+    """Return the finding that a kind of motion leaves a direction unobservable; `at` is an axis or point (m) in `frame`.
+
+    `frame` is "base" or "gripper".
+    """
     where: dict[str, Any] = (
         {} if at is None else {**dict(zip("xyz", at.tolist(), strict=True)), "frame": frame}
     )
@@ -100,7 +103,10 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 def _explained(
     base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
 ) -> list[Finding]:
-    """Return findings that name the degenerate motion of the weak directions `unseen` of `found`."""
+    """Return findings that name the degenerate motion; `unseen` masks weak directions of `found`.
+
+    Without `recon_from_camera`, an orbit about the scene is not distinguished from rotations about a tool point.
+    """
     # The mean of the rotation matrices preserves the length of a common axis and shortens all other directions.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK

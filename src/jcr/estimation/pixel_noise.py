@@ -91,7 +91,10 @@ class Layout:
         return bool(np.ptp(self.stated_variance) > 0) if len(self.stated_variance) else False
 
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:
-        """Return variances over that of the median observation: common + (1 − common) · stated variance."""
+        """Return each observation's variance over that of the median one: common + (1 − common) · stated variance.
+
+        `common` is the share of the variance that all observations have alike.
+        """
         return common + (1 - common) * self.stated_variance
 
     def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:

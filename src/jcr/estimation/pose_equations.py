@@ -76,7 +76,8 @@ class Region:
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
 
-        `systematic` (s,s) is the covariance of e; A is `fit` (change of X and Z by the error), J is `by_unknown`.
+        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error (`fit`), J the derivative
+        `by_unknown`.
         """
         # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
         half = systematic - self.by_unknown @ (self.fit @ systematic)
@@ -175,7 +176,10 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
 
 
 def share_within_limits(step: Float[ndarray, " u"]) -> float:
-    """Return the largest factor ≤ 1 that keeps rotations and log scale of a step (u,) within ±LARGEST_ROTATION."""
+    """Return the largest factor ≤ 1 that keeps a step's rotations and log scale within ±LARGEST_ROTATION.
+
+    `step` (u,) has the order of `weak_prior`; the limit applies to each component times the factor.
+    """
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
     return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))

@@ -45,7 +45,10 @@ def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Rig (cameras that move together) and camera of each of n images; image, point and pixel of k observations."""
+    """Observations of points: rig and camera of each of n images; image, point and pixel of each of k observations.
+
+    A rig is a set of cameras that move together.
+    """
 
     rig: Int[ndarray, " n"]
     """Rig of each image."""
@@ -97,7 +100,10 @@ class LinearPrior(NamedTuple):
 
 
 def scale_prior(metres_per_unit: float, std: float) -> LinearPrior:
-    """Return the prior `metres_per_unit` ± relative `std` on the scale, for one arm with exact cameras (UNKNOWNS)."""
+    """Return the prior that the scale is `metres_per_unit` with the relative standard deviation `std`.
+
+    It is for a problem of one arm with exact cameras, which has UNKNOWNS unknowns.
+    """
     return LinearPrior(np.eye(UNKNOWNS)[6], float(np.log(metres_per_unit)), std)
 
 
@@ -213,7 +219,10 @@ class Problem:
 
     @cached_property
     def model_error_counts(self) -> list[int]:
-        """Number of distortion polynomials of each camera: POLYNOMIALS; 0 if exact or with as few observations."""
+        """Number of distortion polynomials of each camera.
+
+        It is 0 for exact intrinsics and for a camera with POLYNOMIALS observations or fewer, else POLYNOMIALS.
+        """
         counts = [POLYNOMIALS * bool(self.directions[own].any()) for own in self.parameters_of]
         seen = np.bincount(self.layout.camera, minlength=len(counts)) if self.observations else counts
         return [count if n > count else 0 for n, count in zip(seen, counts, strict=True)]
@@ -329,7 +338,10 @@ class Problem:
         return self.arm_unknowns + len(self.free)
 
     def prior_std(self, state: State) -> Float[ndarray, " l"]:
-        """Return the prior std of the first l columns: cameras, model errors (sizes of `state`), boards."""
+        """Return the prior standard deviations of the first l columns: cameras, model errors, boards.
+
+        The sizes of the model errors are those of `state`.
+        """
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std
@@ -535,7 +547,10 @@ def stepped(
 
 
 def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> State:
-    """Return the state after a step (of `stepped`) of all p unknowns; points and rigs that arms move stay."""
+    """Return the state after a step of all p unknowns: X, log scale and Z of the arms, then the columns `Problem.free`.
+
+    Steps are those of `stepped`. Points and the rigs that arms move stay.
+    """
     columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
     columns[problem.free] = step[arms:]
     return stepped(problem, state, step[:arms], columns if columns.any() else None)

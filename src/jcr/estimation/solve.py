@@ -139,7 +139,10 @@ class Solution:
 
     @cached_property
     def log_evidence(self) -> float:
-        """Natural log of (2π)^(3m) times the marginal density of m poses' residuals, without unknowns and sizes."""
+        """Natural logarithm of (2π)^(3m) times the marginal density of the 6m residuals of m used poses.
+
+        Unknowns and error sizes are integrated out.
+        """
         return log_evidence(self.equations, self.at_mode, self.size_information)
 
     @cached_property
@@ -279,7 +282,11 @@ def uncertainty_of(found: Solution) -> Uncertainty:
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
-    """Return scale (m per unit) and base_from_recon (m) of the frame of `tracks`, by a robust similarity of points."""
+    """Return scale (metres per unit) and base_from_recon (metres) of the reconstruction that `tracks` belong to.
+
+    They are the robust least-squares similarity from the reconstruction's points to the adjusted points in the base
+    frame.
+    """
     state, observations = solution.state, solution.problem.observations
     assert observations is not None and observations.point_rows is not None
     points = apply(state.z[0], state.scale * state.points_in_world)
@@ -440,7 +447,10 @@ def with_covariance(
 
 
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
-    """Return the state with the likeliest X, scale, Z and error sizes; ends at a squared step (σ²) below `settled`."""
+    """Return the state with the likeliest arms' unknowns (X, scale, Z) and error sizes, for constant image evidence.
+
+    The iteration ends when the squared step in units of standard deviations is below `settled`.
+    """
     arms = problem.arm_unknowns
     for _ in range(STEPS):
         equations = pose_equations(problem, state, images).equations
@@ -475,7 +485,10 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
 
 
 def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return n numbers: steps of `step_to` (arms, `Problem.columns`), steps of points, log of `model_error_std`."""
+    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`.
+
+    Steps are those of `step_to`.
+    """
     points = (state.points_in_world - start.points_in_world).ravel()
     return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
 

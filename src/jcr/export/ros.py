@@ -36,7 +36,10 @@ _FRAME_NAME = re.compile(r"(?!.*--)[A-Za-z0-9_][A-Za-z0-9_/.\-]*")  # two hyphen
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMount:
-    """Frame of a camera or of another arm's base, and its transform to the parent frame to which it is fixed."""
+    """Frame of a camera, or of another arm's base, and its transform to the parent frame to which it is fixed.
+
+    Construction raises InputError for invalid frame names, and if parent and child have the same name.
+    """
 
     parent: str
     child: str
@@ -178,7 +181,10 @@ def _joint(parent: str, child: str, origin: str | None = None) -> str:
 
 
 def easy_handeye2(mount: CameraMount, name: str) -> str:
-    """Return a .calib file, read by easy_handeye2 as ~/.ros2/easy_handeye2/calibrations/NAME.calib (`name`)."""
+    """Return the text of a .calib file, which easy_handeye2 reads as ~/.ros2/easy_handeye2/calibrations/NAME.calib.
+
+    `name` is the name of the calibration, NAME. Its transform is parent_from_child of the mount.
+    """
     content = {
         "parameters": {
             "name": name,
