@@ -371,7 +371,10 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
 
 
 def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """Return the options with `cameras` set to the capture's COLMAP model, unless another is chosen or there is none."""
+    """Return the options with `cameras` set to the COLMAP model that belongs to the capture.
+
+    They are unchanged if the capture has no model, or if the options name `cameras` or another back end.
+    """
     if capture.cameras is None or options.cameras is not None:
         return options
     selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
@@ -422,7 +425,10 @@ def _given_options(options: ReconstructOptions) -> dict[str, Any]:
 
 
 def device_of(options: ReconstructOptions) -> str:
-    """Return "cuda" or "cpu" for `device`; `auto`: "cuda" if available. Raise InputError if "cuda" is not available."""
+    """Return "cuda" or "cpu" for the option `device`; for `auto`, "cuda" if a CUDA device is available.
+
+    Raises InputError if `device` is "cuda" and no CUDA device is available.
+    """
     if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
         return "cpu"
     torch = extra("torch", "networks", "--device cuda")

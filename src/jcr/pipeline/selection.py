@@ -91,7 +91,10 @@ class Trial:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether findings of images matter: no calibration (but no InputError), warnings, rejection, unused images."""
+        """Whether findings of the images matter: no calibration, warnings, a rejection, or images left out.
+
+        It is False after an InputError of the back end, which has another cause than the images.
+        """
         if self.hand_eye is None:
             return not isinstance(self.failure, InputError)
         return self.hand_eye.verdict != "accepted" or not all(one.used for one in self.hand_eye.images)

@@ -80,7 +80,10 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
-    """Run those of the named stages that the run needs; return the result with outputs and times (s) of each."""
+    """Run those of the named stages that the run's cameras and options need; return the result with their outputs.
+
+    The times (s) of the stages after the calibration are added to `timings_s` of the calibration.
+    """
     unneeded = set() if result.others else {"cameras"}
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):
@@ -138,7 +141,10 @@ def finished_state(result: RunResult) -> RunState:
 
 
 def fingerprint(*values: Any) -> str:
-    """Return a SHA-256 hash of `values`: fields of records, arrays, files (above LARGE: size and date) and folders."""
+    """Return a SHA-256 hash of `values`: of the fields of records, and the content of arrays and files (Path).
+
+    A folder is hashed as its files, and a file above LARGE as size and date.
+    """
 
     def identity(value: Any) -> Any:
         """Return the value to hash for a value that JSON lacks."""
@@ -302,7 +308,8 @@ def _with_depth_kept(result: RunResult) -> RunResult:
 def _map(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with cloud, map and measured objects, and write cloud and map.
 
-    Images that were added later are included. Raises InputError if no points are left for a map.
+    Images that were added later are included. Raises InputError if no point is confident enough, or the options leave
+    no points for a map.
     """
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added import extend

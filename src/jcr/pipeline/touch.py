@@ -45,7 +45,10 @@ class TouchTest:
 
     @property
     def common(self) -> Float[ndarray, "3"]:
-        """Mean over the points of tip minus surface point (m, base axes), as of a wrongly stated tip position."""
+        """Mean over the points of tip minus surface point (m, base axes).
+
+        A wrong position of the tip in the gripper frame causes such a common difference.
+        """
         return self.error.mean(0)
 
 
@@ -80,7 +83,10 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
-    """Read the CSV of a touch test: image of each point, and numbers x_px … z_m; raise InputError if it is invalid."""
+    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m.
+
+    Raises InputError for a missing column or fewer than three points.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()

@@ -56,7 +56,10 @@ class Verification(Drift):
 
     @property
     def std(self) -> Float[ndarray, "6"]:
-        """Standard deviations of `offset` (m, rad), along axes of the gripper, or of the base for a fixed camera."""
+        """Standard deviations of `offset`: translation x, y, z (m), rotation vector x, y, z (rad).
+
+        The axes are those of the gripper, or of the base for a fixed camera.
+        """
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -281,8 +284,9 @@ def _judged(
 ) -> Verification:
     """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
 
-    Significant is a p-value below `options.alpha`; translation or rotation must exceed `options.tolerance` (mm,
-    degrees). `notes` are warnings to include, `images` are the new images that were used, `how` is the method in words.
+    The drift is significant if its p-value is below `options.alpha`. The tolerance is exceeded if translation or
+    rotation is larger than in `options.tolerance` (mm, degrees). `notes` are warnings to include, `images` are the new
+    images that were used, and `how` is the method in words.
     """
     notes = list(notes)
     if found.is_noisier:

@@ -90,7 +90,11 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
-    """Return the entry `name` of a network's outputs as float32 of this shape; raise InputError if it does not fit."""
+    """Return the entry `name` of a network's outputs as a float32 array of this shape.
+
+    `answer` is a mapping from names to tensors. Raises InputError, naming the `model`, if the entry is absent or has
+    another number of elements.
+    """
     tensor = answer.get(name) if hasattr(answer, "get") else None
     if not isinstance(tensor, torch.Tensor) or tensor.numel() != np.prod(shape):
         raise InputError(

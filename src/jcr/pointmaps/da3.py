@@ -38,7 +38,10 @@ def reconstruct_da3(
 
 
 def load(weights: Path, device: str) -> Predict:
-    """Return the function that predicts views by a network's folder; raise InputError if its files are not usable."""
+    """Return the function that predicts views with the network of a folder with config.json and model.safetensors.
+
+    Raises InputError for files that are missing, damaged or of another network.
+    """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -94,7 +97,10 @@ def predict_views(network: nn.Module, views: Views) -> PosedPointmaps:
 
 
 def grid_of(size: tuple[int, int]) -> ImageGrid:
-    """Return the grid of an image of `size` px: its long edge is LONG_EDGE, and both are multiples of PATCH."""
+    """Return the network's grid for an image of `size` (width, height), px.
+
+    The long edge is resized to LONG_EDGE px, and both edges are rounded to multiples of PATCH.
+    """
     edges = (round(edge * LONG_EDGE / max(size)) for edge in size)
     width, height = (max(1, (edge + PATCH // 2) // PATCH) * PATCH for edge in edges)
     return ImageGrid.uncropped(size, (width, height))

@@ -119,7 +119,11 @@ class PreparedImages:
 def prepare_images(
     capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
 ) -> PreparedImages:
-    """Read images, undistort them if the intrinsics are known, and resize and crop them by `grid_of(size)`."""
+    """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
+
+    `grid_of` returns the resize and crop for an image's width and height. Raises InputError for an image that cannot be
+    read.
+    """
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics
     if intrinsics is not None and is_distorted(intrinsics):

@@ -84,7 +84,10 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
-    """Return pairwise predictions from a file's ARRAYS; raise InputError, naming `source`, for invalid ones."""
+    """Return checked pairwise predictions from the arrays of a file (by name, see ARRAYS), named `source` in messages.
+
+    Raises InputError for arrays that are missing or inconsistent.
+    """
     check_arrays(arrays, ARRAYS, source)
     edges = arrays["edges"]
     count, height, width = arrays["pts3d"].shape[:3]

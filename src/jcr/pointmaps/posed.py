@@ -40,7 +40,10 @@ class PosedPointmaps:
     warnings: tuple[str, ...] = ()
 
     def on_rays(self, pinhole: Intrinsics) -> "PosedPointmaps":
-        """Return the pointmaps with points moved, at constant z, to their pixels' rays; 0 where the confidence is 0."""
+        """Return the pointmaps with each point moved, at constant z, to its pixel's ray by the grid's `pinhole`.
+
+        Points with confidence 0 become 0.
+        """
         points = self.x_in_camera[..., 2:] * rays(pinhole).astype(np.float32)
         return replace(self, x_in_camera=np.where((self.confidence > 0)[..., None], points, 0))
 
@@ -82,7 +85,8 @@ def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:
     """Return the covariance (6n,6n) of n camera poses relative to the first, from errors published for a network.
 
     Each camera has six rows: translation (recon units) and rotation (rad) in recon axes; those of the first are 0.
-    Every camera has an independent error (PREDICTED_STD); the first camera's moves all others.
+    Every camera has an independent error (PREDICTED_STD); the first camera's error also moves all others relative to
+    it.
     """
     poses = maps.recon_from_camera
     count = len(poses)

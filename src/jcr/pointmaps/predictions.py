@@ -89,7 +89,10 @@ def _posed_pointmaps(
 
 
 def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> Int[ndarray, " m"]:
-    """Return the capture's row of each of the file's `count` images, by name if named; raise InputError for misfits."""
+    """Return the row in the capture of each image of the file; raise InputError for names that do not fit.
+
+    Without `names`, the file must have all images of the capture, in its order; `count` is the number in the file.
+    """
     if not names:
         if count != len(capture):
             raise InputError(

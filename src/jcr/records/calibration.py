@@ -126,7 +126,10 @@ class RobotNoise:
 
     @property
     def together(self) -> tuple[float, float]:
-        """Standard deviation per axis (m, rad) of a pose: root of squared random and `systematic_left` errors."""
+        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined.
+
+        It is the root of the summed squares of both; the systematic error is `systematic_left`.
+        """
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
@@ -189,7 +192,10 @@ class Budget:
 
     @property
     def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors are half of the translation's variance or more; images do not reduce these."""
+        """Whether systematic robot errors are at least half of the translation's variance.
+
+        More images do not reduce these errors.
+        """
         others = self.robot_random, self.intrinsics, self.images, self.faults
         return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
@@ -240,7 +246,11 @@ class DepthCheck:
     """Number of features that were compared."""
 
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
-        """Return the std (m) of depths z (m), scale corrected, by `noise_m`, `noise_per_m`·z² and `std_percent`."""
+        """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
+
+        It is the root of the summed squares of `noise_m`, `noise_per_m`·z² and the error of the scale, which is
+        `std_percent` of z.
+        """
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
@@ -383,7 +393,10 @@ class Uncertainty:
     @computed_field
     @property
     def scene_95_mm(self) -> float | None:
-        """Bound (mm) on 95 % of the median scene point's errors in the base frame; None if no image was adjusted."""
+        """Bound (mm) on 95 % of the errors of the median reconstructed point in the base frame.
+
+        The bound is None where no image was adjusted.
+        """
         return None if self.scene is None else 1e3 * self.scene.within_95_m
 
     @property
@@ -398,7 +411,10 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance (j,j) in COVARIANCE_ORDER, then of fx, fy, cx, cy and distortion if these are estimated."""
+        """Covariance (j,j) of transform and scale in COVARIANCE_ORDER, then of the intrinsics if estimated.
+
+        The intrinsics are fx, fy, cx, cy and the distortion coefficients. Without these, j is 7.
+        """
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property

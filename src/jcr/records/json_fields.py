@@ -59,7 +59,10 @@ EXACT = 1e-15
 
 
 def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Float[ndarray, "n n"]:
-    """Return a covariance from lists; raise ValueError unless symmetric, with correlation eigenvalues ≥ `least`."""
+    """Return a covariance matrix from nested lists.
+
+    Raises ValueError if it is not symmetric, or if an eigenvalue of its correlation matrix is below `least`.
+    """
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), EXACT**2))
     correlation = matrix / np.outer(std, std)

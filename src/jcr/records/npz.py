@@ -41,7 +41,8 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 def _named(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     """Return a value as JSON that refers to arrays by name, and add these arrays to `arrays`.
 
-    `value` is a dataclass, tuple, array or plain value. Names of arrays are `name` and the path of fields and indices.
+    `value` is a dataclass, tuple, array or plain value. The names of its arrays begin with `name`, followed by the path
+    of fields and indices.
     """
     if isinstance(value, np.ndarray):
         arrays[name] = value
@@ -93,7 +94,8 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
 def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
     """Open an npz file of `write_npz`: yield its JSON text and its arrays by name.
 
-    Raises InputError for a missing or damaged file, a `format` that is not `expected`, or a failure under `with`.
+    Raises InputError if the file is missing or damaged, or if its `format` is not `expected`. Raises InputError also if
+    the block under `with` fails for a value of the file.
     """
     require_file(path)
     try:
@@ -117,7 +119,10 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
 
 
 def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
-    """Raise ValueError if an array (name: (array, expected shape)) has another shape or values that are not finite."""
+    """Raise ValueError if an array does not have its expected shape or holds values that are not finite.
+
+    `shapes` maps the name of an array to the array and its expected shape.
+    """
     for name, (array, shape) in shapes.items():
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, not {shape}")

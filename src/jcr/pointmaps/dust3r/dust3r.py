@@ -181,7 +181,10 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """Return the network of a config.json with the tensors `state`; raise InputError, naming `path`, if they misfit."""
+    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit.
+
+    `config` is the content of config.json, `state` contains the tensors by name, and `path` is named in messages.
+    """
     mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
     config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")

@@ -115,11 +115,18 @@ class Dust3r(nn.Module):
     def forward(
         self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Return both pointmaps of each pair of images (RGB, -1 to 1; sides multiples of 16) in the first camera."""
+        """Return the pointmaps of both images of each pair, in the first camera's frame.
+
+        Colours are RGB, scaled to [-1, 1]. Raises ValueError unless height and width are multiples of 16. Portrait
+        images are accepted.
+        """
         return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> EncodedImages:
-        """Return the encoder tokens of images (RGB, -1 to 1), whose height and width must be multiples of 16."""
+        """Return the encoder tokens of images (RGB, -1 to 1); each image is encoded once for all its pairs.
+
+        Raises ValueError unless height and width are multiples of 16.
+        """
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(f"images are {tuple(images.shape[-2:])}; both must be multiples of {PATCH}")
         with self._autocast(images):
@@ -132,7 +139,10 @@ class Dust3r(nn.Module):
             return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
-        """Return the first and second image's pointmaps of each pair, in the first camera's frame; the order matters."""
+        """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame.
+
+        Swapped arguments give other predictions.
+        """
         with self._autocast(features1.tokens):
             rotary1, rotary2 = (
                 rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
@@ -224,7 +234,10 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the attention of tokens x to the other image's y, with x's shape; `rotary_x`, `rotary_y`: positions."""
+        """Return the attention of tokens x to tokens y of the other image, with the shape of x.
+
+        `rotary_x` and `rotary_y` are the position embeddings of the tokens (`rotary_embedding`).
+        """
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
@@ -272,7 +285,10 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return x after self-attention, cross-attention to the other image's y, and perceptron; `rotary`: positions."""
+        """Return the tokens x after self-attention, cross-attention to the other image's tokens y, and perceptron.
+
+        `rotary_x` and `rotary_y` are the position embeddings of the tokens.
+        """
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
@@ -296,7 +312,10 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps from the tokens (b,n,c) of the last of `layers`; `grid`: rows and columns of tokens."""
+        """Return the pointmaps of images from the tokens (b,n,c) in the last entry of `layers`.
+
+        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
+        """
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -311,7 +330,10 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps from the tokens (b,n,c) of four `layers`; `grid`: rows and columns of tokens."""
+        """Return the pointmaps of images from the tokens (b,n,c) in four entries of `layers`.
+
+        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
+        """
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 
@@ -337,7 +359,10 @@ class Dpt(nn.Module):
         )
 
     def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
-        """Return x, y, z, c of each pixel from four layers' token grids (b, channels, rows, columns), first to last."""
+        """Return the four raw outputs of each pixel (x, y, z, c of `pointmap`) from the token grids of four layers.
+
+        The grids have shape (b, channels, rows, columns), from the earliest layer to the last.
+        """
         x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -355,7 +380,10 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
     def forward(self, levels: list[Tensor]) -> FeatureMap:
-        """Return the fused map, twice the finest of four `levels` (b,c,h,w), each half as large as the one before."""
+        """Return the fused feature map, at twice the resolution of the finest one.
+
+        `levels` are four feature maps (b,c,h,w), finest first, each with about half the resolution of the one before.
+        """
         level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
         # With an odd grid the stride-2 level is a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]

@@ -36,7 +36,8 @@ USELESS = 0.2
 class Alignment:
     """Camera pose and depth map of each image, and scale of each pair, from pairwise pointmaps.
 
-    The recon frame is camera 0. Its unit is the geometric mean of the pairs' own units: metres for metric predictions.
+    The recon frame is the camera frame of image 0. Its unit is the geometric mean of the pairs' own units, so metric
+    predictions give metres.
     """
 
     recon_from_camera: Float[ndarray, "n 4 4"]
@@ -92,7 +93,10 @@ def global_align(
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the alignment with depth and confidence of every pixel, for the poses, focal length and scales found."""
+    """Return the result of the alignment with depth and confidence of every pixel, not only of those used to solve it.
+
+    The poses, focal length and pair scales of `solution` do not change.
+    """
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

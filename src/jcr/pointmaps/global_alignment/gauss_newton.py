@@ -88,7 +88,11 @@ class ImageEquations:
 
 
 def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
-    """Estimate poses, focal length, pair scales and depths, first with COARSE_PIXELS, then with `pixels`, per image."""
+    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image.
+
+    A first stage with at most COARSE_PIXELS pixels per image gives the initial estimate. Raises RejectedError where the
+    pointmaps do not determine the unknowns.
+    """
     images = problem.observe_all(min(COARSE_PIXELS, pixels))
     state = initial_state(images, problem.predictions.edges)
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)

@@ -15,7 +15,8 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"]) -
     """Return an initial estimate of all unknowns, accurate to a few per cent.
 
     Depths come from the pairs that have the image first, and cameras from a spanning tree of the pairs that agree best.
-    `edges` are the images (first, second) of each pair. Raises RejectedError if no first view has points.
+    `edges` are the images (first, second) of each pair. Raises RejectedError where no first view has points in front of
+    its camera.
     """
     # The median of pixel radius / tangent of the angle off the optical axis, of pointmaps in their own camera's frame.
     ratios = []
@@ -87,7 +88,8 @@ def _similarities(
 
     Returns three arrays with an entry per pair: first_from_second in the first image's unit; the log ratio of the
     second image's unit to the first's; the median residual relative to the distance of the points. `focal` is fx in px,
-    and `depth` the z of the image's m pixels in its unit. `unit` has the pairs' log scales of `_own_depth`.
+    and `depth` the z of the image's m pixels in its unit. `unit` has for each pair the log scale of the
+    pair's first image, as returned by `_own_depth`.
     """
     n = o.second_count
     x = np.concatenate([o.pixel_offset / focal, np.ones_like(o.pixel_offset[:1])]) * depth

@@ -29,7 +29,11 @@ class AlignmentProblem:
 
     @classmethod
     def of(cls, predictions: PairPredictions) -> "AlignmentProblem":
-        """Return the problem of these predictions; confidences count as DUSt3R's if any is above 1."""
+        """Return the problem of aligning these predictions.
+
+        If the predictions have no intrinsics, the principal point is the middle of the grid, and fy / fx is 1.
+        Confidences are treated as those of DUSt3R (`weigh`) if any is above 1.
+        """
         given = predictions.intrinsics
         height, width = predictions.conf.shape[1:]
         middle = ((width - 1) / 2, (height - 1) / 2) if given is None else (given.cx, given.cy)
@@ -76,7 +80,8 @@ class AlignmentProblem:
 class ImageObservations:
     """Pointmaps of one image at m chosen pixels, from k pairs, as float32 arrays with pixels as the last axis.
 
-    The first of the k are second views, in the frame of another camera; the others are in the image's own.
+    The first of the k are second views: pointmaps in the frame of another camera. The others are in the image's own
+    camera frame.
     """
 
     image: int
@@ -97,7 +102,10 @@ class ImageObservations:
 
 
 def observe(problem: AlignmentProblem, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
-    """Return the pointmaps of all pairs with `image`, at its `pixels` (index row · width + column on the grid)."""
+    """Return the pointmaps of all pairs that contain `image`, at its `pixels`.
+
+    A pixel is given by its index row · width + column on the pointmaps' grid.
+    """
     predictions = problem.predictions
     height, width = predictions.conf.shape[1:]
     as_first, as_second = (np.flatnonzero(predictions.edges[:, side] == image) for side in (0, 1))
