@@ -52,7 +52,7 @@ SHA256 = {
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
     """Return XFeat and LightGlue with their published weights, in evaluation mode.
 
-    Raises InputError if the weights are not installed.
+    Raises InputError if kornia or the weights are not installed.
     """
     kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
     network, matcher = (

@@ -26,7 +26,10 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Content:
-    """Return tables of names and values: calibration, map (None: no map), options of each stage, and versions."""
+    """Return tables of names and values: calibration, map (`map_history`), options of each stage, and versions.
+
+    `map_history` are names and values stored with the map; it is None without a map.
+    """
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {
@@ -39,7 +42,10 @@ def details_section(
 
 
 def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Content:
-    """Return a row per object: name, RGB of its label, height, length, width (mm, ± 1 σ), and x, y of its box (m)."""
+    """Return a row for each object: name, RGB of its label, height, length, width (mm, ± one sigma), and place.
+
+    The place is the centre x, y of the object's box (m, base frame). `label_names` are the names of all labels.
+    """
     colors = label_colors(len(label_names)).tolist()
     rows = []
     for one in measured.objects:
@@ -82,7 +88,10 @@ def cameras_section(cameras: CamerasFile) -> Content:
 def _matrix(
     matrix: Float[ndarray, "4 4"] | None, uncertainty: TransformUncertainty | None
 ) -> dict[str, str | None]:
-    """Return texts of a transform (m): "matrix", "copied", and "std"; only "matrix", None, if it is unknown."""
+    """Return texts of a transform (m): "matrix" to read, "copied" to copy, and "std" with its standard deviations.
+
+    Without a transform or its uncertainty, "matrix" is None and the only entry.
+    """
     if matrix is None or uncertainty is None:
         return {"matrix": None}
     return {

@@ -77,7 +77,8 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
     """Yield a bar for each axis x, y, z, as wide as ± its standard deviation in `std` relative to the largest of them.
 
-    A bar is (`name` with the axis, left end and width in percent of the chart, number as text in the `unit` of `std`).
+    A bar is (text beside it, left end and width in percent of the chart, number as text). The text is `name` with the
+    axis; `unit` is that of `std`.
     """
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
@@ -104,7 +105,8 @@ def _next_poses(result: RunResult) -> dict[str, Any] | None:
 def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:
     """Return a proposed gripper pose in a convention, with motion and expected uncertainty as cells of a table.
 
-    The motion is that from the nearest gripper pose of an image; the uncertainty is that with the pose added.
+    The motion is that from the image with the nearest gripper pose. The uncertainty is expected of a calibration that
+    includes the pose.
     """
     numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
     mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())

@@ -13,7 +13,11 @@ NOTICEABLE = 1.05
 
 
 def residuals_section(result: RunResult) -> Content:
-    """Return residuals of gripper poses against camera poses (mm, degrees), each and in total, and robot pose noise."""
+    """Return the section on residuals of gripper poses against camera poses (mm, degrees).
+
+    The section contains the residuals of each image as numbers and bars, those of the whole fit, and the robot pose
+    noise.
+    """
     fit = result.found
     named = zip(shown_names(fit.images), fit.images, strict=True)
     rows = [(name, one) for name, one in named if one.translation_residual_mm is not None]

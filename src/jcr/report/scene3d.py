@@ -133,7 +133,11 @@ def scene_view(
     base_from_gripper: Float[ndarray, "4 4"],
     base_from_camera: Float[ndarray, "4 4"] | None,
 ) -> dict[str, Any]:
-    """Return the JSON entry of an image in the 3D view (m), with base_from_camera None if it is not registered."""
+    """Return the JSON entry of an image in the 3D view; base_from_camera is None for an image without a camera pose.
+
+    `caption` is the text shown with its `name`; `used` states whether the calibration uses the image. Poses are in
+    metres.
+    """
     camera = None if base_from_camera is None else _rows(base_from_camera)
     return {
         "name": name,
@@ -150,7 +154,10 @@ def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
 
 
 def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
-    """Return name, caption, intrinsics and poses (base frame) of the cell's other cameras that have a pose."""
+    """Return the other cameras of the cell that have a pose: name, caption, intrinsics, and poses in the base frame.
+
+    `base_from_camera` are the poses of the calibrated camera at its registered images.
+    """
     if result.cameras is None:
         return []
     grippers = base_from_camera @ inverse(result.calibration.gripper_from_camera)

@@ -89,8 +89,9 @@ def sketch(
 ) -> dict[str, Any]:
     """Return a sketch of the camera, as a pyramid with axes, in the gripper frame (z drawn downwards) or the base frame.
 
-    The frame is that of `mount`. `intrinsics` give the shape of the pyramid; None: those of a usual camera. "shapes"
-    are tag, attributes and text of SVG elements. "width" and "height" are in px, "label" is for screen readers.
+    The frame is that of `mount`. `intrinsics` give the shape of the pyramid; None selects those of a usual camera.
+    "shapes" are tag, attributes and text of SVG elements. "width" and "height" are the size (px), "label" is the text
+    for screen readers.
     """
     down = mount == "gripper"
     away = float(np.linalg.norm(parent_from_camera[:3, 3]))
@@ -136,7 +137,11 @@ def sketch(
 def _projection(
     x: Float[ndarray, "n 3"], down: bool
 ) -> Callable[[Float[ndarray, "k 3"]], Float[ndarray, "k 2"]]:
-    """Return the parallel projection of points (k,3) m to pixels that shows all points `x`; `down`: z downwards."""
+    """Return a function that projects points (k,3) m to pixels (k,2) of the sketch, in parallel projection.
+
+    The points are in the parent frame. The scale is such that all points `x` are visible. If `down` is true, the z axis
+    is drawn downwards, else upwards.
+    """
     azimuth, elevation = np.radians(EYE_DEG)
     up_z = -1.0 if down else 1.0
     eye = np.array(

@@ -33,11 +33,17 @@ class DistanceGrid:
     """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Return signed distance (m) and derivatives by x, y, z, (n,4), at n points (m, base); outside, the border's."""
+        """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
+
+        The points are in the base frame; a point outside of the grid has the values of the nearest point on its border.
+        """
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the signed distance (n,) m at points (n,3) m, base frame, interpolated; outside, that of the border."""
+        """Return the signed distance (n,) m at points (n,3) m of the base frame, interpolated trilinearly.
+
+        A point outside of the grid has the value of the nearest point on its border.
+        """
         return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
 
 

@@ -121,7 +121,10 @@ def interpolate_grid(
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a linear layer with weights drawn from `generator` (None: torch's), uniformly from ±1/√inputs."""
+    """Return a linear layer whose initial weights are drawn from `generator`, uniformly from ±1/√inputs.
+
+    torch.nn.Linear has the same distribution. If `generator` is None, torch's own generator is used.
+    """
     # torch.nn.utils.skip_init would import SymPy, which takes 0.3 s; the caller's random numbers must not advance.
     with torch.random.fork_rng([]):
         layer, bound = nn.Linear(inputs, outputs), inputs**-0.5
@@ -178,7 +181,10 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set offset and scale of outputs to mean and std of `targets` (n, outputs), except for occupancy and label."""
+        """Set offset and scale of all outputs but occupancy and label to mean and std of the property's `targets`.
+
+        `targets` has an array (n, outputs) for each property, such as the colours of n points.
+        """
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
@@ -192,7 +198,10 @@ class Field(nn.Module):
 
     @property
     def tables(self) -> nn.ParameterList:
-        """Trainable features: a table (nodes + 1, features) for each grid; row 0 is for nodes that are not selected."""
+        """Trainable features: for each grid a table with a row per selected node, after a row 0 for all others.
+
+        The columns are the features of a node.
+        """
         return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
@@ -211,7 +220,10 @@ class Field(nn.Module):
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Return outputs (n, outputs) at points (n,3) m, base frame, by property; logits for occupancy and label."""
+        """Return the network's outputs (n, outputs) at points (n,3) m of the base frame, by name of the property.
+
+        Occupancy and label are logits; other properties are plain values.
+        """
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
         outputs = {}
@@ -235,7 +247,10 @@ class Fields(nn.Module):
         self.lattices, self.of = nn.ModuleList(lattices), cast(Any, nn.ModuleList(fields))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
-        """Return outputs (n, outputs) at points (n,3) m, base frame, of `names`; logits for occupancy and label."""
+        """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`.
+
+        Occupancy and label are logits; other properties are plain values.
+        """
         out: dict[str, Tensor] = {}
         for field in self.of:
             if not field.heads.keys().isdisjoint(names):

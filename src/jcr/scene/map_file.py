@@ -56,6 +56,10 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """Raise InputError if `what` lacks one of the `PACKAGES` of the map; `otherwise` is a second remedy."""
+    """Raise InputError if one of the `PACKAGES` of the map is not installed.
+
+    In the message, `what` is the part of jcr that needs the package; `otherwise` is added at the end, such as another
+    remedy.
+    """
     for package in PACKAGES:
         extra(package, "map", what, otherwise)

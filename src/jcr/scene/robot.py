@@ -141,7 +141,8 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
 def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple[Joint, ...]:
     """Return the joints of a robot, parents before children; a joint names its two links by their indices in `links`.
 
-    `links` are their names. Raises InputError for an unsupported type of joint, or one that mimics a dependent joint.
+    `links` are the names of the links. Raises InputError for an unsupported type of joint, or a joint that mimics a
+    dependent one. The message begins with `path`.
     """
     joints = []
     for joint in sorted(robot.robot.joints, key=lambda joint: len(joints_to(robot, joint.child))):
@@ -172,7 +173,8 @@ def spheres_of_shape(
     """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
     `shape` is in metres, and `link_from_shape` is its pose in the link's frame. The spheres exceed the shape by at most
-    `excess` (m) plus half a voxel. Half a voxel is at most a sixth of the excess for shapes up to 15 cm.
+    `excess` (m) plus half a voxel. Half a voxel is a sixth of the excess for shapes up to 15 cm. A shape that is a
+    sphere is returned unchanged.
     """
     from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 
@@ -194,7 +196,8 @@ def cover_with_spheres(
 
     `distance` d is the signed distance (m), negative inside, from solid space at the centres of voxels with side `step`
     (m). A sphere with centre c and radius excess - d(c) exceeds solid space by at most `excess`. The cover is greedy:
-    the deepest voxel that is not yet covered becomes the next centre. Covered voxels are inside a sphere.
+    the deepest voxel that is not yet covered becomes the next centre. A voxel is covered if its whole cube is inside a
+    sphere.
     """
     half = 0.5 * np.sqrt(3.0) * step
     left = distance <= half

@@ -137,7 +137,10 @@ class Sample:
         return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
-        """Return results of `ask` (points (n,3) m to tensors) at the query's points; arrays if the points are arrays."""
+        """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
+
+        `ask` maps points (n,3) m to tensors with n rows.
+        """
         answers = in_chunks(ask, self._x)
         return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
 
@@ -177,7 +180,10 @@ class SceneMap:
 
     @property
     def cell(self) -> float:
-        """Spacing (m) of the distance grid's nodes and of features near surfaces; cells of seen space have half."""
+        """Spacing (m) of the nodes of the distance grid, and of the features near surfaces.
+
+        Cells of the grid of seen space have half this side.
+        """
         return 2 * self.seen.cell
 
     def to(self, device: str) -> "SceneMap":
@@ -186,7 +192,10 @@ class SceneMap:
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
 
     def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
-        """Return raw outputs (n, outputs) at points (n,3) m, base frame, by property; logits for occupancy and label."""
+        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
+
+        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
+        """
         x = self._points(x_in_base, "points")
         answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
         if not isinstance(x_in_base, Tensor):
@@ -197,7 +206,8 @@ class SceneMap:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
 
         `unknown` selects how unseen space counts in `occupancy` and `distance`: "occupied" as solid, "free" as empty,
-        and "report" as occupancy 0.5 and, in the distance, as empty. Raises InputError for other points.
+        and "report" as occupancy 0.5 and, in the distance, as empty. Raises InputError for a wrong shape or a value
+        that is not finite.
         """
         x, tensors = self._points(x_in_base, "points", unknown), isinstance(x_in_base, Tensor)
         return Sample(self, x, unknown=unknown, tensors=tensors)
@@ -280,7 +290,10 @@ class SceneMap:
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
     ) -> Bool[Tensor, " n"]:
-        """Return True for each of n spheres (centres x, radii in m) that collides; `unknown`: as in `check_spheres`."""
+        """Return True for each of n spheres that collides; `unknown` is "occupied" or "free", as in `check_spheres`.
+
+        `x` are the centres (m, base frame) and `radius` the radii (m).
+        """
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
@@ -321,7 +334,11 @@ class SceneMap:
             return self._distance[unknown]
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
-        """Return points (n,3) m as a tensor; raise InputError, naming them `what`, unless they are finite and fit."""
+        """Return points (n,3) m as a tensor on the map's device.
+
+        Raises InputError for another shape, values that are not finite, or an invalid `unknown`; `what` is the name of
+        the points in the message.
+        """
         if unknown not in get_args(Unknown):
             raise InputError(f"unknown={unknown!r}: choose occupied, free or report")
         x = x if isinstance(x, Tensor) else np.asarray(x)

@@ -55,7 +55,10 @@ class SeenGrid:
         return torch.where(inside, self.state.view(-1).index_select(0, index), 0)
 
     def index(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Return the index in the flattened `state` of each point's cell, 0 outside, and a mask of the points inside."""
+        """Return the index of each point's cell (0 for points outside), and a mask of the points inside the workspace.
+
+        The index counts cells of the flattened `state`, in which x changes fastest. The points are in m, base frame.
+        """
         nz, ny, nx = self.state.shape
         # Points beyond the range of int32, and NaN, must not become indices inside the box.
         at = ((x_in_base - self.lower) * (1.0 / self.cell)).nan_to_num(-1.0).clamp(-1.0, 1e6).floor().int()
@@ -170,7 +173,8 @@ def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
     """Set `crossed` (z,y,x) for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
 
     `crossed` is the mask of the blocks, which is changed in place. `nearest`, `rotation`, `corner` and `pitch` are the
-    results of `_depth_image`. `start` is the centre (m) of the first block in the axes of the depth image.
+    results of `_depth_image`. `start` is the centre (m) of the first block, relative to the camera, in the axes of the
+    depth image.
     """
     per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
     rows, columns = nearest.shape

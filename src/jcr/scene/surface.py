@@ -68,7 +68,10 @@ def sample_surface(
 
 
 def point_size(points: Float[ndarray, "n 3"]) -> float:
-    """Return the size (m) to draw points without gaps: 2.2 median nearest distances; 0.01 for fewer than two."""
+    """Return the size (m) at which points (n,3) m are drawn so that few gaps remain, 0.01 for fewer than two points.
+
+    The size is 2.2 times the median distance from a point to the nearest other point.
+    """
     if len(points) < 2:
         return 0.01
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # takes a third of the time

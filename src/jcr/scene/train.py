@@ -84,7 +84,10 @@ def workspace_box(
 
 
 def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, " n"]:
-    """Return the indices of the cloud's points inside `box` (two corners, m); raise InputError for fewer than 100."""
+    """Return the indices of the cloud's points inside `box`, the lower and upper corner (m, base frame).
+
+    Raises InputError if fewer than 100 points are inside.
+    """
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
     if len(inside) < 100:
@@ -235,7 +238,8 @@ def total_loss(field: Field, rays: Rays, samples: Samples) -> Tensor:
     """Return the training loss: the sum over the properties of `field` of the weighted mean loss of each.
 
     `samples` come from `draw_samples` for `rays`. The loss is binary cross-entropy for occupancy and cross-entropy for
-    labels. For other properties it is the squared error over the variance of the property.
+    labels. For other properties it is the squared error divided by the variance of the property, so that units do not
+    matter.
     """
     (x, occupied, of_samples), losses = samples, []
     for name, out in field(x).items():

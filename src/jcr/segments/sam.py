@@ -82,7 +82,8 @@ def sam_labels(
 ) -> LabelImages:
     """Return label images of the registered images, on the pixel grid of the pointmaps, and label names.
 
-    Labels are masks of Segment Anything, merged into objects by their overlap in the base frame (by `hand_eye`).
+    Labels are masks of Segment Anything, merged into objects by their overlap in the base frame, for which `hand_eye`
+    is needed.
     """
     dense = reconstruction.dense
     images = steps(progress or silent, "segment anything", list(dense.colors))

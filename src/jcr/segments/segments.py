@@ -55,7 +55,10 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Return the names of the labels in names.json at `path`, empty without it; raise InputError for another format."""
+    """Return the name of each label in the file `path`, names.json; an empty dict if there is no such file.
+
+    Raises InputError if the file has another format.
+    """
     if not path.is_file():
         return {}
     try:
@@ -76,7 +79,8 @@ def image_labels(
     """Return a label per pixel of the pointmaps, and label names; None for methods that label the cloud.
 
     The labels come from the capture's label images or Segment Anything, as set by `options`. With "auto" the result is
-    None if the capture has no label images. Raises InputError if what is requested is missing.
+    None if the capture has no label images. Raises InputError if requested label images are missing or Segment Anything
+    cannot be loaded.
     """
     if options.segments in ("auto", "labels"):
         labels = read_labels(capture, reconstruction)

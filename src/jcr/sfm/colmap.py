@@ -166,7 +166,8 @@ def _adjusted(
     """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
     All cameras and points are adjusted before and after; `model` is changed. Points beyond _MOST_OBSERVATIONS, chosen
-    at random by `seed`, are deleted first. `images` are all images by row. `like` are intrinsics, held if `known`.
+    at random by `seed`, are deleted first. `images` are all images by row. `like` are the intrinsics at the images'
+    size, held if `known`.
     """
     if model.compute_num_observations() > _MOST_OBSERVATIONS:
         order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -227,7 +228,8 @@ def map_images(
     The model is None if no pair could be mapped. `intrinsics` are the initial estimate at the original size, `cameras`
     COLMAP's initial cameras at the working size, and `names` the images' names for messages. The mapper tries the
     cameras in turn, after intrinsics estimated from the gripper's angles if there are any. A model `begun` is continued
-    with the images that it lacks. Images that the mapper leaves out are added near predicted cameras.
+    with the images that it lacks. Images that the mapper leaves out are added near cameras predicted from the gripper
+    poses.
     """
     working = resized(intrinsics, cameras[0].width, cameras[0].height)
     found = match_with_robot(matcher, base_from_gripper, working, names, report)
@@ -259,7 +261,8 @@ def matcher_of(
 ) -> Matcher:
     """Return a matcher of the images by SIFT or XFeat (`features`); SIFT keypoints are found now, XFeat's later.
 
-    `camera` is COLMAP's camera at the size of matching, with given intrinsics if `known`; `seed` is RANSAC's.
+    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`. `seed` is
+    that of RANSAC.
     """
     if features != "xfeat":
         give_back()
@@ -278,7 +281,8 @@ def matcher_of(
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
     """Return the matches of features chosen at random by `seed`, so that at most _MOST_MATCHED keypoints remain.
 
-    A feature is a set of keypoints that matches connect, all kept or none; `images` is the number of images.
+    A feature is a set of keypoints that matches connect; either all its matches are kept or none. `images` is the
+    number of images.
     """
     rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
     ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]

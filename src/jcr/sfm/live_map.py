@@ -54,7 +54,8 @@ class LiveMap:
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
-        Images that left the capture are removed. The map then begins anew, as in every update with FEW images or fewer.
+        Images that are no longer in the capture are removed, and the map then begins anew. With FEW images or fewer,
+        every update begins anew.
         """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
@@ -87,7 +88,10 @@ class LiveMap:
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:
-        """Return the map's reconstruction, with rows of the capture as `image_index`; None for fewer than two images."""
+        """Return the map as a reconstruction; None with fewer than two registered images.
+
+        The `image_index` of the result has rows of the capture.
+        """
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None

@@ -104,7 +104,10 @@ def with_missing_images(
 
 
 def _complete_images(model: pycolmap.Reconstruction, images: set[int], matcher: Matcher) -> None:
-    """Match images (by id) with points near their cameras; adjust `model`, without errors above LARGEST_PX."""
+    """Match the images with COLMAP ids `images` with points near their cameras; adjust all cameras and points.
+
+    `model` is changed. Observations with a reprojection error above LARGEST_PX are removed.
+    """
     filters = pycolmap.ObservationManager(model)
     for radius_px in RADII_PX:
         for image_id in sorted(images):

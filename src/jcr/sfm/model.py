@@ -51,7 +51,10 @@ def colmap_camera(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
 def working_cameras(
     all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int = WORKING_SIZE_PX
 ) -> list[pycolmap.Camera]:
-    """Return COLMAP's cameras at a long side of up to `working_size_px`; COLMAP refines those not `known`."""
+    """Return COLMAP's camera of each of the intrinsics, for images reduced to a long side of at most `working_size_px`.
+
+    If the intrinsics are not `known`, COLMAP refines focal length and distortion.
+    """
     width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -71,7 +74,10 @@ def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics, known: bool) -> Int
 def write_database(
     folder: Path, camera: pycolmap.Camera, x_px: Sequence[Float[ndarray, "_ 2"]], geometries: Geometries
 ) -> Path:
-    """Write COLMAP's `database.db` to `folder`: keypoints (pixels of `camera`) and matches; return its path."""
+    """Write `database.db` for COLMAP to `folder`: images of one camera, keypoints and verified matches; return its path.
+
+    `x_px` has the keypoints (x, y) of each image, in pixels of the images of `camera`.
+    """
     with closing(pycolmap.Database.open(folder / "database.db")) as db:
         db.write_camera(camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -138,7 +144,11 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return all observations as (row in `image_ids`, keypoint of the image, rank of the point's id), point by point."""
+    """Return all observations of a model as (image, keypoint, point), point by point.
+
+    The image is an index into `image_ids`, and the keypoint is a row of the image's keypoints. The point is its rank
+    among the ascending point ids.
+    """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     return [
         (row_of[element.image_id], element.point2D_idx, point)

@@ -82,7 +82,10 @@ class LocalServer(viser.ViserServer):
 
 
 def open_server(port: int, title: str) -> LocalServer:
-    """Start a server at a port of 127.0.0.1 (0: any free one); raise InputError if the port is invalid or in use."""
+    """Start a server at a port of 127.0.0.1 (0: any free one) and return it; `title` is the title of its page.
+
+    Raises InputError if the port is invalid or in use.
+    """
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
     with redirect_stdout(io.StringIO()):
@@ -98,7 +101,8 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
     """Return the robot of a URDF with its visual meshes, and its joint values (n,dof) at the n images (rad or m).
 
     The joint values of the capture are those of the first movable joints in the URDF; other joints, such as fingers,
-    are at 0. Raises InputError for an unreadable URDF, fewer movable joints, or no joint values.
+    are at 0. Raises InputError if the URDF cannot be read or has fewer movable joints, or the capture has no joint
+    values.
     """
     import yourdfpy
 
@@ -130,7 +134,11 @@ class Viewer:
         urdf: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Fill the server with the scene and controls of a run, with the robot of `urdf` or of the capture, if any."""
+        """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
+
+        There is no robot if `urdf` is None and the capture has no URDF or no joint values. Raises InputError as
+        `read_robot` does.
+        """
         report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
@@ -231,7 +239,8 @@ class Viewer:
     def _add_map(self, map: SceneMap, measured: Measurement | None) -> None:
         """Add a slice of the map, the border of unknown space (hidden), and a sphere to move, with their controls.
 
-        The slice is horizontal. The sphere begins 0.15 m above the support plane of `measured`, or above the floor.
+        The slice is horizontal. The sphere begins 0.15 m above the support plane of `measured`. If `measured` is None,
+        the sphere begins 0.15 m above the lower border of the map.
         """
         gui, scene, (low, high) = self.server.gui, self.server.scene, map.box
         height = low[2] if measured is None else measured.support.base_from_support[2, 3]
@@ -286,7 +295,10 @@ class Viewer:
                 self.robot.update_cfg(self._configurations[row])
 
     def look_from(self, camera: int, client: viser.ClientHandle | None) -> None:
-        """Select a registered camera's image, and move the view of a client (browser), if any, to the camera's pose."""
+        """Select the image of a registered camera, and move the view of a client (browser) to the pose of this camera.
+
+        `camera` is its index among the registered images. If `client` is None, the image is only selected.
+        """
         self.image.value = int(self.image_index[camera])
         if client is None:
             return
@@ -323,7 +335,10 @@ class Viewer:
                     self.server.scene.remove_by_name(name)
 
     def show_slice(self) -> None:
-        """Draw the map's slice with the selected property and height (base z), or hide it; x to the right, y up."""
+        """Draw the horizontal slice of the map with the selected property and height (base z), or hide it.
+
+        Columns of the image follow the x axis of the base; rows follow y from the largest value to the smallest.
+        """
         assert self.scene is not None  # the control exists only with a map
         with self._lock:
             of, height = self.slice_of.value, self.slice_at.value
