@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.calibration.case import Case
-from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, effects
+from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
 from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -176,10 +176,7 @@ def _examined(
         if (free := state.combinations) is not None:
             images = images.with_freed(one.number, free)
             solution = images.solved()
-            adopted = {"shift": None, "intrinsics_shift": None}
-            faults = tuple(
-                replace(one, **adopted) if one.kind.row.group == "camera" else one for one in faults
-            )
+            faults = tuple(as_adopted(one) if one.kind.row.group == "camera" else one for one in faults)
         found.append(faults)
     return solution, found
 

@@ -224,8 +224,8 @@ def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarr
     """Return the displacements (px) of k pixels by e polynomials with a coefficient of one image width.
 
     The polynomials are products of Legendre polynomials in both pixel coordinates, of total degree ≤ DEGREE. The
-    coordinates are 0 at the image centre and ±1 at the ends of the longer side. The first half
-    displaces along x, the second half along y.
+    coordinates are 0 at the image centre and ±1 at the ends of the longer side. The first half displaces along x, the
+    second half along y.
     """
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)

@@ -533,7 +533,7 @@ def with_effects(
     adjusted, remaining = adjust_case(case, combinations=free, confirmed_errors=bent), list[Finding]()
     for one in findings:
         if one.kind.row.group == "camera":
-            one = replace(one, shift=None, intrinsics_shift=None)  # the calibration includes the effect
+            one = as_adopted(one)
         elif bent is not None and one.kind in (row.kind for row in strains):
             # The shift due to all effects of the arm together belongs to the first finding.
             straight = np.zeros(7)
@@ -548,6 +548,11 @@ def with_effects(
             one = replace(one, shift=tuple(straight.tolist()))
         remaining.append(one)
     return adjusted, tuple(remaining)
+
+
+def as_adopted(found: Finding) -> Finding:
+    """Return the finding of an effect that the calibration includes: its shifts (also of the intrinsics) are removed."""
+    return replace(found, shift=None, intrinsics_shift=None)
 
 
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
