@@ -2,6 +2,7 @@
 
 import time
 from contextlib import nullcontext
+from itertools import combinations
 from pathlib import Path
 from unittest.mock import patch
 
@@ -14,7 +15,6 @@ from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.features.matchers import FeatureName, Matcher
-from jcr.features.pairs import all_pairs
 from jcr.features.stage import MatchedPairs
 from jcr.records import Intrinsics
 from jcr.sfm import colmap
@@ -72,7 +72,7 @@ def _match_all(
     matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
 ) -> MatchedPairs:
     """Match without gripper poses: all pairs, none judged, as if the gripper moved between all images."""
-    pairs = all_pairs(len(matcher.x_px))
+    pairs = list(combinations(range(len(matcher.x_px)), 2))
     moving = np.zeros((len(gripper), len(gripper)), bool)
     geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)), moving)
     return MatchedPairs(geometries=geometries, intrinsics=working)

@@ -1,6 +1,7 @@
 """Pairs of images: two-view geometries, agreement with the robot's motions, rotation of X, and which are matched."""
 
 import numpy as np
+import pycolmap
 import pytest
 from jaxtyping import Float, Int
 from numpy import ndarray
@@ -48,6 +49,7 @@ def essential(i_from_j: np.ndarray) -> np.ndarray:
     return np.cross(np.eye(3), -t / np.linalg.norm(t)) @ r
 
 
+GEOMETRY = pycolmap.TwoViewGeometry()
 MOTION = transform(rotation_exp(np.array([0.1, -0.3, 0.2])), np.array([0.15, 0.02, 0.03]))
 
 
@@ -81,7 +83,12 @@ def problem_and_pairs(seed: int) -> tuple[HandEyeProblem, list[Pair]]:
         return v / np.linalg.norm(v)
 
     return problem, [
-        Pair((i, j), rows, (CameraMotion(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),))
+        Pair(
+            (i, j),
+            rows,
+            (CameraMotion(camera[i, j, :3, :3], unit(camera[i, j, :3, 3]), sure, 0.5),),
+            GEOMETRY,
+        )
         for i in range(N)
         for j in range(i + 1, N)
     ]
@@ -95,7 +102,7 @@ def test_wrong_pairs_are_contradicted_and_right_ones_are_not(seed: int):
     for k in wrong:
         motion = pairs[k].motions[0]
         bad = CameraMotion(rotation_exp(rng.normal(size=3)), motion.direction, motion.covariance, 0.5)
-        pairs[k] = Pair(pairs[k].key, pairs[k].rows, (bad,))
+        pairs[k] = Pair(pairs[k].key, pairs[k].rows, (bad,), GEOMETRY)
     gate = classify_pairs(pairs, motions(problem.base_from_gripper))
     assert gate.of_x is not None
     assert rotation_angle(gate.of_x.rotation.T @ problem.gripper_from_camera[:3, :3]) < 0.01
@@ -111,7 +118,7 @@ def test_the_second_reading_of_a_plane_is_tried():
     other = CameraMotion(
         rotation_exp(np.array([0.5, 0.0, 0.0])) @ right.rotation, right.direction, right.covariance, 0.4
     )
-    pairs[3] = Pair(pairs[3].key, pairs[3].rows, (other, right))
+    pairs[3] = Pair(pairs[3].key, pairs[3].rows, (other, right), GEOMETRY)
     gate = classify_pairs(pairs, motions(problem.base_from_gripper))
     assert not gate.contradicted
     assert next(pair for pair in gate.confirmed if pair.key == pairs[3].key).motions[0] is right

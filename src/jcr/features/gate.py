@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pycolmap
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
@@ -54,6 +55,8 @@ class Pair:
     """Rows of the matched keypoints among those of the first and of the second image."""
     motions: tuple[CameraMotion, ...]
     """Possible relative motions of the two cameras, best first; empty where none could be found."""
+    geometry: pycolmap.TwoViewGeometry
+    """Two-view geometry whose inliers are `rows`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -49,15 +48,10 @@ class Features(Protocol):
     farthest: float
     """Largest distance of the descriptors of a match."""
 
-    @property
-    def needs_upright(self) -> bool:
-        """True if images must be rotated upright before matching."""
-        ...
-
-    @property
-    def every_pair(self) -> int:
-        """Largest number of images of which all pairs are matched; of more images, only pairs of near viewpoints."""
-        ...
+    needs_upright: bool
+    """True if images must be rotated upright before matching."""
+    every_pair: int
+    """Largest number of images of which all pairs are matched; of more images, only pairs of near viewpoints."""
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
@@ -65,23 +59,6 @@ class Features(Protocol):
         The two images are first rotated by `rolls` (rad), clockwise on the screen.
         """
         ...
-
-
-@dataclass(frozen=True)
-class ImageGeometry:
-    """Keypoints, rays (x/z, y/z) and intrinsics of a capture's images, at the size in which features are matched."""
-
-    x_px: Sequence[Float[ndarray, "_ 2"]]
-    """Keypoints of every image, px; pixel centres are whole numbers."""
-    intrinsics: Intrinsics
-    """Intrinsics at the working size, given or estimated."""
-    rays: Sequence[Float[ndarray, "_ 2"]]
-    """Undistorted directions x/z, y/z of the keypoints."""
-
-    @staticmethod
-    def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "ImageGeometry":
-        """Return the geometry of images with these intrinsics and keypoints (px); compute the rays of the keypoints."""
-        return ImageGeometry(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
 
 class Matcher:
@@ -103,8 +80,8 @@ class Matcher:
         """Cells of the image that do not move while the gripper does; matches there are discarded."""
         self._verified: dict[tuple[Key, bytes], pycolmap.TwoViewGeometry | None] = {}
         """Verified geometries by pair and matches; None where the verification failed."""
-        self._pairs: dict[tuple[Key, int, Intrinsics], tuple[Pair, pycolmap.TwoViewGeometry]] = {}
-        """Pairs by key, identity of the geometry, and intrinsics; storing the geometry keeps its identity unique."""
+        self._pairs: dict[tuple[Key, int, Intrinsics], Pair] = {}
+        """Pairs by key, identity of the geometry, and intrinsics; the pair keeps the identity of its geometry unique."""
 
     @property
     def x_px(self) -> list[Float[ndarray, "_ 2"]]:
@@ -154,18 +131,27 @@ class Matcher:
         )
         return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
 
-    def pair(self, view: ImageGeometry, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
+    def pair(
+        self,
+        x_px: Sequence[Float[ndarray, "_ 2"]],
+        intrinsics: Intrinsics,
+        key: Key,
+        geometry: pycolmap.TwoViewGeometry,
+    ) -> Pair:
         """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
 
-        The rays and intrinsics are those of `view`; `geometry` is the result of `verified`.
+        `x_px` are the keypoints of each image (`Matcher.x_px`), `intrinsics` those at the size of matching, and
+        `geometry` is the result of `verified`.
         """
-        depends = key, id(geometry), view.intrinsics
+        depends = key, id(geometry), intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
-            ray_i, ray_j = (view.rays[row][own] for row, own in zip(key, rows.T, strict=True))
-            found = camera_motions(ray_i, ray_j, view.intrinsics.fx, *matrices(geometry, view.intrinsics))
-            self._pairs[depends] = Pair(key, rows, tuple(found)), geometry
-        return self._pairs[depends][0]
+            ray_i, ray_j = (
+                unproject(intrinsics, x_px[row][own])[:, :2] for row, own in zip(key, rows.T, strict=True)
+            )
+            found = camera_motions(ray_i, ray_j, intrinsics.fx, *matrices(geometry, intrinsics))
+            self._pairs[depends] = Pair(key, rows, tuple(found), geometry)
+        return self._pairs[depends]
 
     def remove_image(self, row: int) -> None:
         """Remove all matches of image `row`, which the features no longer have; later rows decrease by one."""

@@ -1,15 +1,16 @@
 """Choice of the image pairs to match: all pairs of a few images, else pairs of near viewpoints or of a common scene."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.camera import project
+from jcr.camera import project, unproject
 from jcr.features.gate import Gate, Key
-from jcr.features.matchers import ImageGeometry
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
+from jcr.records import Intrinsics
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
 """Numbers of near viewpoints that each image is paired with: in the first search, and where this does not find R_X."""
@@ -31,11 +32,6 @@ LEAST_DIRECTION_STD = 0.01
 """Least standard deviation, rad, of a two-view translation's direction, which plane scenes determine weakly."""
 ROUNDS = 15
 POINTS_OF_PAIR = 60
-
-
-def all_pairs(n: int) -> list[Key]:
-    """Return every pair (i, j) of n images, i < j."""
-    return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
@@ -66,12 +62,17 @@ def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
     return first
 
 
-def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
+def pairs_of_common_scene(
+    x_px: Sequence[Float[ndarray, "_ 2"]],
+    intrinsics: Intrinsics,
+    found: Gate,
+    motion: Float[ndarray, "n n 4 4"],
+) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
     Each image has up to PARTNERS viewpoints. The shared scene is measured by the points of the pairs in `found` that
     the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
-    gripper's i_from_j.
+    gripper's i_from_j. `x_px` are the keypoints of every image (px), `intrinsics` those of the images.
     """
     if (gripper_from_camera := hand_eye_of_pairs(found, motion)) is None:
         return []
@@ -80,8 +81,8 @@ def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarra
     for pair in found.confirmed:
         rows = pair.rows[:: max(1, len(pair.rows) // POINTS_OF_PAIR)]
         pose = first_from_camera[list(pair.key)]
-        ray = np.stack([view.rays[row][own] for row, own in zip(pair.key, rows.T, strict=True)], 1)
-        direction = np.einsum("bij,mbj->mbi", pose[:, :3, :3], np.insert(ray, 2, 1.0, axis=2))
+        seen_px = np.stack([x_px[row][own] for row, own in zip(pair.key, rows.T, strict=True)], 1)
+        direction = np.einsum("bij,mbj->mbi", pose[:, :3, :3], unproject(intrinsics, seen_px))
         direction /= np.linalg.norm(direction, axis=2, keepdims=True)
         x = nearest_to_lines(pose[:, :3, 3], direction)
         far = ((x[:, None] - pose[:, :3, 3]) * direction).sum(2)
@@ -90,12 +91,12 @@ def pairs_of_common_scene(view: ImageGeometry, found: Gate, motion: Float[ndarra
     points = np.concatenate(kept)
     if len(points) < 20:
         return []
-    inside, size = [], [view.intrinsics.width - 0.5, view.intrinsics.height - 0.5]
+    inside, size = [], [intrinsics.width - 0.5, intrinsics.height - 0.5]
     for camera_from_first in inverse(first_from_camera):
         x_in_camera = apply(camera_from_first, points)
         shown = x_in_camera[:, 2] > 0
-        x_px = project(view.intrinsics, x_in_camera[shown])
-        shown[shown] = ((x_px > -0.5) & (x_px < size)).all(1)
+        at_px = project(intrinsics, x_in_camera[shown])
+        shown[shown] = ((at_px > -0.5) & (at_px < size)).all(1)
         inside.append(shown)
     counted = np.array(inside, np.float32)  # 10⁷ numbers for 200 images
     share = counted @ counted.T / np.maximum(counted.sum(1), 1)[:, None]

@@ -7,9 +7,9 @@ images are then rotated upright.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
@@ -21,17 +21,17 @@ from jcr.features.gate import (
     Gate,
     Key,
     Pair,
+    RotationOfX,
     agreeing_motions,
     by_quarters,
     classify_pairs,
     rolls,
 )
-from jcr.features.matchers import Geometries, ImageGeometry, Matcher, matrices, still_cells
+from jcr.features.matchers import Geometries, Matcher, matrices, still_cells
 from jcr.features.pairs import (
     FEW,
     FIRST_NEIGHBOURS,
     NEIGHBOURS,
-    all_pairs,
     hand_eye_of_pairs,
     near_pairs,
     pairs_of_common_scene,
@@ -82,10 +82,13 @@ class _Search:
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
     """Gripper's motions i_from_j."""
-    view: ImageGeometry
+    x_px: Sequence[Float[ndarray, "_ 2"]]
+    """Keypoints of every image at the size of matching (`Matcher.x_px`)."""
+    intrinsics: Intrinsics
+    """Intrinsics at this size, given or estimated."""
     repeats: Bool[ndarray, "n n"]
     """True for pairs of images between which the gripper did not move."""
-    pairs: dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]] = field(default_factory=dict)
+    pairs: dict[Key, Pair] = field(default_factory=dict)
     tried: set[tuple[int, int, int, int]] = field(default_factory=set)
     """Rows of the two images and the angles (degrees) that they were rotated by, for each attempt to match a pair."""
 
@@ -93,6 +96,10 @@ class _Search:
     def systematic(self) -> float:
         """Assumed bound on the systematic difference of camera and gripper rotation, as a share of the angle."""
         return SYSTEMATIC if self.matcher.known else SYSTEMATIC_OF_GUESS
+
+    def classify(self, known: RotationOfX | None = None) -> Gate:
+        """Classify all pairs by the gripper's motion; `known` is used if they do not determine a hand-eye rotation."""
+        return classify_pairs(list(self.pairs.values()), self.motion, self.systematic, known)
 
     def match(self, rotations: Mapping[Key, tuple[float, float]]) -> None:
         """Match pairs with their two images rotated by angles (rad); keep the better geometry of each pair.
@@ -113,10 +120,10 @@ class _Search:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats)
         if self.matcher.features.needs_upright:  # rotated images have added keypoints
-            self.view = ImageGeometry.of(self.matcher.x_px, self.view.intrinsics)
+            self.x_px = self.matcher.x_px
         for key, geometry in found.items():
-            if self._is_better(pair := self.matcher.pair(self.view, key, geometry)):
-                self.pairs[key] = pair, geometry
+            if self._is_better(pair := self.matcher.pair(self.x_px, self.intrinsics, key, geometry)):
+                self.pairs[key] = pair
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs with the second image rotated by 0, 90, 180 and 270° until the hand-eye rotation is known.
@@ -128,7 +135,7 @@ class _Search:
             for quarter in range(4):
                 guess = (0.0, quarter * math.pi / 2)
                 self.match(dict.fromkeys(pairs[start : start + GUESSED_AT_ONCE], guess))
-            found = classify_pairs([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
+            found = self.classify()
             if found.of_x is not None:
                 break
         return found
@@ -140,9 +147,7 @@ class _Search:
         the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
-        return classify_pairs(
-            [pair for pair, _ in self.pairs.values()], self.motion, self.systematic, found.of_x
-        )
+        return self.classify(found.of_x)
 
     def hide_still_parts(self) -> None:
         """Find the cells of the image that stay while the gripper moves; verify all matches without these cells.
@@ -150,18 +155,18 @@ class _Search:
         Pairs with too few other matches are removed.
         """
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
-        size = self.view.intrinsics.width, self.view.intrinsics.height
-        still = still_cells(self.view.x_px, self.matcher.raw, size, moving)
+        size = self.intrinsics.width, self.intrinsics.height
+        still = still_cells(self.x_px, self.matcher.raw, size, moving)
         if not still.any():
             return
         self.matcher.still = still
         for key in list(self.pairs):
             rows, moved = self.matcher.raw[key], not self.repeats[key]
-            geometry = self.matcher.verified(key, rows, self.view.x_px, moved)
+            geometry = self.matcher.verified(key, rows, self.x_px, moved)
             if geometry is None:
                 del self.pairs[key]
             else:
-                self.pairs[key] = self.matcher.pair(self.view, key, geometry), geometry
+                self.pairs[key] = self.matcher.pair(self.x_px, self.intrinsics, key, geometry)
 
     def _is_better(self, new: Pair) -> bool:
         """Test whether the new geometry of a pair replaces the one in `pairs`.
@@ -171,7 +176,7 @@ class _Search:
         """
         if new.key not in self.pairs:
             return True
-        old, angle = self.pairs[new.key][0], float(rotation_angle(self.motion[new.key][:3, :3]))
+        old, angle = self.pairs[new.key], float(rotation_angle(self.motion[new.key][:3, :3]))
         first, second = (bool(agreeing_motions(pair, angle, self.systematic)) for pair in (new, old))
         # The later geometry is preferred: its images are rotated upright, so that all pairs share their keypoints.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
@@ -179,12 +184,10 @@ class _Search:
     def gate(self) -> Gate:
         """Estimate unknown intrinsics from the gripper's angles, then classify all pairs by the gripper's motion."""
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
-            self.view = ImageGeometry.of(self.view.x_px, intrinsics)
-            self.pairs = {
-                key: (self.matcher.pair(self.view, key, geometry), geometry)
-                for key, (_, geometry) in self.pairs.items()
-            }
-        return classify_pairs([pair for pair, _ in self.pairs.values()], self.motion, self.systematic)
+            self.intrinsics = intrinsics
+            for key, pair in self.pairs.items():
+                self.pairs[key] = self.matcher.pair(self.x_px, intrinsics, key, pair.geometry)
+        return self.classify()
 
     def _intrinsics_by_robot(self) -> Intrinsics | None:
         """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
@@ -192,28 +195,20 @@ class _Search:
         The image size of the result is the size of matching. Returns None where too few pairs agree on a focal length
         (LEAST_SUPPORT).
         """
-        size = self.view.intrinsics.width, self.view.intrinsics.height
+        size = self.intrinsics.width, self.intrinsics.height
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
-        known = [
-            (
-                angle[key],
-                found,
-                [self.view.x_px[row][own[:FOCAL_MATCHES]] for row, own in zip(key, pair.rows.T, strict=True)],
-            )
-            for key, (pair, found) in self.pairs.items()
-            if angle[key] > math.radians(8)
-        ]
+        rotated = [pair for pair in self.pairs.values() if angle[pair.key] > math.radians(8)]
         best, support = None, LEAST_SUPPORT
         for focal in FOCALS.tolist():
             intrinsics, agreeing = guessed_intrinsics(size, focal), 0.0
-            for of_gripper, geometry, x_px in known:
-                essential, homography = matrices(geometry, intrinsics)
-                ray_i, ray_j = (unproject(intrinsics, x)[:, :2] for x in x_px)
+            for pair in rotated:
+                essential, homography = matrices(pair.geometry, intrinsics)
+                some = zip(pair.key, pair.rows[:FOCAL_MATCHES].T, strict=True)
+                ray_i, ray_j = (unproject(intrinsics, self.x_px[row][own])[:, :2] for row, own in some)
                 found = starting_motions(ray_i, ray_j, essential if homography is None else None, homography)
                 if found:
-                    gap = np.abs(
-                        rotation_angle(np.stack([rotation for rotation, _ in found])) - of_gripper
-                    ).min()
+                    of_camera = rotation_angle(np.stack([rotation for rotation, _ in found]))
+                    gap = np.abs(of_camera - angle[pair.key]).min()
                     agreeing += float(np.exp(-0.5 * (gap / FOCAL_TOLERANCE) ** 2))
             if agreeing > support:
                 best, support = intrinsics, agreeing
@@ -237,9 +232,13 @@ def match_with_robot(
     n, features = len(base_from_gripper), matcher.features
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    matcher.still, view = None, ImageGeometry.of(matcher.x_px, intrinsics)
-    search = _Search(matcher=matcher, motion=motion, view=view, repeats=repeats(motion))
-    everything = all_pairs(n) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
+    matcher.still = None
+    search = _Search(
+        matcher=matcher, motion=motion, x_px=matcher.x_px, intrinsics=intrinsics, repeats=repeats(motion)
+    )
+    everything = (
+        list(combinations(range(n), 2)) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
+    )
     at_once = n <= FEW and not features.needs_upright
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     as_taken = (0.0, 0.0)
@@ -257,12 +256,11 @@ def match_with_robot(
         found = search.gate()
     x = None
     if found.of_x is None:
-        kept, notes, warnings = {key: one for key, (_, one) in search.pairs.items()}, (), ()
+        kept, notes, warnings = search.pairs, (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
-        found = search.match_upright(
-            pairs_of_common_scene(search.view, found, motion) or everything, upright, found
-        )
+        some = pairs_of_common_scene(search.x_px, search.intrinsics, found, motion)
+        found = search.match_upright(some or everything, upright, found)
         report("matching", 0.8)
         rows = [row for pair in found.confirmed for row in pair.key]
         lonely = set(np.flatnonzero(np.bincount(rows, minlength=n) < 2).tolist())
@@ -274,14 +272,16 @@ def match_with_robot(
         percent = 100 * matcher.still.mean()
         notes += (f"{percent:.0f} % of the image stay while the gripper moves, fingers or a logo: left out",)
     report("matching", 1.0)
-    intrinsics = search.view.intrinsics
-    return MatchedPairs(geometries=kept, intrinsics=intrinsics, x=x, notes=notes, warnings=warnings)
+    geometries = {key: pair.geometry for key, pair in kept.items()}
+    return MatchedPairs(
+        geometries=geometries, intrinsics=search.intrinsics, x=x, notes=notes, warnings=warnings
+    )
 
 
 def _pairs_to_map(
     search: _Search, found: Gate, names: Sequence[str]
-) -> tuple[Geometries, tuple[str, ...], tuple[str, ...]]:
-    """Return the two-view geometries that are to be mapped, and notes and warnings for the user about the other pairs.
+) -> tuple[dict[Key, Pair], tuple[str, ...], tuple[str, ...]]:
+    """Return the pairs that are to be mapped, and notes and warnings for the user about the other pairs.
 
     To be mapped are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
     Pairs too uncertain to be judged are mapped only if the intrinsics are unknown.
@@ -303,7 +303,7 @@ def _pairs_to_map(
             f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check its "
             "pose",
         )
-    return {key: one for key, (_, one) in search.pairs.items() if key in believed}, notes, warnings
+    return {key: pair for key, pair in search.pairs.items() if key in believed}, notes, warnings
 
 
 def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:

@@ -96,59 +96,37 @@ def starting_motions(
     return [(rotation.T, _unit(-rotation.T @ translation[:, 0])) for rotation, translation in found]
 
 
-def sampson_px(
+def _sampson_px(
     rotation: Float[ndarray, "3 3"],
     direction: Float[ndarray, "3"],
     ray_i: Float[ndarray, "m 2"],
     ray_j: Float[ndarray, "m 2"],
     focal_px: float,
-) -> Float[ndarray, " m"]:
-    """Return the signed Sampson distance (px) of each match from the epipolar geometry of a camera motion.
+) -> tuple[Float[ndarray, "m 1"], Float[ndarray, "m 1 5"]]:
+    """Return the signed Sampson distance (px) of each match from a camera motion, and its derivatives by a step.
 
     `rotation` is i_from_j, and `direction` points from camera i to camera j in the frame of i. Rays are x/z, y/z; the
-    distance in rays is multiplied by `focal_px`.
-    """
-    essential = skew(direction) @ rotation  # x_i · E x_j = 0
-    h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
-    line_i, line_j = h_j @ essential.T, h_i @ essential
-    return focal_px * (h_i * line_i).sum(1) / _norm(line_i, line_j)
-
-
-def _by_step(
-    rotation: Float[ndarray, "3 3"],
-    direction: Float[ndarray, "3"],
-    ray_i: Float[ndarray, "m 2"],
-    ray_j: Float[ndarray, "m 2"],
-    focal_px: float,
-) -> Float[ndarray, "m 5"]:
-    """Return the derivatives of `sampson_px` by a step of the motion, one column per component.
-
-    Columns 0 to 2 are a rotation vector w in axes of camera i, which changes the rotation R to exp(w) R. Columns 3 and
-    4 are components of the direction along the two vectors of `_sideways`.
+    distance in rays is multiplied by `focal_px`. Derivatives 0 to 2 are by a rotation vector w in axes of camera i,
+    which changes the rotation R to exp(w) R. Derivatives 3 and 4 are by components of the direction along the two
+    vectors of `_sideways`.
     """
     of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
-    essential = of_direction @ rotation
+    essential = of_direction @ rotation  # x_i · E x_j = 0
     by_step = np.concatenate(
         [of_direction @ skew(np.eye(3)) @ rotation, skew(np.stack(_sideways(direction))) @ rotation]
     )
     line_i, line_j = h_j @ essential.T, h_i @ essential
     line_i_by, line_j_by = h_j @ np.swapaxes(by_step, 1, 2), h_i @ by_step
-    norm = _norm(line_i, line_j)
+    # Norm of the gradient of x_i · E x_j by x and y of both rays.
+    norm = np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
     distance = (h_i * line_i).sum(1) / norm
     norm_by = (line_i_by[..., :2] * line_i[:, :2] + line_j_by[..., :2] * line_j[:, :2]).sum(2) / norm
-    return focal_px * (((h_i * line_i_by).sum(2) - distance * norm_by) / norm).T
+    by_motion = focal_px * (((h_i * line_i_by).sum(2) - distance * norm_by) / norm).T
+    return focal_px * distance[:, None], by_motion[:, None]
 
 
 def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
     return np.concatenate([ray, np.ones((len(ray), 1))], 1)
-
-
-def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
-    """Return for m matches the norm of the gradient of x_i · E x_j by x and y of both rays.
-
-    The rows of `line_i` are E x_j, and those of `line_j` are Eᵀ x_i.
-    """
-    return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
 def _least_squares_motion(
@@ -167,14 +145,11 @@ def _least_squares_motion(
         return None
     at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)
     for _ in range(ROUNDS):
-        residual = sampson_px(*at, ray_i, ray_j, focal_px)
+        residual, _ = _sampson_px(*at, ray_i, ray_j, focal_px)
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
         scaled = focal_px / (2 * sigma)
         found = minimise(
-            lambda at, scaled=scaled: (
-                sampson_px(*at, ray_i, ray_j, scaled)[:, None],
-                _by_step(*at, ray_i, ray_j, scaled)[:, None],
-            ),
+            lambda at, scaled=scaled: _sampson_px(*at, ray_i, ray_j, scaled),
             at,
             lambda at, step: _retracted(*at, step),
             "cauchy",

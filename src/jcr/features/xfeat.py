@@ -25,7 +25,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.extras import extra, install
-from jcr.features.gate import Key, by_quarters
+from jcr.features.gate import Key
 from jcr.progress import Progress, silent, steps
 
 LONG_SIDE_PX = 1024
@@ -98,9 +98,9 @@ def read_weights(name: str) -> dict[str, Tensor]:
 
 @torch.inference_mode()
 def detect(
-    network: torch.nn.Module, image: Float[Tensor, "3 h w"], count: int
+    network: torch.nn.Module, image: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
-    """Return the at most `count` best keypoints of an image (RGB, 0 to 1) and their unit descriptors.
+    """Return the best keypoints of an image (RGB, 0 to 1), KEYPOINTS at most, and their unit descriptors.
 
     Keypoints are x, y in px; pixel centres are whole numbers. Published keypoints are whole pixels; here each is moved
     to the centroid of its 3x3 neighbourhood in the heat map, because calibration needs fractions of a pixel.
@@ -110,9 +110,11 @@ def detect(
     is_peak = (heat == F.max_pool2d(heat, 5, stride=1, padding=2)) & (heat > LEAST_SCORE)
     is_peak[..., :2, :] = is_peak[..., -2:, :] = is_peak[..., :2] = is_peak[..., -2:] = False
     y, x = is_peak[0, 0].nonzero(as_tuple=True)
-    grid = _grid(torch.stack([x, y], -1), heat)
+    # As in the network's training, -1 and 1 are the centres of the outermost pixels; grid_sample has them at the edges.
+    sides = torch.tensor([heat.shape[3] - 1, heat.shape[2] - 1], dtype=torch.float32)
+    grid = (2 * torch.stack([x, y], -1) / sides - 1)[None, None]
     score = heat[0, 0, y, x] * F.grid_sample(reliability, grid, align_corners=False)[0, 0, 0]
-    best = score.argsort(descending=True, stable=True)[:count]
+    best = score.argsort(descending=True, stable=True)[:KEYPOINTS]
     x, y = x[best], y[best]
     near = torch.arange(-1, 2)
     patch = heat[0, 0, y[:, None, None] + near[:, None], x[:, None, None] + near]
@@ -140,16 +142,6 @@ def match(
     ]
     found = matcher({"image0": images[0], "image1": images[1]})
     return cast(Tensor, found["matches"][0]), cast(Tensor, found["scores"][0])
-
-
-def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
-    """Return pixels (x, y) of `image` as the coordinates, -1 to 1, at which torch's grid_sample reads it.
-
-    The last two axes of `image` are height h and width w. A pixel x becomes 2x/(w-1) - 1, as in the network's training,
-    where -1 and 1 are the centres of the outermost pixels. grid_sample itself has them at the outer edges.
-    """
-    height, width = image.shape[-2:]
-    return (2 * x_px / torch.tensor([width - 1, height - 1], dtype=torch.float32) - 1)[None, None]
 
 
 @dataclass(frozen=True)
@@ -190,11 +182,11 @@ class LearnedFeatures:
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Return for each pair its m matches, as rows of keypoints of its first and of its second image (m,2).
 
-        The two images are first rotated by `rolls` (rad, `by_quarters`), clockwise on the screen; keypoints are added
-        to `x_px`.
+        The two images are first rotated by `rolls` (rad, rounded to 1°), clockwise on the screen; keypoints are added to
+        `x_px`.
         """
         rotated = [
-            [(row, round(math.degrees(by_quarters(float(roll))))) for row, roll in zip(*both, strict=True)]
+            [(row, round(math.degrees(float(roll)))) for row, roll in zip(*both, strict=True)]
             for both in zip(pairs, rolls, strict=True)
         ]
 
@@ -240,7 +232,7 @@ class LearnedFeatures:
         rotated = cv2.warpAffine(small, rotated_from_small[:2], out, borderMode=cv2.BORDER_REPLICATE)
         pixels = torch.from_numpy(np.ascontiguousarray(rotated)).permute(2, 0, 1).float() / 255
         given_from_rotated = (given_from_small @ np.linalg.inv(rotated_from_small))[:2]
-        x_px, descriptor = detect(self._network, pixels, KEYPOINTS)
+        x_px, descriptor = detect(self._network, pixels)
         given = x_px.double().numpy() @ given_from_rotated[:, :2].T + given_from_rotated[:, 2]
         inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in the replicated border
         kept = torch.from_numpy(inside)
