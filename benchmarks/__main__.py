@@ -6,7 +6,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date
 from importlib import import_module
@@ -42,6 +42,9 @@ BENCHES = {
     "pointmaps": (OTHERS, "Pointmaps"),
 }
 """Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+SHARE, LEFT_OUT = 4, "kinhec"
+"""`all` takes one case in SHARE of the benches with many, and leaves out the bench that takes an hour."""
 COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of commands that are no bench and take arguments of their own, by name."""
 CLAIM = "> "
@@ -58,37 +61,39 @@ class Arguments:
 
     examples:
       python -m benchmarks speed
-      python -m benchmarks map --out docs/results
-      python -m benchmarks fetch-captures captures
-      python -m benchmarks real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
-      python -m benchmarks all captures --out docs/results
+      python -m benchmarks map docs/results
+      python -m benchmarks fetch-captures data
+      python -m benchmarks real --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
+      python -m benchmarks all out/results
+      python -m benchmarks kinhec --every 12 --seed 1
       python -m benchmarks align PAIRS.npz OUT.npz --method adam
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
-    """Bench to run, or all of them."""
-    captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
+    """Bench to run; `all`: all but KinHEC, which takes an hour, with every fourth case of those that have many."""
+    out: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OUT]")] = None
+    """Folder into which NAME.md and the index README.md are written, too (unset: of `all` docs/results)."""
+    captures: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("data")
     """Folder that holds capture folders, for benches of real captures."""
     boards: tuple[str, ...] = ()
     """CAPTURE=BOARD, a board as in jcr run --board, for the bench `real`."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md and the index README.md into this folder."""
+    every: int = 1
+    """Measure one case in this many (1: all); captures, faults and sequences are taken at even steps."""
+    seed: int = 0
+    """Number that is added to the seed of KinHEC's tier; each number generates other sequences."""
 
 
 def main(arguments: Arguments) -> int:
     """Run one bench or all of them and return the exit status."""
+    if arguments.every < 1:
+        raise InputError(f"--every {arguments.every}: give 1 or more")
     if arguments.name == "all":
-        if arguments.out is None:
-            raise InputError("bench all: name the folder for the tables with --out DIR")
-        return run_all(arguments.out, arguments.captures, arguments.boards)
+        return run_all(arguments)
     run = import_module(f"benchmarks.{arguments.name}").run
-    given = {name: value for name in ("captures", "boards") if (value := getattr(arguments, name))}
     taken = signature(run).parameters
-    if "captures" in taken and arguments.captures is None:
-        raise InputError(f"bench {arguments.name}: name the folder that holds the captures")
-    if excess := given.keys() - taken.keys():
+    if excess := options_of(arguments).keys() - taken.keys():
         raise InputError(f"bench {arguments.name}: does not use {', '.join(sorted(excess))}; leave it out")
-    page = heading(arguments) + run(**given)
+    page = heading(arguments) + run(**{name: getattr(arguments, name) for name in taken})
     sys.stdout.write(page)
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", page)
@@ -96,29 +101,44 @@ def main(arguments: Arguments) -> int:
     return 0
 
 
-def run_all(out: Path, captures: Path | None, boards: Sequence[str] = ()) -> int:
-    """Run every bench in a process of its own, write pages and index into `out`, and return 1 if one failed, else 0.
+def options_of(arguments: Arguments) -> dict[str, list[str]]:
+    """Return the options that are not at their defaults, each as the words of a command line."""
+    default, found = Arguments(arguments.name), {}
+    for name in ("captures", "boards", "every", "seed"):
+        if (value := getattr(arguments, name)) != getattr(default, name):
+            found[name] = [f"--{name}", *(value if name == "boards" else [str(value)])]
+    return found
 
-    Benches of real captures need `captures`.
+
+def run_all(arguments: Arguments) -> int:
+    """Run the benches, two at a time and `speed` alone at the end, and return 1 if one failed, else 0.
+
+    Each runs in a process of its own. Benches of real captures are left out where there are none.
     """
-    passed = True
-    for name in BENCHES:
-        taken = signature(import_module(f"benchmarks.{name}").run).parameters
-        if "captures" in taken and captures is None:
-            continue
-        words = [str(captures)] if "captures" in taken else []
-        words += ["--boards", *boards] if boards and "boards" in taken else []
-        begun, checkout = time.perf_counter(), str(Path(__file__).parents[1])
-        path = os.pathsep.join([checkout, os.environ.get("PYTHONPATH", "")])
-        command = [sys.executable, "-m", "benchmarks", name, *words, "--out", str(out)]
+    out, options = arguments.out or RESULTS, options_of(arguments) | {"every": ["--every", str(SHARE)]}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+
+    def is_done(name: str) -> bool:
+        """Run one bench and report it on stderr."""
+        taken, begun = signature(import_module(f"benchmarks.{name}").run).parameters, time.perf_counter()
+        reason = "takes an hour" if name == LEFT_OUT else ""
+        if "captures" in taken and not arguments.captures.is_dir():
+            reason = f"there is no folder {arguments.captures}"
+        if reason:
+            sys.stderr.write(f"{name}: left out, {reason}\n")
+            return True
+        words = [word for option, pair in options.items() if option in taken for word in pair]
         done = subprocess.run(
-            command, env=os.environ | {"PYTHONPATH": path}, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+            [sys.executable, "-m", "benchmarks", name, str(out), *words], env=environment, capture_output=True
         )
         lines = done.stderr.decode().strip().splitlines() or [""]
         outcome = f"exit status {done.returncode}: {lines[-1]}" if done.returncode else "done"
         sys.stderr.write(f"{name}: {outcome}, {time.perf_counter() - begun:.0f} s\n")
-        passed &= done.returncode == 0
-    return int(not passed)
+        return done.returncode == 0
+
+    with ThreadPoolExecutor(2) as two:
+        passed = [*two.map(is_done, (name for name in BENCHES if name != "speed"))]
+    return int(not all([*passed, is_done("speed")]))
 
 
 def claims(page: Path) -> str:
@@ -132,7 +152,10 @@ def write_index(out: Path) -> None:
     lines = [
         "# Results",
         "",
-        "Written by `python -m benchmarks`; each page has its command, commit and machine.",
+        "Written by `python -m benchmarks`; each page has its command, commit and machine. `python -m benchmarks all` "
+        "takes 20 minutes of two cores: without KinHEC, which takes an hour, and with one case in "
+        f"{SHARE} where the command has `--every {SHARE}`. `python -m benchmarks NAME docs/results` takes all of "
+        "one bench.",
     ]
     for part in PARTS:
         rows = [
@@ -147,10 +170,16 @@ def write_index(out: Path) -> None:
 
 def heading(arguments: Arguments) -> str:
     """Return title, subject, command, date, commit, machine and versions of a page."""
-    command = ["python", "-m", "benchmarks", arguments.name]
-    if arguments.captures is not None:
-        # The path of the folder is a detail of this machine.
-        command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
+    # The path of the captures is a detail of this machine.
+    options = options_of(arguments) | {"captures": []}
+    command = [
+        "python",
+        "-m",
+        "benchmarks",
+        arguments.name,
+        *(word for pair in options.values() for word in pair),
+    ]
+    share = f" One case in {arguments.every}; without `--every` all." if arguments.every > 1 else ""
     subject = (import_module(f"benchmarks.{arguments.name}").__doc__ or "").partition("\n")[0]
     git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     done = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True)
@@ -161,7 +190,7 @@ def heading(arguments: Arguments) -> str:
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     processor = [*models, platform.machine()][0]
     return (
-        f"# {BENCHES[arguments.name][1]}\n\n{subject}\n\n    {shlex.join(command)}\n\n"
+        f"# {BENCHES[arguments.name][1]}\n\n{subject}{share}\n\n    {shlex.join(command)}\n\n"
         f"{date.today().isoformat()}, commit `{done.stdout.strip() or 'unknown'}`. {processor}, {os.cpu_count()} "
         f"cores, Python {platform.python_version()}, {', '.join(versions)}.\n\n"
     )

@@ -111,10 +111,10 @@ def answered(problem: CellProblem, seed: int, world: Float[ndarray, "4 4"] = UNM
     return solve(*with_observations(*cell_of(problem, cameras, world), problem.observations))
 
 
-def run(captures: Path) -> str:
-    """Return the page in Markdown: simulated cells of each kind, and withheld images of the captures."""
+def run(captures: Path, every: int = 1) -> str:
+    """Return the page in Markdown: simulated cells of each kind, and withheld images of one capture in `every`."""
     faults = [cells for seed in CELL_SEEDS for cells in _with_faults(seed)]
-    real = [row for folder in folders_with_captures(captures) for row in _withheld(folder)]
+    real = [row for folder in folders_with_captures(captures, every) for row in _withheld(folder)]
     every, rows = [], []
     for kind, preset in product(get_args(Kind), PRESET_NAMES):
         for name, draws in _draws(kind, preset).items():

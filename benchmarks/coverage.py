@@ -5,6 +5,7 @@ sees, and predicted over reported uncertainty.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -59,10 +60,12 @@ SOLVERS: dict[str, Callable[[BentProblem], Calibration]] = {
 """Three states of knowledge about the robot, and independent errors alone, HALCON's published model."""
 
 
-def run() -> str:
-    """Return the page in Markdown: claims, then the three tables."""
-    robots, seen, ahead = measure_robots(), measure_seen(), predicted()
-    return "\n".join([*_claims(robots, seen, ahead), *_tables(robots, seen, ahead)]) + "\n"
+def run(every: int = 1) -> str:
+    """Return the page in Markdown, of one arm and one draw in `every`: claims, then the three tables."""
+    draws = DRAWS // every
+    robots, seen = measure_robots(ROBOT_NAMES[::every]), measure_seen(draws)
+    ahead = predicted(PREDICTED_DRAWS // every)
+    return "\n".join([*_claims(robots, seen, ahead), *_tables(robots, seen, draws, ahead)]) + "\n"
 
 
 class RobotRow(NamedTuple):
@@ -83,33 +86,25 @@ class RobotRow(NamedTuple):
     """Mean squared Mahalanobis distance over its 6 degrees of freedom."""
 
 
-def measure_robots(
-    arms: Sequence[str] = ROBOT_NAMES,
-    presets: Sequence[PresetName] = get_args(PresetName),
-    counts: Sequence[int] = COUNTS,
-    draws: int = 1,
-) -> list[RobotRow]:
-    """Return a row per size of errors, number of images and solver; `draws` of each arm."""
-    rows = []
-    for preset in presets:
-        for count in counts:
-            problems = [bent_problem(arm_named(arm), preset, count, k) for arm in arms for k in range(draws)]
-            for known, solve in SOLVERS.items():
-                answers = [solve(p) for p in problems]
-                off = _errors(problems, [(one.gripper_from_camera, one.scale) for one in answers])
-                accepted = np.array([one.converged for one in answers])
-                shares = []
-                if accepted.any():
-                    covariance = np.array([one.covariance[:6, :6] for one in answers if one.converged])
-                    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-                    worst = np.abs(off[accepted] / std).max(1)
-                    squared = squared_distance(off[accepted], covariance).mean() / 6
-                    shares = [float((worst > 3).mean()), float((worst > 5).mean()), float(squared)]
-                rows.append(
-                    RobotRow(preset, count, known, *_median_error(off), float(accepted.mean()), *shares)
-                )
-            park = [opencv("Park", p.base_from_gripper, p.recon_from_camera, p.scale) for p in problems]
-            rows.append(RobotRow(preset, count, PEER, *_median_error(_errors(problems, park)), 1.0))
+def measure_robots(arms: Sequence[str]) -> list[RobotRow]:
+    """Return a row per size of errors, number of images and solver, over one draw of each arm."""
+    rows: list[RobotRow] = []
+    for preset, count in product(get_args(PresetName), COUNTS):
+        problems = [bent_problem(arm_named(arm), preset, count, 0) for arm in arms]
+        for known, solve in SOLVERS.items():
+            answers = [solve(p) for p in problems]
+            off = _errors(problems, [(one.gripper_from_camera, one.scale) for one in answers])
+            accepted = np.array([one.converged for one in answers])
+            shares = []
+            if accepted.any():
+                covariance = np.array([one.covariance[:6, :6] for one in answers if one.converged])
+                std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+                worst = np.abs(off[accepted] / std).max(1)
+                squared = squared_distance(off[accepted], covariance).mean() / 6
+                shares = [float((worst > 3).mean()), float((worst > 5).mean()), float(squared)]
+            rows.append(RobotRow(preset, count, known, *_median_error(off), float(accepted.mean()), *shares))
+        park = [opencv("Park", p.base_from_gripper, p.recon_from_camera, p.scale) for p in problems]
+        rows.append(RobotRow(preset, count, PEER, *_median_error(_errors(problems, park)), 1.0))
     return rows
 
 
@@ -179,16 +174,10 @@ class SeenRow(NamedTuple):
     """Median error of the camera on the gripper."""
 
 
-def measure_seen(
-    presets: Sequence[PresetName] = ("white", "typical"),
-    counts: Sequence[int] = COUNTS,
-    ways: Sequence[Knowledge] = WAYS,
-    draws: int = DRAWS,
-) -> list[SeenRow]:
+def measure_seen(draws: int) -> list[SeenRow]:
     """Return a row per robot, number of images and knowledge of the intrinsics."""
-    return [
-        _seen_row(preset, count, known, draws) for preset in presets for count in counts for known in ways
-    ]
+    presets: tuple[PresetName, ...] = ("white", "typical")
+    return [_seen_row(*row, draws) for row in product(presets, COUNTS, WAYS)]
 
 
 def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> SeenRow:
@@ -219,7 +208,7 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
     return SeenRow(preset, count, known.name, within, float(np.mean(three)), *medians)
 
 
-def predicted(draws: int = PREDICTED_DRAWS) -> Float[ndarray, "k 3"]:
+def predicted(draws: int) -> Float[ndarray, "k 3"]:
     """Return predicted over reported uncertainty of point, camera and rotation for accepted captures.
 
     Captures differ in arm, its errors, number of images, intrinsics and noise.
@@ -305,7 +294,7 @@ def _claims(
 
 
 def _tables(
-    robots: Sequence[RobotRow], seen: Sequence[SeenRow], ahead: Float[ndarray, "k 3"]
+    robots: Sequence[RobotRow], seen: Sequence[SeenRow], draws: int, ahead: Float[ndarray, "k 3"]
 ) -> Iterator[str]:
     yield from ("", "## Arms with systematic errors", "")
     head = "errors | images | solver | median error | accepted | > 3 σ | > 5 σ | squared distance / 6"
@@ -322,7 +311,7 @@ def _tables(
         ),
     )
     yield from ("", "## Points that the camera sees", "")
-    yield from (f"Nine pixels of the image, {POINTS} points with {PIXEL_STD} px, {DRAWS} captures a row.", "")
+    yield from (f"Nine pixels of the image, {POINTS} points with {PIXEL_STD} px, {draws} captures a row.", "")
     head = "robot | images | intrinsics | within their 95 % | within 3 σ | median error | 95 % stated below | camera"
     yield from table(
         head,

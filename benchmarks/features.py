@@ -22,13 +22,11 @@ from jcr.sfm.colmap import reconstruct_colmap
 
 WAYS: tuple[tuple[FeatureName, bool], ...] = (("sift", True), ("sift", False), ("xfeat", True))
 """Features, and whether the robot checks the pairs."""
-EVERY = 4
-"""One capture in this many is measured."""
 
 
-def run(captures: Path) -> str:
-    """Return the page in Markdown: some of the captures below `captures`, matched in each way."""
-    folders = folders_with_captures(captures)[::EVERY]
+def run(captures: Path, every: int = 1) -> str:
+    """Return the page in Markdown: one in `every` of the captures below `captures`, matched in each way."""
+    folders = folders_with_captures(captures, every)
     counts, rows = [], []
     for features, gate in WAYS:
         way = features + ("" if gate else " without the gate")

@@ -93,10 +93,10 @@ class Fed(NamedTuple):
     cells: list[str]
 
 
-def run(captures: Path) -> str:
-    """Return the page in Markdown: simulated captures by each way, and real ones image by image."""
+def run(captures: Path, every: int = 1) -> str:
+    """Return the page in Markdown: simulated captures by each way, and one real one in `every` image by image."""
     runs = [run_of(cell_of(seed), way) for seed in range(SCENES) for way in WAYS]
-    real, seconds = [fed(folder) for folder in folders_with_captures(captures)], latencies()
+    real, seconds = [fed(folder) for folder in folders_with_captures(captures, every)], latencies()
     needed = []
     for way in WAYS:
         counts = [one.images if one.claimed else np.inf for one in runs if one.way == way]

@@ -53,9 +53,15 @@ def of_rows(capture: Capture, rows: Sequence[int]) -> Capture:
     return replace(capture.of_rows(rows), depths=None)
 
 
-def folders_with_captures(captures: Path) -> list[Path]:
-    """Return the folders below `captures` that hold a capture.json; raise InputError where there is none."""
+def folders_with_captures(captures: Path, every: int = 1) -> list[Path]:
+    """Return one in `every` of the folders below `captures` that hold a capture.json, at even steps.
+
+    Raises InputError where there is none.
+    """
     folders = sorted(path.parent for path in captures.glob("*/capture.json"))
     if not folders:
-        raise InputError(f"{captures}: no folder below it holds a capture.json")
-    return folders
+        raise InputError(
+            f"{captures}: no folder below it holds a capture.json; name another one with --captures, or build captures "
+            "with python -m benchmarks fetch-captures data"
+        )
+    return folders[::every]

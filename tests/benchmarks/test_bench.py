@@ -43,7 +43,7 @@ def test_every_page_of_results_belongs_to_a_bench_and_the_index_is_current(tmp_p
 def test_every_bench_can_be_imported_and_takes_known_options():
     for name in BENCHES:
         known = signature(import_module(f"benchmarks.{name}").run).parameters
-        assert set(known) <= {"captures", "boards"}, name
+        assert set(known) <= {"captures", "boards", "every", "seed"}, name
 
 
 def test_every_number_of_the_readme_is_in_the_results():
