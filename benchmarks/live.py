@@ -135,7 +135,7 @@ def cell_of(seed: int) -> Cell:
     arm = arm_named(ARMS[seed % len(ARMS)])
     x, target = hand_eye_on(arm, hand_eye), table_center(arm)
     return Cell(
-        arm=bend(arm, PRESETS["typical"].sizes, errors),
+        arm=bend(arm, PRESETS["typical"], errors),
         scene=moved(make_scene("tabletop", seed), target),
         camera=pinhole(camera),
         physical=x,

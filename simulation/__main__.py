@@ -16,16 +16,14 @@ from simulation.capture import SimulateOptions, simulate
 class Arguments:
     """A capture of a simulated tabletop, rendered with MuJoCo, with the ground truth beside it.
 
-    OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye transform; for a robot
-    with errors the effective one, and the physical one and the errors beside it) and truth/ (scene.json: heights, boxes,
-    poses; depth and labels per image).
+    OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye transform) and truth/
+    (scene.json: heights, boxes, poses; depth and labels per image).
 
     examples:
       python -m simulation captures/simulated
       python -m simulation captures/noisy --seed 3 --robot-noise 0.5 0.1
       python -m simulation captures/measuring --scene measuring --images 10
-      python -m simulation captures/orbit --pattern orbit --unknown-intrinsics
-      python -m simulation captures/bent --robot ur5e --joint-offsets 0.1 --link-errors 0.3 --intrinsics-error 0.5
+      python -m simulation captures/uncalibrated --unknown-intrinsics
     """
 
     out: Annotated[Path, tyro.conf.Positional]

@@ -1,10 +1,6 @@
 """Simulated arms with systematic errors, the views that they reach, and their effective hand-eye transform.
 
-Joint offsets and link errors are those of estimation/kinematics.py. Light and low-cost arms have two kinds more:
-
-- sag: elastic deflection under gravity, φ times the horizontal lever of the gripper about the joint's axis, divided by
-  the arm's reach (rad at full stretch);
-- an eccentric encoder or gear, q + φ₁ sin q + φ₂ cos q (rad).
+Joint offsets and link errors are those of estimation/kinematics.py.
 
 The truth for a hand-eye calibration of such an arm is the effective transform: of all hand-eye transforms and bases,
 the one that best predicts the camera from the reported poses over the workspace of the capture.
@@ -20,13 +16,10 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.estimation.inverse_kinematics import reach_toward
 from jcr.estimation.kinematics import (
-    LINK_ERRORS,
     Arm,
     Joints,
-    axis_twists,
     error_std,
     forward_kinematics,
-    joint_frames,
     kinematic_jacobian,
     perpendicular,
 )
@@ -54,27 +47,6 @@ STRIDE = 0.4
 """rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
-NAMES = (
-    ("joint {}",),
-    ("link {} shift 1", "link {} shift 2", "link {} tilt 1", "link {} tilt 2"),
-    ("joint {} sag",),
-    ("joint {} gear sine", "joint {} gear cosine"),
-)
-"""Names of the errors of each joint, counted from 1: all of the first kind, then all of the second."""
-
-
-@dataclass(frozen=True)
-class ErrorSizes:
-    """One-sigma sizes of an arm's errors."""
-
-    joint_offset: float = 0.0
-    """rad, of each joint."""
-    link: float = 0.0
-    """m, of each translation of a link; its rotations go with it (robots.error_std)."""
-    sag: float = 0.0
-    """rad, of each joint with the arm stretched out."""
-    gear: float = 0.0
-    """rad, of sine and cosine each."""
 
 
 @dataclass(frozen=True)
@@ -83,42 +55,21 @@ class BentArm:
 
     arm: Arm
     errors: Float[ndarray, " p"]
-    """The errors in the order of `error_names`; m and rad."""
+    """Offset of each joint (rad), then two shifts (m) and two tilts (rad) of each link."""
 
     def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
         """Return base_from_gripper (n,4,4) as the controller computes it."""
         return forward_kinematics(self.arm, joints)
 
     def true(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
-        """Return the true base_from_gripper (n,4,4), exact except that the lever of sag is that of the nominal arm."""
+        """Return the true base_from_gripper (n,4,4)."""
         dof, arm = self.arm.dof, self.arm
-        offset, link, sag, gear = np.split(self.errors, dof * np.cumsum([1, LINK_ERRORS, 1]))
-        sine, cosine = gear.reshape(dof, 2).T
-        lever = axis_twists(arm, *joint_frames(arm, joints))[..., 2]
-        angles = joints + offset + np.sin(joints) * sine + np.cos(joints) * cosine + lever / arm.reach * sag
-        sideways, link = perpendicular(arm.axes), link.reshape(dof, 2, 2, 1)
+        sideways, link = perpendicular(arm.axes), self.errors[dof:].reshape(dof, 2, 2, 1)
         shift, tilt = (sideways @ link[:, part] for part in range(2))
         moved = transform(rotation_exp(tilt[..., 0]), shift[..., 0])
-        return forward_kinematics(replace(arm, parent_from_joint=arm.parent_from_joint @ moved), angles)
-
-    def named_errors(self) -> dict[str, float]:
-        """Return the errors that are not zero by name (m, rad)."""
-        names = error_names(self.arm)
-        return {name: float(value) for name, value in zip(names, self.errors, strict=True) if value}
-
-
-def error_names(arm: Arm) -> tuple[str, ...]:
-    """Return the names of an arm's errors in their order: "joint 3", "link 2 tilt 1"."""
-    return tuple(text.format(i + 1) for texts in NAMES for i in range(arm.dof) for text in texts)
-
-
-def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
-    """Draw an arm with random errors of the given sizes."""
-    std = np.r_[
-        error_std(arm, sizes.joint_offset, sizes.link),
-        np.repeat([sizes.sag, sizes.gear], [arm.dof, 2 * arm.dof]),
-    ]
-    return BentArm(arm, std * rng.normal(size=len(std)))
+        return forward_kinematics(
+            replace(arm, parent_from_joint=arm.parent_from_joint @ moved), joints + self.errors[:dof]
+        )
 
 
 @dataclass(frozen=True)
@@ -127,15 +78,17 @@ class ArmErrors:
 
     white: tuple[float, float] = (0.0, 0.0)
     """m, rad per axis, independent at each pose."""
-    sizes: ErrorSizes = ErrorSizes()
-    """Systematic errors, the same for all poses."""
+    joint_offset: float = 0.0
+    """rad, of each joint, the same for all poses."""
+    link: float = 0.0
+    """m, of each translation of a link; its rotations go with it (kinematics.error_std)."""
 
 
 PresetName = Literal["white", "factory-calibrated", "typical", "poor", "low-cost"]
 
 
 def _bent(joint_offset_deg: float, link_mm: float) -> ArmErrors:
-    return ArmErrors((5e-5, np.radians(0.01)), ErrorSizes(np.radians(joint_offset_deg), 1e-3 * link_mm))
+    return ArmErrors((5e-5, np.radians(0.01)), np.radians(joint_offset_deg), 1e-3 * link_mm)
 
 
 PRESETS: dict[PresetName, ArmErrors] = {
@@ -146,6 +99,12 @@ PRESETS: dict[PresetName, ArmErrors] = {
     "low-cost": _bent(1.0, 1.0),
 }
 """Random noise alone, or systematic errors beside a small repeatability (0.05 mm, 0.01°)."""
+
+
+def bend(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> BentArm:
+    """Draw an arm with random errors of the given sizes."""
+    std = error_std(arm, errors.joint_offset, errors.link)
+    return BentArm(arm, std * rng.normal(size=len(std)))
 
 
 def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:

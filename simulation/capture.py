@@ -2,36 +2,34 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
-import tyro
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.capture.formats import capture_json
-from jcr.capture.images import encode_png
 from jcr.errors import InputError
-from jcr.estimation.arms import CHOICES, RobotName, arm_named
 from jcr.files import write_bytes, write_text
 from jcr.geometry import retract
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, Intrinsics
-from simulation.arms import EFFECTIVE_POSES, ErrorSizes, bend
-from simulation.motion import fixed_camera, motion_over_table
-from simulation.poses import Pattern
+from simulation.motion import fixed_camera
+from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
-from simulation.scenes import SceneName, make_scene, moved
+from simulation.scenes import SceneName, make_scene
 from simulation.truth import Truth, write_pixels, write_truth
 
 _WIDTH, _HEIGHT = 640, 480
-_RANGES = {"images": (1, 1000), "vignetting": (0, 1), "fixed_cameras": (0, 20)} | dict.fromkeys(
-    ("joint_offsets", "link_errors", "gear_errors", "sag", "seed", "noise", "blur", "intrinsics_error"),
-    (0, np.inf),
-)
+_RANGES = {
+    "images": (1, 1000),
+    "vignetting": (0, 1),
+    "fixed_cameras": (0, 20),
+    "jpeg_quality": (1, 100),
+} | dict.fromkeys(("seed", "noise", "blur"), (0, np.inf))
 """Least and largest value of the options."""
 
 
@@ -43,23 +41,7 @@ class SimulateOptions:
     """Objects and table: a mix on wood; 8 or 7 items on a plain light table; 7 on a plain dark one; tape,
     box, mug and toolbox for measuring."""
     images: int = 12
-    """Number of images; fewer images of the pattern `varied` are the first ones of more (`two` has 2)."""
-    pattern: Pattern = "varied"
-    """Path of a gripper without an arm. All but `varied` leave part of the calibration unobservable: an orbit at one
-    radius, pure translation, a turntable, xyz + yaw (SCARA), rotating about a tool point or about the camera's centre,
-    two images."""
-    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
-    """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
-    its nominal kinematics (unset: a gripper without an arm)."""
-    joint_offsets: float = 0.0
-    """Sigma of the offsets of the robot's joints, in degrees. With this and the next three, reference.json has the
-    effective hand-eye transform, and the physical one and the errors beside it."""
-    link_errors: float = 0.0
-    """Sigma of the translations of the robot's joint axes, in mm; of their rotations, 0.19 degrees per mm."""
-    gear_errors: float = 0.0
-    """Sigma of eccentric gears or encoders, in degrees: amplitudes of sine and cosine of each joint's angle."""
-    sag: float = 0.0
-    """Sigma of the deflection of each joint under gravity, in degrees with the arm stretched out."""
+    """Number of images; fewer images are the first ones of more."""
     seed: int = 0
     """Objects, layout, textures, lamp, intrinsics, hand-eye and poses all follow from it."""
     texture: bool = True
@@ -69,17 +51,14 @@ class SimulateOptions:
     show the true ones."""
     unknown_intrinsics: bool = False
     """Leave the intrinsics out of capture.json. (Known or not, the camera is a pinhole without distortion.)"""
-    intrinsics_error: float = 0.0
-    """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
-    the image's width for each coordinate of the principal point. The images show the true ones."""
     noise: float = 0.0
     """Sigma of the pixel noise, in grey levels of 255."""
     blur: float = 0.0
     """Sigma of the blur, in pixels."""
     vignetting: float = 0.0
     """Share of light lost in the corners, 0 to 1."""
-    jpeg_quality: int | Literal["lossless"] = 90
-    """1 to 100, or lossless: PNG."""
+    jpeg_quality: int = 90
+    """1 to 100."""
     fixed_cameras: int = 0
     """Number of cameras that stand beside the table and see the scene, an image each."""
     truth: Literal["full", "scene"] = "full"
@@ -96,30 +75,17 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
     _check(out, options := options or SimulateOptions())
     scene = make_scene(options.scene, options.seed)
     # One stream of random numbers a matter: a change in one must not disturb the others.
-    errors, path, elsewhere, camera, noise, intrinsics, further = (
-        np.random.default_rng([options.seed, stream]) for stream in (8, 4, 9, 5, 6, 10, 14)
-    )
-    bent = None
-    if options.robot is not None:
-        sizes = ErrorSizes(
-            joint_offset=np.radians(options.joint_offsets),
-            link=1e-3 * options.link_errors,
-            sag=np.radians(options.sag),
-            gear=np.radians(options.gear_errors),
-        )
-        bent = bend(arm_named(options.robot), sizes, errors)
-    middle = scene.table_center_in_base
-    motion = motion_over_table(bent, options.pattern, options.images, middle, (path, elsewhere))
-    scene = moved(scene, motion.target_in_base) if bent else scene
-    suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
+    path, camera, noise, further = (np.random.default_rng([options.seed, stream]) for stream in (4, 5, 6, 14))
+    x = random_hand_eye(path)
+    poses = gripper_poses("varied", options.images, scene.table_center_in_base, x, path)
     truth = Truth(
         folder=out,
         scene=scene.name,
         seed=options.seed,
-        images=tuple(f"images/{k:02d}.{suffix}" for k in range(len(motion.reported))),
-        gripper_from_camera=motion.physical,
-        base_from_gripper=motion.base_from_gripper,
-        base_from_camera=motion.base_from_gripper @ motion.physical,
+        images=tuple(f"images/{k:02d}.jpg" for k in range(options.images)),
+        gripper_from_camera=x,
+        base_from_gripper=poses,
+        base_from_camera=poses @ x,
         intrinsics=pinhole(camera),
         labels=scene.labels,
         table_height=scene.table_height,
@@ -133,17 +99,7 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
         if view.depth is not None and view.label is not None:
             write_pixels(truth, k, view.depth, view.label)
     write_truth(truth)
-    reference: dict[str, object] = {
-        "gripper_from_camera": motion.effective.tolist(),
-        "how": "simulated, exact",
-    }
-    if bent is not None:
-        how = f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras"
-        reference |= {
-            "how": how,
-            "physical_gripper_from_camera": motion.physical.tolist(),
-            "errors": bent.named_errors(),
-        }
+    reference: dict[str, object] = {"gripper_from_camera": x.tolist(), "how": "simulated, exact"}
     others = []
     for k in range(options.fixed_cameras):
         name, place, own = (
@@ -151,25 +107,23 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
             fixed_camera(scene.table_center_in_base, 0.55, further),
             pinhole(further),
         )
-        image = f"{name}/00.{suffix}"
+        image = f"{name}/00.jpg"
         (view,) = render(scene, own, place[None], options.texture, with_truth=False)
         _write_image(out / image, view.image, options, [15, 0, *name.encode()])
-        size, stated = (own.width, own.height), _stated_intrinsics(own, options, further)
+        size, stated = (own.width, own.height), None if options.unknown_intrinsics else own
         others.append(
             CellCamera(name=name, mount="base", images=(image,), image_size=size, intrinsics=stated)
         )
-        true = {name: {"base_from_camera": (motion.base_from_true_base @ place).tolist()}}
+        true = {name: {"base_from_camera": place.tolist()}}
         reference = {"cameras": {}, "arms": {}} | reference
         reference["cameras"] |= true  # type: ignore[operator]
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
     capture = Capture(
         folder=out,
         images=truth.images,
-        base_from_gripper=with_robot_noise(motion.reported, *options.robot_noise, noise),
+        base_from_gripper=with_robot_noise(poses, *options.robot_noise, noise),
         image_size=(truth.intrinsics.width, truth.intrinsics.height),
-        intrinsics=_stated_intrinsics(truth.intrinsics, options, intrinsics),
-        joints=motion.joints,
-        robot=options.robot,
+        intrinsics=None if options.unknown_intrinsics else truth.intrinsics,
         others=tuple(others),
     )
     # Last: a folder with a capture.json is a complete capture.
@@ -197,22 +151,6 @@ def with_robot_noise(
     return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
 
 
-def _stated_intrinsics(
-    camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
-) -> Intrinsics | None:
-    """Return the intrinsics of capture.json with the errors of the options, or None where it gives none."""
-    if options.unknown_intrinsics:
-        return None
-    focal, x, y = 0.01 * options.intrinsics_error * rng.normal(size=3)
-    return replace(
-        camera,
-        fx=camera.fx * (1 + focal),
-        fy=camera.fy * (1 + focal),
-        cx=camera.cx + x * camera.width,
-        cy=camera.cy + y * camera.width,
-    )
-
-
 def _write_image(
     path: Path, pixels: UInt8[ndarray, "h w 3"], options: SimulateOptions, stream: Sequence[int]
 ) -> None:
@@ -227,8 +165,7 @@ def _write_image(
     if options.noise:
         light += np.random.default_rng([options.seed, *stream]).normal(0, options.noise, pixels.shape)
     image = np.clip(light + 0.5, 0, 255).astype(np.uint8)
-    quality = options.jpeg_quality
-    write_bytes(path, encode_png(image) if quality == "lossless" else encode_jpeg(image, quality))
+    write_bytes(path, encode_jpeg(image, options.jpeg_quality))
 
 
 def encode_jpeg(image: UInt8[ndarray, "h w 3"], quality: int) -> bytes:
@@ -237,22 +174,12 @@ def encode_jpeg(image: UInt8[ndarray, "h w 3"], quality: int) -> bytes:
 
 
 def _check(out: Path, options: SimulateOptions) -> None:
-    """Raise InputError for options out of range or that exclude each other, and for a folder that is not new."""
+    """Raise InputError for options out of range, and for a folder that is not new."""
     values = {name: (getattr(options, name), *limits) for name, limits in _RANGES.items()}
     values["robot_noise"] = min(options.robot_noise), 0, np.inf
-    if options.jpeg_quality != "lossless":
-        values["jpeg_quality"] = options.jpeg_quality, 1, 100
     for name, (value, low, high) in values.items():
         if not low <= value <= high:
             upper = "or more" if np.isinf(high) else f"to {high}"
             raise InputError(f"--{name.replace('_', '-')} {value}: give {low} {upper}")
-    of_arm = ("joint_offsets", "link_errors", "gear_errors", "sag")
-    bent = next((f"--{name.replace('_', '-')}" for name in of_arm if getattr(options, name)), None)
-    if bent and options.robot is None:
-        raise InputError(f"{bent}: errors of an arm; name it with --robot")
-    if options.robot is not None and options.pattern != "varied":
-        raise InputError(f"--pattern {options.pattern}: not for an arm; leave --robot out")
-    if options.intrinsics_error and options.unknown_intrinsics:
-        raise InputError("--intrinsics-error and --unknown-intrinsics exclude each other; leave one out")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists already and is no empty folder; name a new one, or remove it first")

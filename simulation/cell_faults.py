@@ -47,7 +47,7 @@ def further_camera(
         mounts, _ = moved_parts(scene.gripper_from_camera @ beside, IMAGES, faults, of_faults)
         cameras = scene.base_from_gripper[rows_of(scene, seed)] @ mounts
     else:
-        path = motion_over_table(None, "varied", ARM_IMAGES, target, (motion, elsewhere))
+        path = motion_over_table(None, ARM_IMAGES, target, (motion, elsewhere))
         mounts, _ = moved_parts(path.physical, ARM_IMAGES, faults, of_faults)
         cameras = path.base_from_gripper @ mounts
         reported = reported_poses(inverse(BASE_FROM_OTHER) @ path.base_from_gripper, faults)

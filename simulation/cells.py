@@ -74,7 +74,7 @@ def cell_problem(
     """Draw a cell of that kind, of UR5e arms with errors of `preset`, and `count` poses of each."""
     rng = np.random.default_rng([seed, 13])
     cell = _Cell(kind=kind)
-    bent = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
+    bent = bend(arm_named("ur5e"), PRESETS[preset], rng)
     white = PRESETS[preset].white
     if kind == "carried":
         gripper_from_object = random_hand_eye(rng)
@@ -92,7 +92,7 @@ def cell_problem(
         cell.truth = {"base_from_camera": fit.gripper_from_camera, "gripper_from_object": fit.base_from_recon}
         x_in_object, normal = _box(points, rng)
         return _seen(cell, x_in_object, normal, noise_px, rng)
-    own = motion_over_table(bent, "varied", count, np.zeros(3), (rng, rng))
+    own = motion_over_table(bent, count, np.zeros(3), (rng, rng))
     target = own.target_in_base
     cell.add_arm(
         own.base_from_gripper @ own.physical,
@@ -112,8 +112,8 @@ def cell_problem(
         cell.add_camera(place[None], FIXED_CAMERA)
         cell.truth["base_from_camera"] = own.base_from_true_base @ place
     else:
-        second = bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
-        other = motion_over_table(second, "varied", count, np.zeros(3), (rng, rng))
+        second = bend(arm_named("ur5e"), PRESETS[preset], rng)
+        other = motion_over_table(second, count, np.zeros(3), (rng, rng))
         # The second arm is across the table.
         rotation = rotation_exp(np.array([0.0, 0.0, np.pi + rng.uniform(-0.4, 0.4)]))
         base_from_other = transform(rotation, target - rotation @ other.target_in_base)

@@ -92,8 +92,8 @@ def rendered(seed: int) -> Rendered:
     errors, motion, elsewhere, intrinsics = (np.random.default_rng([seed, 20 + k]) for k in range(4))
     scene, name = make_scene("tabletop", seed), ARMS[seed % len(ARMS)]
     preset = PRESETS["typical"]
-    bent = None if name is None else bend(arm_named(name), preset.sizes, errors)
-    path = motion_over_table(bent, "varied", POSES, scene.table_center_in_base, (motion, elsewhere))
+    bent = None if name is None else bend(arm_named(name), preset, errors)
+    path = motion_over_table(bent, POSES, scene.table_center_in_base, (motion, elsewhere))
     scene, cameras = moved(scene, path.target_in_base), path.base_from_gripper @ path.physical
     focal_px = float(intrinsics.uniform(*FOCAL_PX))
     camera = Intrinsics(focal_px, focal_px, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)

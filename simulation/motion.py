@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from simulation.arms import BentArm, effective_about, hand_eye_on, table_center, views
-from simulation.poses import Pattern, gripper_poses, looking_at, random_hand_eye
+from simulation.poses import gripper_poses, looking_at, random_hand_eye
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,25 +26,22 @@ class Motion:
     """gripper_from_camera that best predicts the camera from reported poses; `physical` without systematic errors."""
     base_from_true_base: Float[ndarray, "4 4"]
     """Base in which `reported` and `effective` predict the camera, from the one of `base_from_gripper`."""
-    joints: Float[ndarray, "n dof"] | None = None
-    """rad; None without an arm."""
 
 
 def motion_over_table(
     bent: BentArm | None,
-    pattern: Pattern,
     count: int,
     target_in_base: Float[ndarray, "3"],
     streams: Sequence[np.random.Generator],
 ) -> Motion:
-    """Draw a motion over a table about `target_in_base`, or, for an arm, varied views of the table that suits it.
+    """Draw varied views of a table about `target_in_base`, or, for an arm, of the table that suits it.
 
     `streams` draw the motion, and the poses that its effective transform is fitted to.
     """
     motion, elsewhere = streams
     if bent is None:
         x = random_hand_eye(motion)
-        poses = gripper_poses(pattern, count, target_in_base, x, motion)
+        poses = gripper_poses("varied", count, target_in_base, x, motion)
         return Motion(
             target_in_base=target_in_base,
             physical=x,
@@ -64,7 +61,6 @@ def motion_over_table(
         reported=bent.reported(joints),
         effective=fit.gripper_from_camera,
         base_from_true_base=fit.base_from_recon,
-        joints=joints,
     )
 
 

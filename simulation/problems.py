@@ -11,7 +11,7 @@ from jcr.camera import project
 from jcr.estimation.kinematics import Arm
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Intrinsics, Tracks
-from simulation.arms import PRESETS, ArmErrors, BentArm, PresetName, bend, effective_about, hand_eye_on, views
+from simulation.arms import PRESETS, BentArm, PresetName, bend, effective_about, hand_eye_on, views
 from simulation.poses import Pattern, gripper_poses, random_hand_eye
 
 INTRINSICS = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (-0.08, 0.05, 1e-3, -5e-4, 0.01))
@@ -98,7 +98,7 @@ class BentProblem(HandEyeProblem):
 
 def bent_problem(
     arm: Arm,
-    errors: ArmErrors | PresetName,
+    preset: PresetName,
     count: int,
     seed: int,
     camera_noise: tuple[float, float] = (5e-5, np.radians(0.005)),
@@ -107,10 +107,10 @@ def bent_problem(
 
     `camera_noise` is one sigma (m, rad) per axis of the reconstructed cameras.
     """
-    errors = PRESETS[errors] if isinstance(errors, str) else errors
+    errors = PRESETS[preset]
     hand_eye, motion, arms, noise, elsewhere = (np.random.default_rng([seed, k]) for k in range(5))
     physical = hand_eye_on(arm, hand_eye)
-    bent = bend(arm, errors.sizes, arms)
+    bent = bend(arm, errors, arms)
     joints = views(arm, count, physical, motion)
     true = bent.true(joints)
     effective = effective_about(bent, physical, count, elsewhere).gripper_from_camera
