@@ -278,6 +278,21 @@ def test_growing_errors_are_weighed_and_in_the_uncertainty():
     assert np.median(squared) < 12.6 and max(squared) < 25
 
 
+def test_errors_of_camera_positions_do_not_bias_the_scale():
+    """A fit that leaves the camera poses as given finds scales that are 6 % too small here, in the mean."""
+    off, noise = list[float](), np.array([0.01] * 3 + [1e-4] * 3)
+    for seed in range(20):
+        rng = np.random.default_rng([seed, 10])
+        problem = hand_eye_problem(rng, 30, robot_noise=(2e-4, 5e-4))
+        camera = problem.recon_from_camera.copy()
+        noise_in_recon = noise / np.repeat([problem.scale, 1.0], 3)
+        camera[:, :3, 3] += noise_in_recon[:3] * rng.normal(size=(30, 3))
+        covariance = np.diag(np.tile(noise_in_recon**2, 30))
+        solved = solve_hand_eye(problem.base_from_gripper, camera, camera_covariance=covariance)
+        off.append(float(np.log(solved.scale / problem.scale)))
+    assert abs(np.mean(off)) < 0.02
+
+
 @pytest.mark.slow
 def test_rotations_about_the_board_and_errors_of_depth_are_weighed_and_in_the_uncertainty():
     squared, metres = list[float](), dict[bool, list[float]]()

@@ -278,7 +278,10 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         gradient += row * (row @ problem.coordinates(state) - value) / std**2
     if images is None:
         assert problem.known_rigs is not None
-        covariance = problem.known_rigs[1]
+        given, covariance = problem.known_rigs
+        if covariance is not None:
+            to_given = step_between(state.world_from_rig, given).reshape(-1, 1)
+            residual = residual + pose_by_pose(by_rig, to_given).reshape(n, 6)
     else:
         follow, step, covariance = images.rigs
         coupling = images.information[np.ix_(problem.by_arm, free)]

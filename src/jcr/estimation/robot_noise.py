@@ -79,7 +79,7 @@ LEVELS = tuple(1.5 * np.arange(-4, 5))
 """Grid of log sizes along each axis, in standard deviations from the mode; relative error of an average: 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
 """Largest squared distance (σ²) of grid points from the mode; with 7, 95 % regions of three images hold 81 %."""
-MANY, TOO_MANY = 15, 80
+MANY, TOO_MANY = 15, 50
 """Number of poses from which the grid is smaller (LESS_FAR), and above which the mode of the sizes replaces it."""
 AT_ONCE = 4e6
 """Largest number of array elements for the grid points of the sizes that are solved together."""

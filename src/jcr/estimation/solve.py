@@ -79,6 +79,8 @@ ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
 """Squared step of the arms' unknowns (in σ²) at which their iteration ends: for a result, for a comparison of fits."""
 ROUNDS_BEFORE = 3
 """Number of earlier rounds that the acceleration uses."""
+FARTHEST_SCALE = float(np.log(5.0))
+"""Largest change of log scale from the start of the iteration of the arms; beyond it there is no solution."""
 PARALLEL = 1e-2
 """Relative cutoff of singular values in the acceleration, against rounds with nearly equal steps."""
 FARTHEST = 5.0
@@ -449,18 +451,44 @@ def with_covariance(
 def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | None, settled: float) -> State:
     """Return the state with the likeliest arms' unknowns (X, scale, Z) and error sizes, for constant image evidence.
 
-    The iteration ends when the squared step in units of standard deviations is below `settled`.
+    Given camera poses with a covariance move to their likeliest values, too. If they stayed, the scale would be too
+    small: the regression on values with errors is attenuated (Fuller, Measurement error models, 1987, section 1.1). The
+    iteration ends when the squared step in units of standard deviations is below `settled`, or when the scale leaves
+    the range FARTHEST_SCALE about its start: large systematic errors then explain any poses, with a scale near 0.
     """
-    arms = problem.arm_unknowns
+    arms, start = problem.arm_unknowns, state
     for _ in range(STEPS):
-        equations = pose_equations(problem, state, images).equations
+        poses = pose_equations(problem, state, images)
+        equations = poses.equations
         sizes, _ = most_likely(equations, state.robot_log_sizes, SIZES_SETTLED / 3)
         solution = solve_equations(equations, sizes)
-        step = share_within_limits(solution.step[:arms]) * solution.step[:arms]
-        state = replace(stepped(problem, state, step), robot_log_sizes=sizes)
-        if float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
+        share = share_within_limits(solution.step[:arms])
+        step = share * solution.step[:arms]
+        columns = None if images is not None else _rig_step(problem, state, poses, solution)
+        columns = None if columns is None else share * columns
+        state = replace(stepped(problem, state, step, columns), robot_log_sizes=sizes)
+        is_far = abs(np.log(state.scale / start.scale)) > FARTHEST_SCALE
+        if is_far or float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
             break
     return state
+
+
+def _rig_step(
+    problem: Problem, state: State, poses: PoseEquations, solution: LinearSolution
+) -> Float[ndarray, " d"] | None:
+    """Return the step of `Problem.columns` that moves given camera poses to their likeliest values; None if exact.
+
+    `poses` are the equations about `state`, `solution` is their solution, which gives the step of the arms.
+    """
+    assert problem.known_rigs is not None
+    given, covariance = problem.known_rigs
+    if covariance is None:
+        return None
+    left = np.zeros((len(poses.used), 6))
+    left[poses.used] = solution.weighed_left.reshape(-1, 6)
+    to_rig = np.swapaxes(reported_poses(problem, state)[2], 1, 2)
+    pull = pose_by_pose(to_rig, left.reshape(-1, 1))[:, 0]
+    return step_between(state.world_from_rig, given).ravel() - covariance @ pull
 
 
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
