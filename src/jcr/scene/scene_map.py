@@ -76,7 +76,14 @@ class Sample:
     @cached_property
     def color(self) -> Any:
         """RGB (n,3) in [0, 1] of the colour field, valid at surfaces; NaN outside of the workspace."""
-        return self._answers(lambda x: (self._continuous("color", x).clamp(0.0, 1.0),))[0]
+        scene = self._map
+
+        def color(x: Tensor) -> tuple[Tensor]:
+            """Return the colour of each point (n,3), NaN outside of the workspace."""
+            inside = scene.seen.index(x)[1][:, None]
+            return (torch.where(inside, scene.fields(x, ("color",))["color"].clamp(0.0, 1.0), torch.nan),)
+
+        return self._answers(color)[0]
 
     @cached_property
     def label(self) -> Any:
@@ -90,13 +97,6 @@ class Sample:
             return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
 
         return self._answers(label)[0]
-
-    @cached_property
-    def values(self) -> dict[str, Any]:
-        """Other properties (n,d) that the map was trained with, by name; NaN outside of the workspace."""
-        further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
-        answers = self._answers(lambda x: tuple(self._continuous(name, x) for name in further))
-        return dict(zip(further, answers, strict=True))
 
     @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
@@ -132,10 +132,6 @@ class Sample:
 
         return self._answers(distance_gradient)
 
-    def _continuous(self, name: str, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n d"]:
-        """Return the d values of the property `name` at n points (m, base frame); NaN outside of the workspace."""
-        return torch.where(self._map.seen.index(x)[1][:, None], self._map.fields(x, (name,))[name], torch.nan)
-
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
         """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
 
@@ -166,7 +162,7 @@ class SceneMap:
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
         self.properties = tuple(name for field in fields.of for name in field.heads)
-        """Names of the properties: occupancy, color, and label and other values if the map was trained with them."""
+        """Names of the properties: occupancy, color, and label if the map was trained with labels."""
         for field in fields.of:
             if "occupancy" in field.heads and len(field.tables):
                 field.expand()
@@ -190,17 +186,6 @@ class SceneMap:
         """Return a copy of the map on a device, e.g. "cuda", which then computes the queries."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
-
-    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
-        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
-
-        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
-        """
-        x = self._points(x_in_base, "points")
-        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
-        if not isinstance(x_in_base, Tensor):
-            answers = tuple(answer.cpu().numpy() for answer in answers)
-        return dict(zip(self.properties, answers, strict=True))
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
