@@ -122,9 +122,7 @@ def _checked(
     neighbours (`relative`). Only pixels of `sees` can contradict the depth of other images.
     """
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
-    found = pool.map(
-        lambda i: agreement(i, compared, *views[i], k, pinhole.width, tolerance), range(len(views))
-    )
+    found = pool.map(lambda i: agreement(i, compared, *views[i], k, tolerance), range(len(views)))
     mean, *others = np.stack(list(found), 1)
     return [np.where(known, mean, depth), *others]
 

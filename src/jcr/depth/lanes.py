@@ -36,13 +36,10 @@ class Lanes:
         there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
-    def gathered(self, start: Any, used: int) -> "Lanes":
-        """Load 64 bits for each of the first `used` lanes; later lanes of the result are 0.
-
-        The lanes are the indices, counted from the LLVM pointer `start`, of the elements at which the 64 bits begin.
-        """
+    def gathered(self, start: Any) -> "Lanes":
+        """Load 64 bits for each lane: the lanes are the indices, from the LLVM pointer `start`, at which these begin."""
         b, found = self.builder, ir.Constant(ir.VectorType(LONG, self.count), [LONG(0)] * self.count)
-        for lane in range(used):
+        for lane in range(self.count):
             place = b.zext(b.extract_element(self.value, INT(lane)), LONG)
             there = b.bitcast(b.gep(start, [place]), LONG.as_pointer())
             found = b.insert_element(found, b.load(there, align=4), INT(lane))
@@ -85,17 +82,16 @@ class Lanes:
         )
 
     def as_ints(self) -> "Lanes":
-        """Convert each lane to int32: floats are truncated, longer integers keep their low 32 bits."""
-        convert = self.builder.fptosi if self.value.type.element == FLOAT else self.builder.trunc
-        return Lanes(self.builder, convert(self.value, ir.VectorType(INT, self.count)))
+        """Truncate each float32 lane to int32."""
+        return Lanes(self.builder, self.builder.fptosi(self.value, ir.VectorType(INT, self.count)))
 
     def as_floats(self) -> "Lanes":
         """Convert each int32 lane to float32."""
         return Lanes(self.builder, self.builder.sitofp(self.value, ir.VectorType(FLOAT, self.count)))
 
-    def as_pairs(self, kind: Any = FLOAT) -> "tuple[Lanes, Lanes]":
-        """Split each 64-bit lane into its low and its high 32 bits; return vectors (low, high) of 32-bit type `kind`."""
-        pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(kind, 2 * self.count)))
+    def as_pairs(self) -> "tuple[Lanes, Lanes]":
+        """Split each 64-bit lane into its low and its high 32 bits; return vectors (low, high) of int32."""
+        pairs = Lanes(self.builder, self.builder.bitcast(self.value, ir.VectorType(INT, 2 * self.count)))
         return pairs.at(range(0, 2 * self.count, 2)), pairs.at(range(1, 2 * self.count, 2))
 
     def inverted(self) -> "Lanes":

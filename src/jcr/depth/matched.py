@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from numpy import ndarray
 
 from jcr.camera import rays, resized
 from jcr.depth.patch_match import UNKNOWN, best_neighbours, peaks, random_planes, spread_planes
-from jcr.depth.window import LANES, MARGIN, PAD, TAPS, blocks_of, quads, windows
+from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
@@ -63,16 +62,12 @@ class _Level:
         self.packed = np.stack([quads(np.pad(grey, PAD, "edge")) for grey in self.greys])
 
     def views(
-        self,
-        i: int,
-        others: Int[ndarray, " n"],
-        recon_from_camera: Float[ndarray, "m 4 4"],
-        space: Float[ndarray, " _"],
+        self, i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"]
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
         """Return the arguments `packed`, `motions`, `windows` and `k` of patch_match.py to match image i with `others`.
 
         `others` are n image indices. `packed` are their greys, packed by `quads`; `motions` (n,12) are the rows of K R,
-        and K t, to each of them. `windows` are those of image i, in the buffer `space`; `k` is (fx, fy, cx, cy).
+        and K t, to each of them. `windows` are those of image i; `k` is (fx, fy, cx, cy).
         """
         _, a, b, _ = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([a.reshape(-1, 9), b], 1)
@@ -80,7 +75,7 @@ class _Level:
         channels = *np.moveaxis(self.colors[i], -1, 0), self.greys[i]
         image = np.stack([np.pad(channel.astype(np.float32), around, "edge") for channel in channels])
         k = tuple(grid(self.pinhole))  # a tuple, which the loops keep in registers
-        return self.packed[others], motions, windows(image, space), k
+        return self.packed[others], motions, windows(image), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
         """Return a map (c,h,w) from one (c,h/2,w/2) of half the resolution; each pixel is repeated at 2 x 2 pixels.
@@ -113,17 +108,14 @@ def match_depth(
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)
     (h, w), ray = half.greys[0].shape, rays(half.pinhole)
-    spaces = SimpleQueue[ndarray]()
-    for _ in range(threads):
-        spaces.put(np.empty(pinhole.height * blocks_of(pinhole.width) * TAPS * 2, np.float32))
 
-    def match(i: int, space: Float[ndarray, " _"]) -> Float[ndarray, "2 h w"]:
+    def match(i: int) -> Float[ndarray, "2 h w"]:
         others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i])
         reach = np.einsum("di,hwi->dhw", family, ray)
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
-        views = half.views(i, others, recon_from_camera, space)
+        views = half.views(i, others, recon_from_camera)
         found = random_planes(family, span, views[-1], h, blocks_of(w), i)
         asked = np.empty((len(others), *found.shape[1:]), np.uint8)
         asked[:] = np.arange(len(others))[:, None, None]
@@ -132,23 +124,16 @@ def match_depth(
         asked = best_neighbours(found, asked, *views, ASKED)
         found, asked = full.enlarged(found), full.enlarged(asked)
 
-        views = full.views(i, others, recon_from_camera, space)
+        views = full.views(i, others, recon_from_camera)
         found[3] = UNKNOWN
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
         depth = peaks(found, asked, *views, np.float32(_PEAK))
         return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])[..., : pinhole.width]
 
-    def one(i: int) -> Float[ndarray, "2 h w"]:
-        space = spaces.get()
-        try:
-            return match(i, space)
-        finally:
-            spaces.put(space)  # after an error too, or other threads would wait for the buffer forever
-
     results = []
     with ThreadPoolExecutor(threads) as pool:
-        for found in pool.map(one, rows):
+        for found in pool.map(match, rows):
             results.append(found)
             report(len(results) / len(rows))
     inverse_depth, score = np.stack(results, 1)

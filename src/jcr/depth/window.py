@@ -46,7 +46,7 @@ def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
 
 @compiled
 @no_type_check
-def windows(image, space):
+def windows(image):
     """Return weight and weighted grey of each tap (sampled pixel) of each pixel's window.
 
     The shape is (rows, blocks of 16 pixels, taps, 2, 16), the weight first in the axis of 2. `image` (4,h,w) are the
@@ -54,10 +54,10 @@ def windows(image, space):
     the sum 1. A tap's weight grows with the similarity of its colour to the central one (Schönberger et al., ECCV 2016,
     eq. 6). The function 1 / (1 + x/16)^16 replaces exp(-x), where x is the squared distance of the colours over 2
     COLOR_SIGMA². The weighted grey is weight · (grey - mean) / sqrt(variance + NOISE²), with weighted mean and variance
-    of the window. The result is written to the beginning of the float buffer `space`, which is reused for every image.
+    of the window.
     """
     h, blocks = image.shape[1] - 2 * MARGIN, (image.shape[2] - 2 * MARGIN) // LANES
-    rows = space[: h * blocks * TAPS * 2 * LANES].reshape((h, blocks, TAPS, 2, LANES))
+    rows = np.empty((h, blocks, TAPS, 2, LANES), np.float32)
     for v in range(h):
         for block in range(blocks):
             _write_windows(rows, image, v, block)
@@ -190,7 +190,7 @@ def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], we
         for j, (dx, dy) in enumerate(along):
             tap, x, y = weights[2 * (i * len(steps) + j) :], px + dx, py + dy
             left, top = x.as_ints(), y.as_ints()
-            upper, lower = (top * width + left + start).gathered(image, LANES).as_pairs(INT)
+            upper, lower = (top * width + left + start).gathered(image).as_pairs()
             fx, fy = x - left.as_floats(), y - top.as_floats()
             here, right = (upper & 65535).as_floats(), (upper >> 16).as_floats()
             below, both = (lower & 65535).as_floats(), (lower >> 16).as_floats()
