@@ -10,11 +10,6 @@ import tyro
 class DepthOptions:
     """Options of the dense depth that the map needs."""
 
-    dense: Annotated[
-        bool,
-        tyro.conf.arg(help="Estimate no dense depth, which only the map needs; networks predict it anyway."),
-    ] = True
-    """Estimate the dense depth that the map needs."""
     priors: Annotated[
         bool,
         tyro.conf.arg(

@@ -32,7 +32,6 @@ from jcr.pipeline.stages import (
     is_unchanged,
     keep_calibration,
     make,
-    noted,
     place,
 )
 from jcr.progress import Progress, silent
@@ -91,7 +90,8 @@ def run(
             threading.Thread(target=_load_map_code, daemon=True).start()
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
-        result = noted(make(result, FIRST, report), missing)
+        result = make(result, FIRST, report)
+        result = result.with_parts(calibration=result.calibration.with_notes(*missing))
         if calibrated is not None:
             calibrated(result)
         return finished(result, REST, report)
@@ -148,7 +148,6 @@ def build_map(
     before, report = RunResult(out), progress or silent
     options = replace(
         before.state.options,
-        depth=replace(before.state.options.depth, dense=True),
         cloud=checked_options(cloud, CloudOptions),
         map=checked_options(map, MapOptions),
         segment=checked_options(segment, SegmentOptions),
@@ -209,22 +208,20 @@ def measure(out: str | Path) -> "Measurement":
     return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
 
 
-def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
-    """Return the options, without a map if none can be made, and a note if packages for the map are missing.
+def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, tuple[str, ...]]:
+    """Return the options, without a map if none can be made, and a note (in a tuple) if packages for it are missing.
 
-    A fixed camera has no map. Raises InputError if the options want a map but no dense depth, which the map needs.
+    A fixed camera has no map.
     """
     # A fixed camera observes the object that the gripper carries; a map would not be fixed in the base frame.
     if options.map is None or capture.mount == "base":
-        return replace(options, map=None), None
-    if not options.depth.dense:
-        raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
+        return replace(options, map=None), ()
     try:
         if not all(map(is_installed, PACKAGES)):
             require_packages("the map", ", then `jcr map`")
     except InputError as error:
-        return replace(options, map=None), f"no map was made: {error}"
-    return options, None
+        return replace(options, map=None), (f"no map was made: {error}",)
+    return options, ()
 
 
 def _load_map_code() -> None:

@@ -129,13 +129,13 @@ def select_reconstruction(
     options: RunOptions,
     progress: Progress | None = None,
     keep: Callable[[Reconstruction], None] | None = None,
-    before: Callable[[], Reconstruction] | None = None,
+    before: Reconstruction | None = None,
 ) -> tuple[Reconstruction, Calibration]:
     """Reconstruct and calibrate a capture with the back ends of `reconstruct.tries`, and return the best trial's result.
 
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
     a note names the selected one and the reason. If there is only one back end to try, `keep` receives its
-    reconstruction before the calibration. If `before` is given, only the reconstruction that it returns is calibrated.
+    reconstruction before the calibration. If the reconstruction `before` is given, only it is calibrated.
     Raises InputError if a back end does, or if gripper poses and joint angles contradict each other; NothingFoundError
     if no back end gives a calibration.
     """
@@ -246,14 +246,14 @@ def timings_of(attempts: Sequence[Attempt]) -> dict[str, float]:
 
 def _try(
     capture: Capture,
-    source: ReconstructOptions | Callable[[], Reconstruction],
+    source: ReconstructOptions | Reconstruction,
     options: RunOptions,
     progress: Progress | None,
     keep: Callable[[Reconstruction], None] | None = None,
 ) -> Trial:
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
-    `source` is the options of the back end, or a function that returns a reconstruction, which `keep` receives before
+    `source` is the options of the back end, or a reconstruction made before. `keep` receives the reconstruction before
     the calibration. Dense depth is estimated first if a known length needs it. An InputError of the calibration is
     raised, because it would occur with every back end.
     """
@@ -261,7 +261,7 @@ def _try(
     own = source if isinstance(source, ReconstructOptions) else None
     made = failure = hand_eye = why_not = None
     try:
-        made = reconstruct(capture, source, progress) if isinstance(source, ReconstructOptions) else source()
+        made = source if isinstance(source, Reconstruction) else reconstruct(capture, source, progress)
     except (InputError, RejectedError) as error:
         failure = error.with_traceback(None)
     give_back()  # return the memory of the back end to the system

@@ -102,7 +102,7 @@ def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> Ru
         (result.out / CAMERAS).unlink(missing_ok=True)
         result = result.with_parts(cameras=None)
     result = make(result, stages, progress)
-    write_calibration_and_log(result.out, result.calibration)
+    keep_calibration(result.out, result.calibration)
     return complete(result)
 
 
@@ -190,9 +190,9 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
         (out / DEPTH).unlink(missing_ok=True)
     same = next(filter(is_same, (out, capture.folder / LIVE)), None)
     before = None if same is None else RunResult(same, capture=seen)
-    read = None if before is None else lambda: before.reconstruction
     try:
         keep = partial(keep_reconstruction, result)
+        read = None if before is None else before.reconstruction
         made, found = select_reconstruction(seen, options, progress, keep, read)
     except NothingFoundError as error:
         if not is_same(out):
@@ -213,7 +213,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
         write_state(result)
     else:
         keep_reconstruction(result, made)
-    return _with_depth_kept(result)
+    return result
 
 
 def keep_reconstruction(result: RunResult, reconstruction: Reconstruction) -> None:
@@ -246,7 +246,7 @@ def _calibrate(result: RunResult, progress: Progress) -> RunResult:
 
 
 def keep_calibration(out: Path, content: AnyCalibration) -> None:
-    """Write calibration.json and log.txt; delete files that were made from a different calibration first."""
+    """Write calibration.json and, as text, log.txt; delete files that were made from a different calibration first."""
     same = False
     with suppress(InputError):
         before = RunResult(out).calibration
@@ -254,11 +254,6 @@ def keep_calibration(out: Path, content: AnyCalibration) -> None:
         same = same and np.array_equal(before.parent_from_camera, content.parent_from_camera)  # pyright: ignore[reportArgumentType]
     for name in () if same else (CLOUD, MAP, REPORT, CAMERAS):
         (out / name).unlink(missing_ok=True)
-    write_calibration_and_log(out, content)
-
-
-def write_calibration_and_log(out: Path, content: AnyCalibration) -> None:
-    """Write a calibration to calibration.json and, as text, to log.txt in the run folder `out`."""
     write_calibration(out / CALIBRATION, content)
     write_text(out / LOG, log(content))
 
@@ -286,23 +281,16 @@ def _cameras(result: RunResult, progress: Progress) -> RunResult:
 
 def _depth_made_from(result: RunResult) -> str:
     """Return the fingerprint of the reconstruction's inputs and the depth options, which depth.npz stores."""
-    # The option `dense` decides whether depth is estimated, and does not change its values.
-    depth = replace(result.state.options.depth, dense=True)
-    return fingerprint(result.state.made["reconstruct"], depth, DEPTH_FORMAT)
+    return fingerprint(result.state.made["reconstruct"], result.state.options.depth, DEPTH_FORMAT)
 
 
 def _densify(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with dense depth in its reconstruction, estimated unless it is there, and write depth.npz."""
     made = densify(result.capture, result.reconstruction, result.state.options.depth, progress)
-    return _with_depth_kept(result.with_parts(reconstruction=made))
-
-
-def _with_depth_kept(result: RunResult) -> RunResult:
-    """Write the estimated pointmaps of the reconstruction to depth.npz if the file lacks them; return the result."""
-    pointmaps, file, made = result.reconstruction.pointmaps, result.out / DEPTH, _depth_made_from(result)
-    if pointmaps is not None and not pointmaps.is_predicted and not is_made_from(file, made):
-        write_depth(file, result.reconstruction, made)
-    return result
+    file, made_from = result.out / DEPTH, _depth_made_from(result)
+    if not made.dense.is_predicted and not is_made_from(file, made_from):
+        write_depth(file, made, made_from)
+    return result.with_parts(reconstruction=made)
 
 
 def _map(result: RunResult, progress: Progress) -> RunResult:
@@ -349,7 +337,8 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     scene.save(result.out / MAP)
     if len(added):
         write_added(added, capture)
-    return noted(result.with_parts(cloud=cloud, scene=scene, measured=measured), *notes)
+    noted = result.calibration.with_notes(*notes)
+    return result.with_parts(cloud=cloud, scene=scene, measured=measured, calibration=noted)
 
 
 def _report(result: RunResult, progress: Progress = silent) -> RunResult:
@@ -364,12 +353,6 @@ def _report(result: RunResult, progress: Progress = silent) -> RunResult:
     write_text(result.out / REPORT, report_html(result, about))
     progress("report", 1.0)
     return result
-
-
-def noted(result: RunResult, *notes: str | None) -> RunResult:
-    """Return the result with `notes` added to the notes of its calibration; a note None is ignored."""
-    every = [*result.calibration.notes, *filter(None, notes)]
-    return result.with_parts(calibration=replace(result.calibration, notes=tuple(every)))
 
 
 STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResult]]] = {
