@@ -26,7 +26,7 @@ from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import Concerns, Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
-from jcr.sfm.register import GATE_PX, KnownImages, Registration, registrations
+from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registrations
 
 CLEARLY_MORE = 1.1
 """Ratio of RANSAC inliers with estimated over given focal length, above which the given one is wrong."""
@@ -140,9 +140,10 @@ class Rigs:
     def __init__(self, case: Case, known: KnownImages | None = None) -> None:
         self.case, self.rows, found = case, case.reconstruction.image_index[case.used], case.reconstruction
         if known is None:
-            images = [read_image(case.capture.folder / case.capture.images[row]) for row in self.rows]
+            images = (read_image(case.capture.folder / case.capture.images[row]) for row in self.rows)
             places = scale_translation(found.recon_from_camera[case.used], case.hand_eye.scale)
-            known = KnownImages.of(images, found.intrinsics, places)
+            own = tuple(features(image, found.intrinsics) for image in images)
+            known = KnownImages(found.intrinsics, places, own)
         self.known = known
         self.poses = list(known.recon_from_camera)
         self.arms: list[str] = []

@@ -42,16 +42,6 @@ class KnownImages:
     recon_from_camera: Float[ndarray, "m 4 4"]
     features: tuple[ImageFeatures, ...]
 
-    @classmethod
-    def of(
-        cls,
-        images: Sequence[UInt8[ndarray, "h w 3"]],
-        camera: Intrinsics,
-        recon_from_camera: Float[ndarray, "m 4 4"],
-    ) -> "KnownImages":
-        """Find the features of m images (RGB) of one camera, whose poses and intrinsics (`camera`) are known."""
-        return cls(camera, recon_from_camera, tuple(features(image, camera) for image in images))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
@@ -77,7 +67,8 @@ def register(
     It fails with fewer than MIN_POINTS. `older` are the images of the reconstruction's rows. All are of one camera.
     """
     camera = reconstruction.intrinsics
-    known = KnownImages.of(older, camera, reconstruction.recon_from_camera)
+    older_features = tuple(features(image, camera) for image in older)
+    known = KnownImages(camera, reconstruction.recon_from_camera, older_features)
     found = [registrations(known, image, camera)[0] for image in new]
     return [one.pose if one else count for one, count in found]
 
