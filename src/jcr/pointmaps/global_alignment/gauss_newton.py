@@ -6,7 +6,7 @@ Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6). The re
 poses, log focal length and log pair scales.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -23,15 +23,11 @@ from jcr.pointmaps.global_alignment.residuals import (
     Residuals,
     ResidualSpread,
     depth_residuals,
-    fitted_depth,
     measure_noise,
     residual_weights,
 )
 
-COARSE_PIXELS = 300
-"""Number of pixels per image in the first stage, whose error is within the noise at a seventh of the cost."""
-COARSE_TOLERANCE = 1e-3
-FINE_TOLERANCE = 1e-4
+TOLERANCE = 1e-4
 """Largest last step (rad, or relative), a tenth of the noise of the predictions."""
 ROUNDS, STEPS = 30, 10
 """Largest number of estimates of the weights, and of Gauss-Newton steps with the same weights."""
@@ -56,8 +52,6 @@ class AlignmentSolution:
     images: list[ImageObservations]
     noise: list[ResidualSpread]
     """Spread of the residuals of each image's pointmaps."""
-    pair_spread: Float[ndarray, "6"]
-    """Standard deviations of the pairs' errors: three of the translation, three of the rotation."""
     settled: bool
     """True if the last step was smaller than the tolerance."""
 
@@ -87,37 +81,22 @@ class ImageEquations:
     coupling: Float[ndarray, "c m"]
 
 
-def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
-    """Estimate camera poses, focal length, pair scales and depths from about `pixels` pixels per image.
-
-    A first stage with at most COARSE_PIXELS pixels per image gives the initial estimate. Raises RejectedError where the
-    pointmaps do not determine the unknowns.
-    """
-    images = problem.observe_all(min(COARSE_PIXELS, pixels))
-    state = initial_state(images, problem.predictions.edges)
-    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
-    coarse = gauss_newton(images, state, pair_spread, COARSE_TOLERANCE)
-    images = problem.observe_all(pixels)
-    depth = [fitted_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
-    state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
-    return gauss_newton(images, state, coarse.pair_spread, FINE_TOLERANCE)
-
-
 Iterate = tuple[AlignmentState, list[Residuals]]
 """State, and the residuals of each image at the state."""
 
 
 @one_blas_thread
-def gauss_newton(
-    images: list[ImageObservations], state: AlignmentState, pair_spread: Float[ndarray, "6"], tolerance: float
-) -> AlignmentSolution:
-    """Solve for cameras, focal length, pair scales and depths by iteratively reweighted least squares.
+def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
+    """Estimate cameras, focal length, pair scales and depths by iteratively reweighted least squares.
 
-    `state` is the initial estimate. Each round estimates the weights, and at its end `pair_spread`, the standard
-    deviations of the pairs' errors (translation in recon units, rotation in rad). The rounds end when no entry of a
-    camera pose, log focal length or log pair scale changes by more than `tolerance`. The first camera and the product
-    of the pair scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
+    About `pixels` pixels per image are used. Each round estimates the weights, and at its end the standard deviations
+    of the pairs' errors (translation in recon units, rotation in rad). The rounds end when no entry of a camera pose,
+    log focal length or log pair scale changes by more than TOLERANCE. The first camera and the product of the pair
+    scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
     """
+    images = problem.observe_all(pixels)
+    state = initial_state(images, problem.predictions.edges)
+    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
     at: Iterate = (state, _residuals(images, state))
     noise, equations, settled = list[ResidualSpread](), list[ImageEquations](), False
     for _ in range(ROUNDS):
@@ -133,7 +112,7 @@ def gauss_newton(
         spread = np.sqrt(squared / NORMAL_SQUARE_MEDIAN / np.maximum(determined, 0.01))
         pair_spread = np.repeat(np.maximum(spread, LEAST_SPREAD), 3)
         settled = all(
-            np.abs(getattr(at[0], name) - getattr(before, name)).max() < tolerance
+            np.abs(getattr(at[0], name) - getattr(before, name)).max() < TOLERANCE
             for name in ("recon_from_camera", "log_focal", "log_pair_scale")
         )
         if settled:
@@ -145,7 +124,6 @@ def gauss_newton(
         covariance=covariance,
         images=images,
         noise=noise,
-        pair_spread=pair_spread,
         settled=settled,
     )
 
