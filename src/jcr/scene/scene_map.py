@@ -76,14 +76,8 @@ class Sample:
     @cached_property
     def color(self) -> Any:
         """RGB (n,3) in [0, 1] of the colour field, valid at surfaces; NaN outside of the workspace."""
-        scene = self._map
-
-        def color(x: Tensor) -> tuple[Tensor]:
-            """Return the colour of each point (n,3), NaN outside of the workspace."""
-            inside = scene.seen.index(x)[1][:, None]
-            return (torch.where(inside, scene.fields(x, ("color",))["color"].clamp(0.0, 1.0), torch.nan),)
-
-        return self._answers(color)[0]
+        fields = self._map.fields
+        return self._inside(lambda x: fields(x, ("color",))["color"].clamp(0.0, 1.0))
 
     @cached_property
     def label(self) -> Any:
@@ -123,14 +117,15 @@ class Sample:
     @cached_property
     def _distance_gradient(self) -> tuple[Any, ...]:
         """Values of `distance` (n,) and `gradient` (n,3), which are computed together."""
-        grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
+        answer = self._inside(
+            self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free").at
+        )
+        return answer[:, 0], answer[:, 1:]
 
-        def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
-            """Return signed distance (n,) m and gradient (n,3)."""
-            answer = torch.where(self._map.seen.index(x)[1][:, None], grid.at(x), torch.nan)
-            return answer[:, 0], answer[:, 1:]
-
-        return self._answers(distance_gradient)
+    def _inside(self, ask: Callable[[Tensor], Tensor]) -> Any:
+        """Return the result (n,d) of the function `ask` at the query's points, NaN outside of the workspace."""
+        inside = self._map.seen.index
+        return self._answers(lambda x: (torch.where(inside(x)[1][:, None], ask(x), torch.nan),))[0]
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
         """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
