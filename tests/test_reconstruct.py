@@ -129,7 +129,7 @@ def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
-    monkeypatch.setattr(convention, "better_reading", lambda *_: None)
+    monkeypatch.setattr(convention, "better_reading", lambda *_: ())
     monkeypatch.setattr(selection, "view_findings", lambda _: ())
     monkeypatch.setattr(selection, "calibrate_reconstruction", calibrated_once)
 

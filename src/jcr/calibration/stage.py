@@ -9,7 +9,7 @@ from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case, with_findings
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
 from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
-from jcr.calibration.checks.convention import better_reading, check_convention, convention_finding
+from jcr.calibration.checks.convention import better_reading, check_convention
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
@@ -203,10 +203,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
         if not free.observability.observable and scale == 1.0:
             return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
-        found = better_reading(gripper, camera)
-        # Degenerate motions may fit another convention by chance, so their own finding must come first.
-        severity = "rejects" if hand_eye.observability.observable else "warns"
-        return hand_eye.with_findings(*(() if found is None else (convention_finding(found, severity),)))
+        return hand_eye.with_findings(*better_reading(gripper, camera, hand_eye.observability.observable))
     if pairs.is_metric and not is_one(hand_eye):
         std = hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6]))
         size = {"value": hand_eye.scale - 1, "std": std, "marker": 1.0}

@@ -5,8 +5,8 @@ are fitted. A convention that fits is reported, and never applied.
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import MAX_NOISE, poses_agree, solve_hand_eye
+from jcr.calibration.hand_eye import poses_agree, solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import errors_of
 from jcr.capture.pairing import paired_by_name
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.robust import least_trimmed
-from jcr.findings import Finding, FindingKind, Severity
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, inverse, transform
 
 SOLVED = 24
@@ -54,160 +54,108 @@ _Candidate = tuple[str, str, Float[ndarray, "_ 4 4"], Int[ndarray, " _"]]
 """Candidate convention: name, remedy, base_from_gripper in it, and for each pose the index of its camera pose."""
 
 
-@dataclass(frozen=True)
-class PoseConvention:
-    """Convention or order of the gripper poses, and how badly a calibration with them fits."""
-
-    name: str
-    remedy: str
-    translation_mm: float
-    """Estimated robot error per axis (mm), random and systematic."""
-    rotation_deg: float
-    """Estimated robot error per axis (degrees), random and systematic."""
-    used: int
-    """Number of images that agree with the fit."""
-
-    @property
-    def agrees(self) -> bool:
-        """Whether both estimated robot errors per axis are at most MAX_NOISE, the limit for an accepted calibration."""
-        small = self.translation_mm <= 1e3 * MAX_NOISE[0], self.rotation_deg <= np.degrees(MAX_NOISE[1])
-        return all(map(bool, small))
-
-    @property
-    def misfit(self) -> float:
-        """Misfit (mm): translation error plus 5 mm per degree of rotation error."""
-        return self.translation_mm + 5 * self.rotation_deg
-
-
 def check_convention(case: Case) -> Case:
     """Return the case with a finding if its calibration is rejected and the gripper poses fit in another convention.
 
-    The finding only warns if the motions are degenerate, because such motions may fit another convention by chance. No
-    convention is searched if a wrong board size explains the rejection.
+    No convention is searched if a wrong board size explains the rejection.
     """
-    fit, capture = case.pose_fit, case.capture
+    fit, capture, camera = case.pose_fit, case.capture, case.recon_from_camera
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
     if case.hand_eye.converged or fit.converged or by_board:
         return case
-    by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    rows = case.reconstruction.image_index
-    # Candidates are fitted without given noise, known lengths and camera covariance; the given poses must be, too.
-    alone = not case.priors and case.reconstruction.evidence is None and fit.robot_noise.given is None
-    solved = fit if alone else None
-    found = better_reading(capture.base_from_gripper, case.recon_from_camera, by_name, solved, rows)
-    found = found or _better_adjusted(case, by_name)
-    if found is None:
-        return case
+    rows, by_name = case.reconstruction.image_index, paired_by_name(capture.images, capture.base_from_gripper)
+    # Estimated intrinsics are too poor to compare conventions before the images are adjusted.
+    is_poor = capture.intrinsics is None and case.is_adjustable and not case.tracks.from_pointmaps
+
+    def with_images(poses: Poses, image: Int[ndarray, " k"]) -> Calibration:
+        """Return the calibration from adjusted images with other gripper poses of the registered images `image`."""
+        every = capture.base_from_gripper.copy()
+        every[rows[image]] = poses
+        reported = every[rows]
+        other = replace(
+            case,
+            capture=replace(capture, base_from_gripper=every),
+            robot=errors_of(reported),
+            hand_eye=replace(
+                solve_hand_eye(reported, camera, camera_errors="none"), intrinsics=fit.intrinsics
+            ),
+            fit=None,
+            chosen_tracks=None,
+            adjusted=None,
+        )
+        return with_adjusted_images(other).hand_eye
+
     observable = case.hand_eye.observability.observable
-    return case.after((convention_finding(found, "rejects" if observable else "warns"),))
+    found = better_reading(
+        capture.base_from_gripper, camera, observable, by_name, rows, with_images if is_poor else None
+    )
+    return case.after(found)
 
 
 def better_reading(
     base_from_gripper: Poses,
     recon_from_camera: Float[ndarray, "m 4 4"],
+    observable: bool = True,
     by_name: Mapping[bool, Poses] | None = None,
-    solved: Calibration | None = None,
     rows: Int[ndarray, " m"] | None = None,
-) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the pose convention that fits much better than the given one, then the given one; None if none does.
+    calibrate: Callable[[Poses, Int[ndarray, " k"]], Calibration] | None = None,
+) -> tuple[Finding, ...]:
+    """Return a finding of the pose convention that fits much better than the given one; an empty tuple if none does.
 
-    Its `misfit` must be below that of the given poses divided by BETTER, its errors acceptable (`agrees`), and most
-    images (MIN_SHARE) in agreement. None is also returned if the given poses fit already (FITS).
+    Its `misfit` must be below that of the given poses divided by BETTER, its errors acceptable (`poses_agree`), and
+    most images (MIN_SHARE) in agreement. There is no finding if the given poses fit already (FITS). The finding only
+    warns unless the motions are `observable`, because degenerate motions may fit another convention by chance.
 
     `rows` holds the index of the gripper pose of each of the m camera poses; None: both arrays have the same order and
     length. `by_name` holds the gripper poses that the images have if they are sorted by name, as numbers (key True) or
-    as text (key False). `solved` is a fit of the given poses to the camera poses alone; None: it is computed.
+    as text (key False). `calibrate` returns the calibration with other gripper poses of the k images with the given
+    indices among the camera poses; None: the fit to the camera poses.
     """
     rows = np.arange(len(base_from_gripper)) if rows is None else rows
     n = len(rows)
     given, *others = _candidates(base_from_gripper, by_name or {}, rows)
-    as_given = _reading(given, recon_from_camera, solved)
-    if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
-        return None
+
+    def fit(candidate: _Candidate) -> Calibration:
+        """Return the calibration with the gripper poses in a candidate convention."""
+        _, _, poses, image = candidate
+        if calibrate is not None:
+            return calibrate(poses, image)
+        return solve_hand_eye(poses, recon_from_camera[image], camera_errors="none")
+
+    as_given = fit(given)
+    if misfit(as_given) < FITS and as_given.images_used >= MIN_SHARE * n:
+        return ()
     worth = _congruent(others, recon_from_camera)
     rough = [_rough_error(candidate, recon_from_camera) for candidate in worth]
     # Candidates whose closed form fits too badly are not fitted; shuffled poses fit no candidate.
-    enough = 1e-3 * ROUGHLY / BETTER * as_given.misfit
+    enough = 1e-3 * ROUGHLY / BETTER * misfit(as_given)
     if not min(rough) <= min(enough, _rough_error(given, recon_from_camera) / ROUGHLY):
-        return None
+        return ()
     near = min(ROUGHLY * min(rough), enough)
-    readings = [
-        _reading(one, recon_from_camera) for one, error in zip(worth, rough, strict=True) if error <= near
+    nearest = np.argsort(rough, kind="stable")[: SOLVED if calibrate is None else ADJUSTED]
+    fits = [(worth[k], fit(worth[k])) for k in np.sort(nearest) if rough[k] <= near]
+    least = min(misfit(found) for _, found in fits)
+    best, found = next((one, found) for one, found in fits if misfit(found) < 1.05 * least + 0.01)
+    if (
+        not poses_agree(found.robot_noise)
+        or found.images_used < MIN_SHARE * (n - 2)
+        or misfit(found) * BETTER >= misfit(as_given)
+    ):
+        return ()
+    errors = [(one, *one.robot_noise.together) for one in (found, as_given)]
+    words = [
+        f"{1e3 * metres:.1f} mm and {np.degrees(radians):.2f}° per axis over {one.images_used} images"
+        for one, metres, radians in errors
     ]
-    least = min(reading.misfit for reading in readings)
-    best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
-    is_better = best.agrees and best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit
-    return (best, as_given) if is_better else None
+    details = {"reading": best[0], "remedy": best[1], "fits": words[0], "given": words[1]}
+    severity, size = "rejects" if observable else "warns", errors[0][1]
+    return (Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=size, **details),)
 
 
-def _better_adjusted(
-    case: Case, by_name: Mapping[bool, Poses]
-) -> tuple[PoseConvention, PoseConvention] | None:
-    """Return the pose convention whose calibration from adjusted images is accepted, then the given one; None if none.
-
-    The result is also None with given intrinsics. Without given intrinsics, camera poses are too poor to select a
-    convention before the images are adjusted. Only the ADJUSTED candidates with the smallest closed-form error are
-    adjusted, if it is below that of the given poses. `by_name` is that of `better_reading`.
-    """
-    rows = case.reconstruction.image_index
-    given, *others = _candidates(case.capture.base_from_gripper, by_name, rows)
-    if case.capture.intrinsics is not None or not case.is_adjustable or case.tracks.from_pointmaps:
-        return None
-    if poses_agree(case.hand_eye.robot_noise):
-        return None
-    camera = case.recon_from_camera
-    worth = _congruent(others, camera)
-    rough, limit = [_rough_error(candidate, camera) for candidate in worth], _rough_error(given, camera)
-    for k in np.argsort(rough, kind="stable")[:ADJUSTED]:
-        _, _, poses, image = worth[k]
-        if rough[k] >= limit:
-            break
-        reported, every = case.base_from_gripper.copy(), case.capture.base_from_gripper.copy()
-        reported[image] = poses
-        every[rows] = reported
-        robot = errors_of(reported)
-        known = {"systematic": robot.systematic, "names": case.names}
-        fit = solve_hand_eye(reported, camera, camera_errors="none", **known)
-        tried = replace(
-            case,
-            capture=replace(case.capture, base_from_gripper=every),
-            robot=robot,
-            hand_eye=replace(fit, intrinsics=case.pose_fit.intrinsics),
-            fit=None,
-            chosen_tracks=None,
-            adjusted=None,
-        )
-        found = with_adjusted_images(tried).hand_eye
-        if found.converged and found.inliers.sum() >= MIN_SHARE * (len(reported) - 2):
-            readings = _reading(worth[k], camera, found), _reading(given, camera, case.hand_eye)
-            return readings if readings[0].misfit * BETTER < readings[1].misfit else None
-    return None
-
-
-def convention_finding(
-    found: tuple[PoseConvention, PoseConvention], severity: Severity = "rejects"
-) -> Finding:
-    """Return the finding that the poses fit in another convention; `found` holds the better and the given one."""
-    fits, given = (
-        f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
-        for reading in found
-    )
-    details = {"reading": found[0].name, "fits": fits, "given": given, "remedy": found[0].remedy}
-    size = 1e-3 * found[0].translation_mm
-    return Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=size, **details)
-
-
-def _reading(
-    candidate: _Candidate, recon_from_camera: Poses, fit: Calibration | None = None
-) -> PoseConvention:
-    """Return the record of a candidate convention, with the robot errors and the image count of its calibration `fit`.
-
-    `recon_from_camera` are the camera poses of all registered images. `fit` None: the hand-eye fit to them is computed.
-    """
-    name, remedy, base_from_gripper, image = candidate
-    fit = fit or solve_hand_eye(base_from_gripper, recon_from_camera[image], camera_errors="none")
+def misfit(fit: Calibration) -> float:
+    """Return the misfit (mm) of a fit: the estimated robot error in translation, plus 5 mm per degree of rotation."""
     metres, radians = fit.robot_noise.together
-    return PoseConvention(name, remedy, 1e3 * metres, float(np.degrees(radians)), int(fit.inliers.sum()))
+    return 1e3 * metres + 5 * float(np.degrees(radians))
 
 
 def _congruent(candidates: Sequence[_Candidate], recon_from_camera: Poses) -> list[_Candidate]:
