@@ -63,10 +63,6 @@ def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pyt
 X = transform(rotation_exp(np.array([0.3, -1.0, 0.4])), np.array([0.05, 0.02, 0.08]))
 
 
-def known(x: np.ndarray, parts: dict[str, np.ndarray]) -> StatedTransform:
-    return StatedTransform(x, sum(parts.values(), np.zeros((6, 6))), parts)
-
-
 def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
     rng, values = np.random.default_rng(0), []
     root = 1e-3 * rng.normal(size=(6, 6))
@@ -74,7 +70,7 @@ def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
     for _ in range(400):
         step = rng.multivariate_normal(np.zeros(6), 2 * robot + 2 * images)
         parts = {"robot_random": robot, "images": images}
-        found = difference(known(X, parts), known(retract(X, step), parts))
+        found = difference(StatedTransform(X, parts), StatedTransform(retract(X, step), parts))
         values.append(found.p_value)
         assert sum(found.explained_by.values()) == pytest.approx(1.0)
     assert abs(np.mean(np.array(values) < 0.5) - 0.5) < 0.09

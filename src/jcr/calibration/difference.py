@@ -25,7 +25,7 @@ else:
     Comparable = object
 
 OTHER = "reference"
-"""Cause of error that stands for the covariance of a calibration without an uncertainty budget."""
+"""Cause of error that stands for the covariance outside an uncertainty budget."""
 NOTHING = 1e-6
 """Largest share of χ² that is attributed to rounding."""
 
@@ -51,10 +51,9 @@ class StatedTransform:
     """gripper_from_camera of a calibration or of a reference, with its covariance if that is known."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
-    covariance: Float[ndarray, "6 6"] | None = None
-    """Covariance of translation (m) and rotation vector (rad), as in COVARIANCE_ORDER; None: unknown."""
     parts: dict[str, Float[ndarray, "6 6"]] = field(default_factory=dict)
-    """Parts of the covariance by cause of error; empty without an uncertainty budget."""
+    """Parts of the covariance of translation (m) and rotation vector (rad), as in COVARIANCE_ORDER, by cause of error.
+    Empty: the covariance is unknown."""
     doubt: str | None = None
     """Reason why the calibration is rejected; None if it is accepted, or if it is a reference without a verdict."""
 
@@ -91,8 +90,10 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
         raise InputError(f"{name}: has no {record.mount}_from_camera; that calibration failed")
     if isinstance(record, Calibration):
         budget = record.uncertainty.budget
-        parts = {} if budget is None else {cause: part[:6, :6] for cause, part in vars(budget).items()}
-        return StatedTransform(record.gripper_from_camera, record.covariance[:6, :6], parts, record.doubt)
+        causes = {} if budget is None else vars(budget)
+        rest = record.covariance - sum(causes.values(), np.zeros((7, 7)))
+        parts = {cause: part[:6, :6] for cause, part in (causes | {OTHER: rest}).items()}
+        return StatedTransform(record.gripper_from_camera, parts, record.doubt)
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
         raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")
@@ -123,7 +124,7 @@ def read_hand_eye(path: Path) -> StatedTransform:
     if found.std_mm is None or found.std_deg is None:
         return StatedTransform(found.gripper_from_camera)
     std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
-    return StatedTransform(found.gripper_from_camera, np.diag(std**2))
+    return StatedTransform(found.gripper_from_camera, {OTHER: np.diag(std**2)})
 
 
 def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
@@ -133,13 +134,12 @@ def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
     all causes of error k; the share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any covariance, only the step is set.
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
-    parts, together = dict[str, Float[ndarray, "6 6"]](), np.zeros((6, 6))
-    for known in (ours, other):
-        if known.covariance is not None:
-            together += known.covariance
-            rest = known.covariance - sum(known.parts.values(), np.zeros((6, 6)))
-            for name, part in (known.parts | {OTHER: rest}).items():
-                parts[name] = parts.get(name, np.zeros((6, 6))) + part
+    nothing = np.zeros((6, 6))
+    parts = {
+        cause: ours.parts.get(cause, nothing) + other.parts.get(cause, nothing)
+        for cause in ours.parts | other.parts
+    }
+    together = sum(parts.values(), nothing)
     if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
         return Difference(translation_m=step[:3], rotation_vector=step[3:])
     std = np.sqrt(np.diag(together))
