@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from jcr.calibration.adjust import with_intrinsics_considered
+from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
+from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
-from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import scale_prior
-from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import inverse, retract, step_between, transform
 from jcr.records import Capture, Intrinsics, Reconstruction
 from places import ROOT
@@ -72,15 +72,15 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
             )
             camera.append(inverse(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
         solved = solve_hand_eye(problem.base_from_gripper, camera, scale=problem.scale, scale_std=1e-3)
-        whole = with_intrinsics_considered(
-            solved,
-            problem.base_from_gripper,
-            np.array(camera),
-            tracks,
-            camera_with_prior(given),
-            (scale_prior(problem.scale, 1e-3),),
-            smooth_errors(problem.base_from_gripper),
+        case = Case(
+            capture=capture_of(problem.base_from_gripper, intrinsics=given),
+            reconstruction=reconstruction_of(np.array(camera), intrinsics=given, tracks=tracks),
+            options=CalibrateOptions(),
+            robot=errors_of(problem.base_from_gripper),
+            priors=(scale_prior(problem.scale, 1e-3),),
+            hand_eye=solved,
         )
+        whole = with_intrinsics_considered(case)
         off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
         without.append(np.abs(off / np.sqrt(np.diag(solved.covariance)[:6])).max())
         considered.append(np.abs(off / np.sqrt(np.diag(whole.covariance)[:6])).max())

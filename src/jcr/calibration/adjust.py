@@ -14,14 +14,14 @@ from jcr.calibration.hand_eye import image_verdicts, judged, leave_one_out
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import CameraPrior, decentring, joint_covariance
+from jcr.estimation.intrinsics_prior import decentring, joint_covariance
 from jcr.estimation.pose_equations import (
     paper_residuals,
     pose_by_pose,
     predicted_gripper_poses,
     reported_poses,
 )
-from jcr.estimation.problem import LinearPrior, pose_problem, wrist_arm
+from jcr.estimation.problem import pose_problem, wrist_arm
 from jcr.estimation.projection import view_of
 from jcr.estimation.solve import START_NOISE, Solution, adjust_wrist, recon_frame, solve, uncertainty_of
 from jcr.findings import Finding, FindingKind
@@ -35,7 +35,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.records import PaperResiduals, Tracks
+from jcr.records import PaperResiduals
 
 FEWEST = 6
 """Fewest observations of an image; with fewer, the camera's motion due to wrong intrinsics is not computed."""
@@ -71,11 +71,7 @@ def with_adjusted_images(case: Case) -> Case:
         made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
         if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
             return case
-        poses = case.base_from_gripper[case.used], case.recon_from_camera[case.used]
-        found = with_intrinsics_considered(
-            case.hand_eye, *poses, case.tracks, case.camera, case.priors, case.systematic
-        )
-        return replace(case, hand_eye=judged(found))
+        return replace(case, hand_eye=judged(with_intrinsics_considered(case)))
     try:
         found = adjust_case(case, combinations=case.free_focus if case.shows_camera else None)
     except np.linalg.LinAlgError:
@@ -127,27 +123,19 @@ def adjust_case(
     )
 
 
-def with_intrinsics_considered(
-    hand_eye: Calibration,
-    base_from_gripper: Float[ndarray, "m 4 4"],
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    tracks: Tracks,
-    camera: CameraPrior,
-    priors: tuple[LinearPrior, ...],
-    systematic: Float[ndarray, "s s"],
-) -> Calibration:
-    """Add the errors of the intrinsics to the covariance C of a calibration from camera poses alone: C + S Φ Sᵀ.
+def with_intrinsics_considered(case: Case) -> Calibration:
+    """Return the fit to camera poses with the errors of the intrinsics added to its covariance C: C + S Φ Sᵀ.
 
     This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
-    Φ is the covariance of the intrinsics, from their prior `camera`. S is the derivative of the fit by the intrinsics.
-    For S, each parameter changes by one standard deviation, and the camera poses change so that the pixels of `tracks`
-    stay in place.
-
-    `hand_eye` is the fit, and `priors` are the priors that the fit used. Poses, tracks and `systematic` are those of
-    the m used images. `systematic` (6m,6m) is the covariance (m, rad; base axes) of the systematic robot errors for a
-    joint error of 1 rad standard deviation. `hand_eye` is returned unchanged if an image has fewer than FEWEST
-    observations.
+    Φ is the covariance of the intrinsics, from their prior (`Case.camera`). S is the derivative of the fit by the
+    intrinsics. For S, each parameter changes by one standard deviation, and the camera poses change so that the pixels
+    of the tracks stay in place. The fit is returned unchanged if an image has fewer than FEWEST observations.
     """
+    hand_eye, tracks, camera = case.hand_eye, case.tracks, case.camera
+    base_from_gripper, recon_from_camera = (
+        case.base_from_gripper[case.used],
+        case.recon_from_camera[case.used],
+    )
     moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
     for row, pose in enumerate(recon_from_camera):
         if len(seen := np.flatnonzero(tracks.image == row)) < FEWEST:
@@ -164,9 +152,9 @@ def with_intrinsics_considered(
         base_from_gripper,
         recon_from_camera,
         start,
-        error_covariance=systematic,
+        error_covariance=case.systematic,
         noise_floor=hand_eye.robot_noise.given,
-        priors=priors,
+        priors=case.priors,
     )
     found = solve(problem, state, averaged=False)
     by_camera = reported_poses(problem, found.state)[2]
