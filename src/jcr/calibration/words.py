@@ -3,8 +3,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import AnyCalibration, Calibration
@@ -150,7 +148,7 @@ def details(content: AnyCalibration) -> list[str]:
         with np.printoptions(precision=6, suppress=True):
             matrix = str(np.array(content.parent_from_camera)).splitlines()
         lines += [f"{content.mount}_from_camera", *(f"  {row}" for row in matrix)]
-        lines.append(f"least certain {worst_direction(content.parent_from_camera, uncertainty.covariance)}")
+        lines.append(f"least certain {worst_direction(content)}")
         if uncertainty.seen is not None and uncertainty.joint is not None:
             lines.append(seen_in_words(uncertainty.seen))
         if content.with_given_intrinsics is not None:
@@ -231,15 +229,14 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
     }
 
 
-def worst_direction(gripper_from_camera: Float[ndarray, "4 4"], covariance: Float[ndarray, "7 7"]) -> str:
+def worst_direction(content: Calibration) -> str:
     """Return the least certain direction of the translation, e.g. "along the optical axis: ±4.0 mm" (1σ).
 
-    `covariance` is that of the calibration, in COVARIANCE_ORDER along gripper axes. A camera axis is named if it is
-    within 30° of the direction, else the direction is stated in gripper axes.
+    A camera axis is named if it is within 30° of the direction, else the direction is stated in gripper axes.
     """
-    variance, vectors = np.linalg.eigh(covariance[:3, :3])
+    variance, vectors = np.linalg.eigh(content.covariance[:3, :3])
     direction, std_mm = vectors[:, 2], 1e3 * float(np.sqrt(variance[2]))
-    along = gripper_from_camera[:3, :3].T @ direction
+    along = content.parent_from_camera[:3, :3].T @ direction
     k = int(np.abs(along).argmax())
     name = ("the image's x axis", "the image's y axis", "the optical axis")[k]
     if abs(along[k]) < np.cos(np.radians(30)):

@@ -19,8 +19,6 @@ Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", 
 """Subject of a finding's remedy, in this order: another reconstruction of the same images, other motions, more or
 other images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles, nothing."""
 Verdict = Literal["accepted", "accepted with warnings", "rejected"]
-NUMBERS = ("joints", "value", "std", "p", "shift", "intrinsics_shift")
-"""Keyword arguments of Finding.of that set fields of a finding; all others are its details."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
@@ -56,11 +54,8 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Return a finding about `images`; `known` sets fields with numbers and, under all other names, its details.
-
-        These fields are those in NUMBERS: `joints`, `value`, `std`, `p`, `shift` and `intrinsics_shift`.
-        """
-        sizes = {name: known.pop(name) for name in NUMBERS if name in known}
+        """Return a finding about `images`; `known` sets other fields by name and, under all other names, its details."""
+        sizes = {name: known.pop(name) for name in cls.__dataclass_fields__ if name in known}
         return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
 
     @property

@@ -23,7 +23,6 @@ ONE_PART = (
     "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
     "the other part only where "
 )
-SHORT = "not as exact as needed"
 REACHED = (
     "{at:seen=a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's "
     "base frame (95 % of errors)|camera=95 % of errors of the camera on the gripper are below {reached_mm:~} mm and "
@@ -149,7 +148,7 @@ class FindingKind(StrEnum):
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some")
-    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"{SHORT}: {REACHED}",
+    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"not as exact as needed: {REACHED}",
         "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
         "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
         "move closer to the scene, or use a better camera or robot}",

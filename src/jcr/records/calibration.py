@@ -488,12 +488,10 @@ class BoardEstimate:
     """Root mean square of the corners' reprojection errors, per axis (px)."""
     bend_mm: float
     """Height difference of the lowest and highest corner over the plane of a board or tag (mm); the largest of all."""
-    centres_in_base: tuple[tuple[float, float, float], ...]
+    centres_in_base: tuple[Numbers3, ...]
     """Centres of board or tags in the base frame (m)."""
     tilts_deg: tuple[float, ...]
     """Angles of board or tags to the base's horizontal plane (degrees)."""
-    shape_mm: tuple[tuple[float, float, float], ...] = ()
-    """Corners (mm) of the board or tag with the largest `bend_mm`: x and y in its plane, and height over the plane."""
 
 
 @dataclass(frozen=True, kw_only=True)

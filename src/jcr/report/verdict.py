@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.words import leave_one_out_text, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
-from jcr.findings.table import SHORT
 from jcr.report.render import Content
 from jcr.rounding import significant
 
@@ -47,12 +46,12 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     if calibration.doubt is not None:
         reason = calibration.doubt
     elif short is not None:
-        reason = f"{SHORT}: {'' if required is None else f'{reached_in_words(required)}; {remedy(short)}'}"
+        reason = sentence(short)
     else:
         reason = "nothing contradicts it" if required is None else reached_in_words(required)
     evidence = _leave_one_out(calibration)
     if isinstance(calibration, Calibration):
-        worst = worst_direction(calibration.parent_from_camera, calibration.covariance)
+        worst = worst_direction(calibration)
         evidence += f" Largest uncertainty of the translation: {worst} (1 σ)."
     return {"kind": kind, "verdict": verdict.capitalize(), "reason": reason, "evidence": evidence}
 

@@ -184,11 +184,8 @@ def board_estimate(adjusted: Solution, boards: Boards) -> BoardEstimate:
     std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
     of_corners = np.isin(problem.observations.point, shapes.point)
     shape = state.camera_steps[problem.columns.boards]
-    bent = np.column_stack([shapes.x_in_body[:, :2], shapes.bend(shape)])
-    bent_mm = 1e3 * state.scale * np.exp(shape[0]) * bent
+    height_mm = 1e3 * state.scale * np.exp(shape[0]) * shapes.bend(shape)
     numbers = np.unique(shapes.body)
-    bends_mm = [float(np.ptp(bent_mm[shapes.body == k, 2])) for k in numbers]
-    most = shapes.body == numbers[int(np.argmax(bends_mm))]
     rigs = state.world_from_rig[shapes.first_rig + numbers]
     normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
     points = apply(state.z[0], state.scale * state.points_in_world[shapes.point])
@@ -201,13 +198,7 @@ def board_estimate(adjusted: Solution, boards: Boards) -> BoardEstimate:
         side_std_mm=side_mm * std,
         stated_mm=None if boards.size_std is None else 1e3 * boards.side,
         rms_px=float(np.sqrt((adjusted.images.view.residual_px[of_corners] ** 2).mean())),
-        bend_mm=max(bends_mm),
-        centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
+        bend_mm=max(float(np.ptp(height_mm[shapes.body == k])) for k in numbers),
+        centres_in_base=tuple(points[shapes.body == k].mean(0) for k in numbers),
         tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
-        shape_mm=tuple(_xyz(one) for one in bent_mm[most].round(3)),
     )
-
-
-def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
-    """Return a point as a tuple of three numbers."""
-    return float(x[0]), float(x[1]), float(x[2])

@@ -373,11 +373,7 @@ def finding_of(test: Test, model: Adjustment) -> Finding | None:
             count, longer = max((row.place, "before"), (len(model.names) - row.place, "after"))
             known |= {"longer": longer, "count": float(count)}
     elif kind is FindingKind.DELAY:
-        known = {
-            "value": float(estimate[0]),
-            "std": float(np.sqrt(test.covariance[0, 0])),
-            "unit": "interval",
-        }
+        known = {"value": float(estimate[0]), "std": float(np.sqrt(test.covariance[0, 0]))}
     else:
         moves = [shift, straight_shift(model.solution, row.unit * row.columns)]
         known, shift = _size_of_strain(test), None
