@@ -21,7 +21,7 @@ from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import assumptions_of, reached
+from jcr.calibration.requirement import reached
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction, fit_poses
 from jcr.camera import parameters, with_parameters
@@ -31,7 +31,7 @@ from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
 from jcr.estimation.solve import adjust_wrist, recon_frame, uncertainty_of
 from jcr.geometry import step_between
-from jcr.pipeline.check import spread_rows
+from jcr.pipeline.check import assumptions_of, spread_rows
 from jcr.records import Capture, Intrinsics, Reconstruction
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed

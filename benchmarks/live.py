@@ -49,8 +49,8 @@ GOAL = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
 FIRST, MOST = 3, 24
 """Images at varied poses with which every way begins, and images after which a capture ends without a claim."""
 SCENES = 2
-WAYS = ("proposed", "varied", "random", "grid")
-"""Ways to choose the next pose: as the calibration proposes, by the pattern `varied`, at random, or on a grid."""
+WAYS = ("varied", "random", "grid")
+"""Ways to choose the next pose: by the pattern `varied`, at random, or on a grid."""
 ARMS: tuple[RobotName, ...] = ("ur5e", "panda", "fr3", "ur10e", "xarm6")
 AROUND = 0.5
 """m, of a UR5e: distance from which random poses look at the middle of the table."""
@@ -161,10 +161,8 @@ def run_of(cell: Cell, way: str) -> Run:
         for count in range(MOST):
             if count < FIRST:
                 joints = cell.varied[count]
-            elif way == "proposed" and state.next_joints is not None:
-                joints = state.next_joints
             else:
-                joints = reach_toward(arm, _next_pose(cell, way, state, count)[None], joints[None])[0]
+                joints = reach_toward(arm, _next_pose(cell, way, count)[None], joints[None])[0]
             visited.append(joints)
             places.append(cell.arm.true(joints[None])[0] @ cell.physical)
             reported = retract(cell.arm.reported(joints[None]), white * rng.normal(size=(1, 6)))[0]
@@ -190,11 +188,8 @@ def run_of(cell: Cell, way: str) -> Run:
     return Run(way, len(visited), state.requirement_met, is_true, cells)
 
 
-def _next_pose(cell: Cell, way: str, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+def _next_pose(cell: Cell, way: str, count: int) -> Float[ndarray, "4 4"]:
     """Return the next base_from_gripper by one of WAYS."""
-    if way == "proposed":
-        assert state.next_pose is not None
-        return state.next_pose.base_from_gripper
     if way == "varied":
         return cell.arm.reported(cell.varied[count : count + 1])[0]
     rng = np.random.default_rng([cell.seed, 60, count])

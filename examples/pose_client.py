@@ -1,4 +1,4 @@
-"""Send gripper poses to `jcr capture OUT --camera 0 --poses http`, and follow the poses that it proposes.
+"""Send gripper poses to `jcr capture OUT --camera 0 --poses http`.
 
     python examples/pose_client.py http://127.0.0.1:40123 KEY
 
@@ -34,7 +34,7 @@ def sample(address, key, content):
 address, key = sys.argv[1:]
 for pose in robot_poses():
     answer = sample(address, key, {"base_from_gripper": pose})
-    print(answer.get("image") or answer["reason"], "next:", answer.get("next_base_from_gripper"))
+    print(answer.get("image") or answer["reason"], "95 %, mm:", answer.get("translation_95_mm"))
     if answer["done"]:
         break
 else:

@@ -49,7 +49,6 @@ class Scripted:
     """Calibration that is accurate from a number of images on; `contradicted` is an image with a wrong pose."""
 
     live: LiveFolder
-    arm: None = None
     accurate_from: int = 100
     contradicted: str | None = None
     warns: bool = False
@@ -87,10 +86,6 @@ class Scripted:
             hand_eye=hand_eye,
             points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
         )
-        return self.progress
-
-    def propose_elsewhere(self, base_from_gripper: ndarray) -> Progress:
-        self.progress = replace(self.progress, next_joints=base_from_gripper[:3, 3])
         return self.progress
 
     def finish(self) -> Any:

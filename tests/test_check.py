@@ -82,5 +82,4 @@ def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
     monkeypatch.setattr("jcr.pipeline.check.reconstruct_colmap", lambda *_: made)
     found, options = read_and_compare(tmp_path)
     assert read_arguments(options) == ["--pose-convention", convention]
-    assert isinstance(found, Capture) and found.pose_convention == convention
-    assert f"read with --pose-convention {convention}" in found.notes[-1]
+    assert isinstance(found, Capture) and f"read with --pose-convention {convention}" in found.notes[-1]

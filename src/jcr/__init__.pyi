@@ -53,7 +53,6 @@ from .records import CellCamera as CellCamera
 from .records import Intrinsics as Intrinsics
 from .records import IntrinsicsAndStd as IntrinsicsAndStd
 from .records import LeaveOneOut as LeaveOneOut
-from .records import NextPose as NextPose
 from .records import Observability as Observability
 from .records import PointCloud as PointCloud
 from .records import Pointmaps as Pointmaps

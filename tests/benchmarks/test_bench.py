@@ -16,8 +16,8 @@ from benchmarks.__main__ import BENCHES, claims, write_index
 from benchmarks.real import WristCamera, pixels_of
 from benchmarks.real_captures.fetch import Recipe, build, recipes
 from benchmarks.references import Corners, reference
+from capture_writers import rows_as
 from jcr.camera import parameters
-from jcr.capture.controllers import numbers_from_poses
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.geometry import step_between
@@ -102,7 +102,7 @@ def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path:
     for k in range(11):
         grey = np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8)
         Image.fromarray(grey).save(folder / "data" / f"view_{k}.png")
-    rows = numbers_from_poses(poses, "rotation-vector")
+    rows = rows_as("rotation-vector", poses)
     (folder / "data" / "poses.txt").write_text("\n".join(", ".join(map(repr, row)) for row in rows.tolist()))
 
     def git(*words: str) -> str:

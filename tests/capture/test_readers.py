@@ -126,8 +126,16 @@ def test_a_scale_that_is_not_one_tells_of_a_marker_of_another_size(tmp_path: Pat
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_every_controller_is_read_as_it_writes(convention: str, problem: HandEyeProblem):
     poses = problem.base_from_gripper
-    got = poses_from_numbers(writers.rows_as(convention, poses), convention, "auto", "table")
+    numbers = writers.rows_as(convention, poses)
+    got = poses_from_numbers(numbers, convention, "auto", "table")
     assert np.allclose(got, poses, rtol=0, atol=1e-9)
+    form = CONVENTIONS[convention]
+    if form.rotation != "matrix":
+        # In other units than the controller's.
+        numbers[:, :3] *= form.scales("auto")[0] / form.scales("mm-deg")[0]
+        numbers[:, 3:] *= form.scales("auto")[1] / form.scales("mm-deg")[1] if form.has_angles else 1.0
+        got = poses_from_numbers(numbers, convention, "mm-deg", "table")
+        assert np.allclose(got, poses, rtol=0, atol=1e-9)
 
 
 def test_known_poses_of_controllers():
@@ -377,7 +385,7 @@ def test_ur_poses_are_read_as_in_urscript(tmp_path: Path, problem: HandEyeProble
     rows = writers.rows_as("ur", problem.base_from_gripper)
     lines = [row.format(k=k, numbers=", ".join(map(repr, line))) for k, line in enumerate(rows.tolist())]
     got = table_of(tmp_path, header + "\n".join(lines))
-    assert got.images == tuple(f"{k}.png" for k in range(12)) and got.convention == "ur"
+    assert got.images == tuple(f"{k}.png" for k in range(12))
     assert np.allclose(got.base_from_gripper, problem.base_from_gripper, atol=1e-9)
 
 

@@ -15,6 +15,7 @@ import pytest
 from numpy import ndarray
 
 import jcr
+from capture_writers import rows_as
 from jcr.capture.images import read_image
 from jcr.live import robot
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
@@ -299,6 +300,17 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
     server.close()
     with pytest.raises(jcr.InputError, match="check the address"):
         next(closed)
+
+
+def test_typed_poses_follow_the_pendant(tabletop: Path):
+    pose, said = poses(tabletop)[0], list[str]()
+    numbers = rows_as("kuka", pose[None])[0]
+    lines = iter([" ".join(f"{value:.4f}" for value in numbers), "0.4 0 0.5 0 0 0", ""])
+    (found,) = typed_poses(lines, said.append, "kuka")
+    assert np.allclose(found, pose, atol=1e-5)
+    assert "x y z a b c; mm, deg" in said[0]
+    # Metres, typed where the pendant shows millimetres.
+    assert any("too near for this convention's millimetres" in text for text in said)
 
 
 def test_poses_are_typed_in_three_ways_and_mistakes_asked_again():

@@ -14,9 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_reconstruction
-from jcr.capture.controllers import poses_from_numbers
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.estimation.observability import excitation
 from jcr.geometry import inverse, transform
@@ -68,7 +66,7 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
         notes=("a <note> & more",),
         warnings=("a <pose> is off",),
     )
-    hand_eye = calibrate_reconstruction(capture, reconstruction, CalibrateOptions(next_poses=2))
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     cloud = label_tabletop(point_cloud(capture, reconstruction, hand_eye))
     cloud = replace(cloud, label_names=("none", *(f"<i>{name}" for name in cloud.label_names[1:])))
     return RunResult(
@@ -262,29 +260,14 @@ def test_a_rejected_calibration_is_not_recommended(run: RunResult):
     assert [kind for kind, *_ in bars] == ["rejected"] * 3 + ["used"] * 4
 
 
-def test_reprojections_and_poses_to_add_are_those_of_the_run(run: RunResult, page: str):
-    capture, result = run.capture, run
+def test_reprojections_are_those_of_the_run(run: RunResult, page: str):
     marks = re.findall(r'<svg class="marks" viewBox="0 0 640 480".*?d="([^"]*)"', page)
-    assert len(marks) == len(result.reconstruction.image_index)
+    assert len(marks) == len(run.reconstruction.image_index)
     ways = np.array([re.findall(r"l(-?\d+) (-?\d+)", path)[:20] for path in marks], float) / MAGNIFIED
     stated = [image.reprojection_px for image in run.calibration.images if image.reprojection_px]
     assert np.median(np.linalg.norm(ways, axis=-1)) == pytest.approx(np.median(stated), abs=1.5 / MAGNIFIED)
     elements = Elements(page)
-    for k, pose in enumerate(result.calibration.next_poses, start=1):
-        copied = np.array(json.loads(elements.copied(f"pose {k} as a matrix")))
-        np.testing.assert_allclose(copied, pose.base_from_gripper, atol=1e-6)
-        near = capture.base_from_gripper[capture.images.index(pose.like), :3, 3]
-        assert f"{1e3 * np.linalg.norm(copied[:3, 3] - near):.0f}\u00a0mm" in elements.text
     assert all(part in elements.text for part in ("left of the tick", "tracked features (red)"))
-
-
-def test_poses_to_add_are_in_the_notation_of_the_robot(run: RunResult):
-    elements = Elements(report_html(run.with_parts(capture=replace(run.capture, pose_convention="kuka"))))
-    for k, pose in enumerate(run.found.next_poses, start=1):
-        numbers = np.array([float(part) for part in elements.copied(f"pose {k}").split(",")])
-        read = poses_from_numbers(numbers[None], "kuka", "auto", "a test")[0]
-        assert np.abs(read - pose.base_from_gripper).max() < 2e-4
-    assert "as kuka writes poses" in elements.text
 
 
 def test_numbers_have_two_digits_and_none_below_a_tenth_of_sigma():
@@ -325,7 +308,6 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         "#scene-grippers",
         "#scene-grid",
         "#scene-tracks",
-        "#scene-next",
         '[data-look="[-90, 89]"]',
         '[data-through="1"]',
     ):
@@ -343,7 +325,7 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         " { b.click(); while (b.textContent !== 'copied') await new Promise(requestAnimationFrame);"
         " out.push([b.dataset.copy, await navigator.clipboard.readText()]); } return out; })()"
     )
-    assert len(copied) == 10 + 2 * 2  # notations, and poses to add in two of them
+    assert len(copied) == 10
     assert all(offered == found for offered, found in copied)
     # An image opens large with its marks, and arrow keys lead to the next.
     chromium.js("document.querySelectorAll('.images .shot')[1].click()")

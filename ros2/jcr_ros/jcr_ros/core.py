@@ -39,7 +39,7 @@ class Settings:
     at_rest: bool = True
     """Take an image whenever the arm comes to rest in a new place; else by service alone."""
     robot: str = ""
-    """Name of the arm, for joint angles of the next pose; empty: unknown."""
+    """Name of the arm, to model its joint offsets and link errors; empty: unknown."""
     parent: str = "tool0"
     """Frame of the gripper."""
     has_depth: bool = False
@@ -145,7 +145,6 @@ class Calibrator:
                 intrinsics=self.intrinsics,
                 robot=settings.robot or None,
                 options={"require": settings.options.require},
-                reach=settings.options.reach,
                 exclusive=True,
             )
             opened.callback(calibration.close)

@@ -1,4 +1,4 @@
-"""ROS 2 node: tf, images and camera_info in; state of the calibration, next pose and static transform out."""
+"""ROS 2 node: tf, images and camera_info in; state of the calibration and static transform out."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from numpy import ndarray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
@@ -59,7 +59,6 @@ class CalibratorNode(Node):
                 _kind(depth), depth, self._depth, qos_profile_sensor_data, callback_group=group
             )
         self.status = self.create_publisher(String, "~/status", 10)
-        self.next_pose = self.create_publisher(PoseStamped, "~/next_pose", 1)
         services = {
             "start": self._start,
             "take": self.calibrator.take,
@@ -88,10 +87,8 @@ class CalibratorNode(Node):
         self.get_logger().info(text)
 
     def _publish(self, answer: dict[str, Any]) -> None:
-        """Publish the state as JSON, and the next pose."""
+        """Publish the state as JSON."""
         self.status.publish(String(data=json.dumps(answer)))
-        if answer.get("next_base_from_gripper") is not None:
-            self._propose(np.array(answer["next_base_from_gripper"]))
 
     def _image(self, message: Any) -> None:
         """Pass on an image."""
@@ -127,20 +124,14 @@ class CalibratorNode(Node):
         pose[:3, 3] = t.x, t.y, t.z
         return jcr.RobotState(_seconds(found.header.stamp), pose)
 
-    def _propose(self, base_from_gripper: ndarray) -> None:
-        """Publish the next gripper pose."""
-        message = PoseStamped()
-        message.header.frame_id = self.base
-        message.header.stamp = self.get_clock().now().to_msg()
-        _fill(message.pose.position, message.pose.orientation, base_from_gripper)
-        self.next_pose.publish(message)
-
     def _broadcast(self, gripper_from_camera: ndarray) -> None:
         """Send the accepted transform on /tf_static."""
         message = TransformStamped()
         message.header.frame_id, message.child_frame_id = self.gripper, self.camera
         message.header.stamp = self.get_clock().now().to_msg()
-        _fill(message.transform.translation, message.transform.rotation, gripper_from_camera)
+        t, q = message.transform.translation, message.transform.rotation
+        t.x, t.y, t.z = gripper_from_camera[:3, 3].tolist()
+        q.x, q.y, q.z, q.w = Rotation.from_matrix(gripper_from_camera[:3, :3]).as_quat().tolist()
         self.broadcaster.sendTransform(message)
 
     def _start(self) -> tuple[bool, str]:
@@ -165,13 +156,6 @@ def _kind(topic: str) -> type:
 def _seconds(stamp: Any) -> float:
     """Return a stamp in seconds."""
     return stamp.sec + 1e-9 * stamp.nanosec
-
-
-def _fill(translation: Any, rotation: Any, a_from_b: ndarray) -> None:
-    """Write a transform (4,4) into the two parts of a message."""
-    translation.x, translation.y, translation.z = a_from_b[:3, 3].tolist()
-    quat_xyzw = Rotation.from_matrix(a_from_b[:3, :3]).as_quat().tolist()
-    rotation.x, rotation.y, rotation.z, rotation.w = quat_xyzw
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Launch the node, and RViz with the next pose."""
+"""Launch the node, and RViz with robot, frames and camera."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument

@@ -12,8 +12,6 @@ from jcr.findings.requirement import Where
 GRASPING = (5.0, 1.0)
 """Default of the required accuracy (mm, degrees): a parallel gripper that opens 10 mm wider than its object has 5 mm to
 either side, and one degree moves the tip of a 100 mm finger by 2 mm."""
-MOST_POSES = 12
-"""Largest number of gripper poses that are proposed to reach the required accuracy."""
 LengthInImage = tuple[str, float, float, float, float, float]
 """Image name, x and y of two pixels in it, and the distance (mm) between the two points that the pixels show."""
 
@@ -28,8 +26,6 @@ class CalibrateOptions:
     require_at: Where = "seen"
     """Quantity that the limit refers to. seen: a point at the centre of an image, at the working distance, by intrinsics
     and transform together; camera: the camera on the gripper by itself; scene: the mapped points in the base frame."""
-    next_poses: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Number of gripper poses to propose even where the calibration is as accurate as required."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
@@ -58,8 +54,6 @@ def check_options(options: CalibrateOptions) -> None:
     for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):
         if pair is not None and not all(0 < value < inf for value in pair):
             raise InputError(f"{flag} {pair[0]:g} {pair[1]:g}: give two positive numbers, mm and degrees")
-    if not 0 <= options.next_poses <= MOST_POSES:
-        raise InputError(f"--next-poses {options.next_poses}: give a number from 0 to {MOST_POSES}")
     if options.scale is not None and not 0 < options.scale < inf:
         raise InputError(f"--scale {options.scale:g}: give a positive number, metres per unit")
     if options.known_height is not None and not isfinite(options.known_height):

@@ -52,7 +52,6 @@ from jcr.records import (
     LeaveOneOut,
     LengthCheck,
     Mount,
-    NextPose,
     Observability,
     PaperResiduals,
     PosePairs,
@@ -254,8 +253,6 @@ class Calibration(Outcome):
     """Leave-one-out error; None where too few images are used."""
     requirement: Requirement | None = None
     """Required and reached accuracy; None for the result of `solve_hand_eye`."""
-    next_poses: tuple[NextPose, ...] = ()
-    """Gripper poses to add: those that reduce the uncertainty most."""
     with_given_intrinsics: GivenIntrinsicsResult | None = None
     """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
     depth_check: DepthCheck | None = None
@@ -436,7 +433,7 @@ class FailedCalibration(Outcome):
         Raises AttributeError for a name that a Calibration does not have.
         """
         if name in Calibration.__dataclass_fields__ or name == "robot_errors":
-            return () if name in {"next_poses", "lengths"} else None
+            return () if name == "lengths" else None
         if name.startswith("_") or not hasattr(Calibration, name):
             raise AttributeError(name)
         raise RejectedError(f"no calibration was found: {self.doubt}")
@@ -444,7 +441,7 @@ class FailedCalibration(Outcome):
     def as_json(self) -> dict[str, Any]:
         """Return the content of calibration.json: the keys of a Calibration, null or empty where this has no value."""
         fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
-        empty = {name: [] if name in {"next_poses", "lengths"} else None for name in sorted(fields)}
+        empty = {name: [] if name == "lengths" else None for name in sorted(fields)}
         return super().as_json() | empty
 
 

@@ -10,9 +10,8 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.inverse_kinematics import LengthError, posed, reach_toward
+from jcr.estimation.inverse_kinematics import LengthError, posed
 from jcr.estimation.kinematics import Arm, Joints
-from jcr.estimation.prediction import nearest
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses
@@ -36,19 +35,6 @@ class RobotErrorPrior:
         """Return the prior of the errors of some poses, given by their indices, in the order of the indices."""
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
-
-    def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
-        """Return the covariance of the systematic errors (size 1 rad) of this prior's poses, then of `added` poses.
-
-        Each pose has six rows: translation (m), rotation vector (rad), base axes. `base_from_gripper` are the poses of
-        this prior. Inverse kinematics of an added pose starts at the joint angles of the nearest of these poses.
-        """
-        if len(added) == 0:
-            return self.systematic
-        if self.arm is None or self.joints is None:
-            return smooth_errors(np.concatenate([base_from_gripper, added]))
-        start = self.joints[nearest(added, base_from_gripper)]
-        return arm_errors(self.arm, np.concatenate([self.joints, reach_toward(self.arm, added, start)]))
 
 
 def robot_errors(

@@ -1,4 +1,4 @@
-"""Stage calibrate, for a reconstructed capture or given camera poses: fit, bundle adjustment, checks, next poses."""
+"""Stage calibrate, for a reconstructed capture or given camera poses: fit, bundle adjustment, checks, requirement."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from jcr.calibration.cues import CONTRADICTED, height_cue, length_cue
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import advised, assumptions_of, assumptions_of_poses
+from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
@@ -54,7 +54,7 @@ METRIC_STD = 0.005
 def calibrate_reconstruction(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
 ) -> Calibration:
-    """Calibrate a capture from its reconstruction: fit, bundle adjustment, checks, and gripper poses to add.
+    """Calibrate a capture from its reconstruction: fit, bundle adjustment, checks, and required accuracy.
 
     Camera poses with a covariance (`evidence`) are fitted with it and not adjusted. For correspondences between
     pointmaps, whose errors are correlated, the bundle adjustment replaces the fit only if its leave-one-out error is
@@ -74,13 +74,13 @@ def calibrate_reconstruction(
 def calibrate_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case after fit, adjustment and checks, with required accuracy and proposed gripper poses.
+    """Return the case after fit, adjustment and checks, with required accuracy.
 
     `robot` is the error prior of the registered images' gripper poses.
     """
     case = checked_case(capture, reconstruction, options, robot)
-    gripper, assumptions = case.base_from_gripper, assumptions_of(case)
-    found = advised(case.hand_eye, gripper, options, robot, assumptions, case.scene_uncertainty)
+    gripper, distance_m = case.base_from_gripper, case.scene_distance_m
+    found = advised(case.hand_eye, gripper, options, distance_m, case.scene_uncertainty)
     return replace(case, hand_eye=found)
 
 
@@ -88,7 +88,7 @@ def calibrate_case(
 def checked_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Return the case after fit, adjustment and checks, without required accuracy and proposed gripper poses.
+    """Return the case after fit, adjustment and checks, without required accuracy.
 
     A rejected calibration is returned with its findings, not raised; a check that its geometry makes impossible is
     skipped. `robot` is the error prior of the registered images' gripper poses.
@@ -170,9 +170,7 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
         known = {"error_covariance": robot.systematic, "noise_floor": options.robot_noise_m_rad}
         found = effects_of_fit(gripper, pairs.recon_from_camera, hand_eye, pairs.images, **known)
         hand_eye = with_findings(hand_eye, found)
-    is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
-    assumptions = assumptions_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
-    return advised(hand_eye, gripper, options, robot, assumptions).of_capture(pairs, pairs)
+    return advised(hand_eye, gripper, options).of_capture(pairs, pairs)
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:

@@ -63,14 +63,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
-    proposed = ""
-    if poses := content.next_poses:
-        then = f"{significant(poses[-1].within_95_mm)} mm, {significant(poses[-1].rotation_95_deg)}° (95 %)"
-        count = f"{len(poses)} image{'s' * (len(poses) > 1)}"
-        proposed = f"add {count} (poses in calibration.json, next_poses); expected {then}"
-    if content.converged and content.short is None and proposed:
-        lines += labelled("To improve", proposed)
-    return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines), proposed)]) + "\n"
+    return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines))]) + "\n"
 
 
 def _result(content: Calibration) -> list[str]:
@@ -111,27 +104,20 @@ def _result(content: Calibration) -> list[str]:
     return [*lines, *labelled("Intrinsics", f"{how}: {numbers}; use them together with the transform")]
 
 
-def actions(findings: Sequence[Finding], most: int, proposed: str = "") -> list[str]:
+def actions(findings: Sequence[Finding], most: int) -> list[str]:
     """Return the lines with cause and remedy of a rejection, then the warnings; at most `most` lines.
 
-    `findings` are sorted (`strongest_first`). The text `proposed` (images to add) replaces the remedy of a missed
-    accuracy if more images are that remedy. If lines are left out, the last line states their number.
+    `findings` are sorted (`strongest_first`). If lines are left out, the last line states their number.
     """
-
-    def advice(finding: Finding) -> str:
-        """Return the remedy of a finding, or the text `proposed` if the remedy of a missed accuracy is more images."""
-        is_images = finding.kind is FindingKind.NOT_EXACT_ENOUGH and finding.concerns == "images"
-        return proposed if is_images and proposed else remedy(finding)
-
     findings, lines = without_consequences(findings), list[str]()
     if verdict_of(findings) == "rejected":
         cause, *others = findings
         findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
-        lines = labelled("Cause", text(cause)) + labelled("Remedy", *filter(None, [advice(cause)]))
+        lines = labelled("Cause", text(cause)) + labelled("Remedy", *filter(None, [remedy(cause)]))
     for one in findings:
         if one.kind is FindingKind.NOT_EXACT_ENOUGH:
             # Other lines of the summary state the required and the reached accuracy.
-            lines += labelled("WARNING", f"the limit is not met; {advice(one)}")
+            lines += labelled("WARNING", f"the limit is not met; {remedy(one)}")
         elif one.severity != "informs":
             lines += labelled("WARNING", sentence(one))
     if len(lines) <= most:

@@ -84,36 +84,6 @@ CONVENTIONS = {
     "unitree": Convention(_XYZ + _RPY, "xyz"),
     "realman": Convention(_XYZ + _WXYZ, "wxyz"),
 }
-OF_ARM = (
-    dict.fromkeys(("ur3e", "ur5e", "ur10e"), "ur")
-    | dict.fromkeys(("panda", "fr3"), "franka")
-    | dict.fromkeys(("iiwa7", "iiwa14"), "kuka")
-    | dict.fromkeys(("xarm6", "xarm7"), "xarm")
-    | {"z1": "unitree"}
-)
-"""Name in CONVENTIONS of each arm's controller; the arms are those of estimation.arms.ROBOT_NAMES."""
-
-
-def numbers_from_poses(
-    base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
-) -> Float[ndarray, "n k"]:
-    """Convert each pose to the k numbers of a pose convention, in the convention's order, such as x, y, z, rx, ry, rz.
-
-    `convention` is a key of CONVENTIONS. The poses are in metres, the numbers in `units` ("mm-deg"); "auto": the
-    convention's usual ones. Inverse of `poses_from_numbers`.
-    """
-    form = CONVENTIONS[convention]
-    position_unit, angle_unit = form.scales(units)
-    position = base_from_gripper[:, :3, 3] / position_unit
-    if form.rotation == "matrix":
-        cells = transform(base_from_gripper[:, :3, :3], position).reshape(-1, 16)
-        return cells[:, [_ROWS.index(name) for name in form.columns]]
-    rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
-    if form.rotation in QUATERNIONS:
-        order = np.argsort(QUATERNIONS[form.rotation])
-        return np.hstack([position, rotation.as_quat(canonical=True)[:, order]])
-    angles = rotation.as_rotvec() if form.rotation == "rotvec" else rotation.as_euler(form.rotation)
-    return np.hstack([position, angles / angle_unit])
 
 
 def poses_from_numbers(

@@ -33,8 +33,6 @@ class PoseTable:
     images: tuple[str, ...] | None
     """Image names as written in the file; None if the file has no such column."""
     stamp_ns: Int[ndarray, " n"] | None
-    convention: str
-    """Pose convention of the file, a name of CONVENTIONS."""
     faults: Mapping[int, str]
     """Messages by index for the rows that hold no pose; their poses are NaN."""
 

@@ -15,8 +15,7 @@ from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pose_track import NEVER
 from jcr.capture.ros import read_camera_info
 from jcr.errors import InputError
-from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance
-from jcr.estimation.prediction import choose_poses, pose_information, total_uncertainty
+from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance, pose_residuals
 from jcr.files import write_bytes
 from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
@@ -29,6 +28,8 @@ LOOKS = 5
 """Number of frames of one stop whose sharpness is compared."""
 SAME_VIEW = 0.005
 """Smallest distance (m) between two views, as by motion_length; the sharpest of closer frames is kept."""
+UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
+"""Errors of translation (m), rotation (rad) and log scale that have equal weight: 1 mm, 0.1°, 0.2 %."""
 WEAK = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
 Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
@@ -156,15 +157,11 @@ def best_frames(
             f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
             "needed: record again with a pause at each of a dozen views"
         )
-    information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
+    information = _pose_information(base_from_gripper[views])
     frames, known = np.zeros(0, int), WEAK * np.eye(13)
     for of_kind in (speed[views] < STILL, speed[views] >= STILL):  # frames at rest come first
-        gain, before = information[of_kind], known
-
-        def uncertainty_of(rows: Rows, gain: ndarray = gain, before: ndarray = before) -> float:
-            return total_uncertainty(expected_covariance(before + gain[rows].sum(0)))
-
-        chosen = np.array(choose_poses(count - len(frames), len(gain), uncertainty_of), dtype=int)
+        gain = information[of_kind]
+        chosen = _most_informative(gain, known, count - len(frames))
         frames, known = np.append(frames, views[of_kind][chosen]), known + gain.sum(0)
     notes = []
     if len(clear) < len(sharpest):
@@ -176,6 +173,45 @@ def best_frames(
             f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
         )
     return np.sort(frames), tuple(notes)
+
+
+def _pose_information(base_from_gripper: Poses) -> Float[ndarray, "n 13 13"]:
+    """Return the information matrix of X (6), log scale and base_from_recon (6) by each of n gripper poses.
+
+    X is gripper_from_camera, assumed to be the identity. Both transforms have the order translation (m), rotation
+    vector (rad). The poses have the random errors ASSUMED_NOISE (m, rad). The reconstruction frame is arbitrary; here
+    it is the base frame, in metres.
+    """
+    x = np.eye(4)
+    _, j = pose_residuals(x, 1.0, np.eye(4), base_from_gripper, base_from_gripper)
+    j /= np.repeat(ASSUMED_NOISE, 3)[:, None]
+    return np.swapaxes(j, 1, 2) @ j
+
+
+def _most_informative(
+    gain: Float[ndarray, "n 13 13"], before: Float[ndarray, "13 13"], count: int
+) -> list[int]:
+    """Return the indices of up to `count` of n poses, best first, by greedy selection.
+
+    `gain` are the information matrices of the poses, `before` is that of earlier ones. Each choice reduces most the sum
+    of the variances of gripper_from_camera and log scale in units of 1 mm, 0.1° and 0.2 % (A-optimal design: Pukelsheim,
+    Optimal Design of Experiments, 1993, chapter 9). Gains fall as poses are added, so only candidates with the largest
+    earlier gains are evaluated again (accelerated greedy selection: Minoux, Optimization Techniques, 1978).
+    """
+
+    def uncertainty_of(rows: list[int]) -> float:
+        """Return the sum of the variances, without a unit, if the poses of these indices are added."""
+        return float((np.diag(expected_covariance(before + gain[rows].sum(0))) / UNIT**2).sum())
+
+    chosen, reduction, last = list[int](), np.full(len(gain), np.inf), uncertainty_of([])
+    while len(chosen) < min(count, len(gain)):
+        evaluated = dict[int, float]()
+        while (row := int(reduction.argmax())) not in evaluated:
+            evaluated[row] = uncertainty_of([*chosen, row])
+            reduction[row] = last - evaluated[row]
+        chosen.append(row)
+        reduction[row], last = -np.inf, evaluated[row]
+    return chosen
 
 
 def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:

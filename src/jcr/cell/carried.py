@@ -112,7 +112,6 @@ def refined(
         uncertainty=replace(uncertainty, seen=found.uncertainty.seen, scene=found.uncertainty.scene),
         intrinsics=intrinsics,
         robot_noise=answer.noise,
-        next_poses=(),
         findings=tuple(one for one in found.findings if one.kind not in POLICIES),
     )
     return judged(with_findings(judged(again), effects_found)).on_fixed_camera()

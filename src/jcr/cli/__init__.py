@@ -41,7 +41,7 @@ GROUPS = {
         "check.touch": "touch test: compare points touched with the robot's tip with the map",
     },
     "prepare": {
-        "capture.capture": "take a capture live, with advice on the next pose",
+        "capture.capture": "take a capture live, with its accuracy after each image",
         "prepare.board": "draw a calibration board to print, if you want one",
     },
     "more": {

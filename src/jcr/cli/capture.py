@@ -1,4 +1,4 @@
-"""Command `jcr capture`: take a capture live, image by image, with advice on the next pose."""
+"""Command `jcr capture`: take a capture live, image by image, with its accuracy after each."""
 
 import os
 import sys
@@ -18,10 +18,8 @@ from jcr.errors import InputError
 from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName, arm_named
 from jcr.files import locked
 from jcr.live.cameras import CameraOptions, open_camera
-from jcr.live.progress import Notation
 from jcr.live.robot import (
     HELP,
-    KINDS,
     RobotState,
     States,
     address_of,
@@ -42,8 +40,8 @@ class CaptureCommand:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the calibration is
-    updated, and its accuracy, its faults and the next pose that helps most are printed. OUT/result is the
-    calibration of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
+    updated, and its accuracy, its faults and what would improve it are printed. OUT/result is the calibration
+    of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
     buttons to take, retake and remove images, to undo, and to finish; the same commands can be typed.
 
     for example:
@@ -66,13 +64,13 @@ class CaptureCommand:
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
     or http (a program posts them, jcr docs http)."""
     pose_convention: ConventionName = "auto"
-    """Notation of typed poses and of the printed next pose; auto: the arm's own."""
+    """Notation of typed poses; auto: quat-xyzw."""
     pose_units: UnitsName = "auto"
-    """Units of typed and printed poses; auto: those of the convention."""
+    """Units of typed poses; auto: those of the convention."""
     robot: Annotated[RobotName | Literal["list"] | None, tyro.conf.arg(metavar=f"{{list,{CHOICES[1:]}")] = (
         None
     )
-    """The arm: the next pose is then also printed as joint angles, within the arm's limits; list prints the arms."""
+    """The arm, to model its joint offsets and link errors; list prints the arms."""
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
     """Port of the live page and of samples on this machine alone; 0: any free one."""
     listen: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
@@ -118,13 +116,9 @@ class CaptureCommand:
 
         with locked(out), open_camera(self.camera, self.settings) as camera:
             folder = LiveFolder(out, given or camera.intrinsics, self.robot)
-            calibration = LiveCalibration(folder, options={"require": options.require}, reach=options.reach)
-            convention: ConventionName = self.pose_convention
-            if convention == "auto" and states is not None:
-                convention = next(kind for kind in KINDS if self.poses.startswith(f"{kind}:"))
-            notation = Notation(convention, self.pose_units, calibration.arm)
+            calibration = LiveCalibration(folder, options={"require": options.require})
             gripper = None if states is None else lambda: next(states())
-            session = LiveSession(calibration, camera, options, tell, notation, gripper)
+            session = LiveSession(calibration, camera, options, tell, gripper)
             token = os.environ.get("JCR_TOKEN") or None
             try:
                 with LiveServer(session, *address, token, self.poses == "http") as server:

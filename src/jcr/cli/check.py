@@ -11,7 +11,6 @@ import tyro
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
-from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
 from jcr.pipeline.options import VerifyOptions
 from jcr.progress import progress_bars
@@ -28,13 +27,13 @@ UNLIKELY = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand:
-    """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
+    """Check a capture: files, units, motion, observability, and pose convention.
 
     The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
 
     for example:
       jcr check captures/table
-      jcr check captures/table --suggest 3 --robot-noise 0.1 0.05
+      jcr check captures/table --robot-noise 0.1 0.05
       jcr check captures/table --poses-only --json
       jcr check samples.yaml
       jcr check scan.mcap --base-frame base_link --gripper-frame tool0
@@ -43,21 +42,14 @@ class CheckCommand:
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder of the capture, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    suggest: int = 0
-    """Propose this many gripper poses, those that would reduce the uncertainty most."""
     poses_only: bool = False
     """Check files, units and motion only; look for no features in the images."""
     thorough: bool = False
     """Register all images at full size. By default 8 are registered, in seconds, and all only if these show a fault."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Noise (1 sigma per axis) of the gripper poses; unset: estimated, or 0.5 mm and 0.1°."""
-    reach: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
-    ] = None
-    """Box that contains all proposed gripper positions (m, base frame)."""
     seed: int = 0
-    """Seed of the registration and of the proposals."""
+    """Seed of the registration."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -65,8 +57,6 @@ class CheckCommand:
         from jcr.calibration.options import CalibrateOptions, check_options
         from jcr.pipeline.check import check_capture, read_and_compare
 
-        if self.suggest < 0:
-            raise InputError(f"--suggest {self.suggest}: give how many poses to propose, 0 or more")
         options = CalibrateOptions(robot_noise=self.robot_noise)
         check_options(options)
         # Frames of a recording are extracted to a temporary folder.
@@ -74,10 +64,8 @@ class CheckCommand:
             capture, read = read_and_compare(self.capture, self.read, into=scratch, progress=progress)
             found = check_capture(
                 capture,
-                self.suggest,
                 not self.poses_only,
                 options.robot_noise_m_rad,
-                None if self.reach is None else np.array(self.reach).reshape(2, 3),
                 self.seed,
                 progress,
                 self.thorough,
@@ -100,7 +88,7 @@ def read_arguments(read: ReadOptions) -> list[str]:
 def _check_lines(
     command: CheckCommand, capture: Capture | PosePairs, read: ReadOptions, found: "Examination"
 ) -> list[str]:
-    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, proposed poses.
+    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected.
 
     `read` are the options with which the capture was read, repeated in the next command.
     """
@@ -145,11 +133,6 @@ def _check_lines(
     else:
         notes = notes[: MOST_LINES - len(lines) - len(acting) - 1]
     lines += [*acting, *notes]
-    for k, pose in enumerate(found.suggestions, start=1):
-        matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True).splitlines()
-        then = f"{significant(pose.within_95_mm)} mm, {significant(pose.rotation_95_deg)}°"
-        near = f"{1e3 * pose.moved_m:.0f} mm, {np.degrees(pose.rotation_rad):.0f}° from {pose.like}"
-        lines += labelled(f"Add pose {k}", f"{near}; then {then} (95 %); base_from_gripper:", *matrix)
     return [*lines, *labelled("Next", closing)]
 
 
@@ -160,7 +143,6 @@ def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     seen = None if found.expected is None else found.expected.seen
     sharpness = found.sharpness.tolist() or [None] * len(capture)
-    names = "base_from_gripper", "like", "expected_std", "within_95_mm", "rotation_95_deg"
     observed = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
@@ -174,7 +156,6 @@ def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str
         "expected_seen": seen and asdict(seen),
         "expected_images": [capture.images[row] for row in found.counted],
         "robot_noise": None if noise is None else mm_and_deg(noise.translation, noise.rotation),
-        "suggestions": [{name: getattr(pose, name) for name in names} for pose in found.suggestions],
         "findings": [as_json(one) for one in found.findings],
         "warnings": warnings_of(found.findings),
         "notes": found.notes,

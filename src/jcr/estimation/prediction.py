@@ -1,37 +1,24 @@
-"""Predicted uncertainty of a calibration before its images exist, and choice of the poses that reduce it most.
+"""Predicted uncertainty of a calibration before its images exist.
 
 Simulated points lie on a surface with relief in front of the cameras, and all residuals are 0; the uncertainty hardly
-depends on the scene. Poses are chosen one by one, each with the least predicted uncertainty (A-optimal design:
-Pukelsheim, Optimal Design of Experiments, 1993, chapter 9).
+depends on the scene.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, parameters, project, unproject, with_parameters
-from jcr.estimation.covariance import blocks_of_poses
 from jcr.estimation.image_equations import image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
-from jcr.estimation.pose_equations import pose_equations, pose_residuals
-from jcr.estimation.problem import ROTATION, TRANSLATION, pose_problem, scale_prior, wrist_arm, wrist_problem
-from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL, solve_equations
+from jcr.estimation.problem import pose_problem, scale_prior, wrist_arm, wrist_problem
+from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, uncertainty_of, with_covariance
-from jcr.geometry import (
-    Poses,
-    Transform,
-    by_similarity,
-    inverse,
-    motion_length,
-    nearest_to_lines,
-    rotation_exp,
-    transform,
-)
+from jcr.geometry import Poses, Transform, nearest_to_lines, transform
 from jcr.least_squares import one_blas_thread
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 
@@ -88,8 +75,6 @@ class Assumptions:
     """Camera whose images are simulated; None: the camera poses are given and exact."""
     scale_std: float | None = None
     """Relative standard deviation of a known scale; None: the scale is unknown."""
-    faults: Float[ndarray, "7 7"] | None = None
-    """Covariance of X and scale that findings add; None: nothing."""
 
 
 def assumed(
@@ -144,15 +129,24 @@ def predict(
     """
     x, noise, camera = assumptions.gripper_from_camera, assumptions.noise, assumptions.camera
     intrinsics = None
+    cameras = base_from_gripper @ x
     if camera is None:
-        covariance = predict_covariance(assumptions, base_from_gripper, systematic)
-        uncertainty = Uncertainty(covariance=covariance)
+        known = () if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),)
+        problem, state = pose_problem(
+            base_from_gripper,
+            cameras,
+            (x, 1.0, np.eye(4)),
+            error_covariance=systematic,
+            noise_floor=noise.given,
+            priors=known,
+        )
+        found = with_covariance(problem, state, None, expected=noise)
+        uncertainty = Uncertainty(covariance=found.covariance[:7, :7])
     else:
         # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
         straight = parameters(camera.camera.intrinsics)
         straight[4:] = 0.0
         intrinsics = with_parameters(camera.camera.intrinsics, straight)
-        cameras = base_from_gripper @ x
         problem, state = wrist_problem(
             wrist_arm(base_from_gripper, systematic),
             (x, 1.0, np.eye(4)),
@@ -172,39 +166,7 @@ def predict(
         images.information[np.diag_indices(len(images.information))] += UNCONNECTED
         found = with_covariance(problem, state, images, expected=noise)
         uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
-    if assumptions.faults is not None:
-        uncertainty = uncertainty.with_error(assumptions.faults)
     return replace(uncertainty, seen=seen_points(x, uncertainty, intrinsics, assumptions.distance_m))
-
-
-def predict_covariance(
-    assumptions: Assumptions,
-    base_from_gripper: Poses,
-    systematic: Float[ndarray, "s s"],
-    averaged: bool = True,
-) -> Float[ndarray, "7 7"]:
-    """Return the predicted covariance of X (gripper_from_camera) and log scale for exact camera poses in metres.
-
-    The order is that of geometry.retract for X (translation in m, rotation in rad; gripper axes), then log scale.
-    `averaged`: average over the posterior of the robot's error sizes σ; else these are known, as in
-    `assumptions.noise`. `systematic` is that of `predict`.
-    """
-    x, noise = assumptions.gripper_from_camera, assumptions.noise
-    problem, state = pose_problem(
-        base_from_gripper,
-        base_from_gripper @ x,
-        (x, 1.0, np.eye(4)),
-        error_covariance=systematic,
-        noise_floor=noise.given,
-        priors=() if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),),
-    )
-    if averaged:
-        return with_covariance(problem, state, None, expected=noise).covariance[:7, :7]
-    poses = pose_equations(problem, state, None)
-    equations, log_sizes = poses.equations, poses.equations.log_sizes_of(noise)
-    systematic = equations.variances(log_sizes)[2] * equations.systematic
-    covariance = solve_equations(equations, log_sizes).covariance
-    return (covariance + poses.region.spread(blocks_of_poses(systematic)))[:7, :7]
 
 
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
@@ -247,108 +209,8 @@ def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) 
     return Tracks(image=image, x_px=x_px[image, point], point=point, points_in_recon=points)
 
 
-CANDIDATES = 600
-"""Number of candidate gripper poses."""
 SCENE_DISTANCE = (0.1, 2.0)
 """Smallest and largest distance of a scene (m)."""
-UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""Errors of translation (m), rotation (rad) and log scale that have equal weight: 1 mm, 0.1°, 0.2 %."""
-
-
-def choose_poses(
-    count: int, candidates: int, uncertainty_of: Callable[[Int[ndarray, " c"]], float]
-) -> list[int]:
-    """Return the indices of up to `count` poses chosen among `candidates` poses, best first, by greedy selection.
-
-    `candidates` is the number of poses. `uncertainty_of(indices)` returns the uncertainty if these poses are added;
-    each choice reduces it most. Gains fall as poses are added, so only candidates with the largest earlier gains are
-    evaluated again (accelerated greedy selection: Minoux, Optimization Techniques, 1978).
-    """
-    chosen, gain = list[int](), np.full(candidates, np.inf)
-    last = uncertainty_of(np.zeros(0, dtype=int))
-    while len(chosen) < min(count, candidates):
-        evaluated = dict[int, float]()
-        while (row := int(gain.argmax())) not in evaluated:
-            evaluated[row] = uncertainty_of(np.array([*chosen, row]))
-            gain[row] = last - evaluated[row]
-        chosen.append(row)
-        gain[row], last = -np.inf, evaluated[row]
-    return chosen
-
-
-def total_uncertainty(covariance: Float[ndarray, "7 7"], point: Float[ndarray, "3"] | None = None) -> float:
-    """Return the sum of the variances of gripper_from_camera (6) and log scale in units of 1 mm, 0.1° and 0.2 % (UNIT).
-
-    `covariance` has the order translation (m), rotation (rad), log scale. With a `point` (m, from the camera in gripper
-    axes), the variances of the point's position and of the rotation are summed instead.
-    """
-    counted = np.eye(7) / UNIT[:, None]
-    if point is not None:
-        counted = np.concatenate([by_similarity(point) / UNIT[TRANSLATION, None], counted[ROTATION]])
-    return float(np.einsum("ri,ij,rj->", counted, covariance, counted))
-
-
-def pose_information(
-    base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
-) -> Float[ndarray, "n 13 13"]:
-    """Return the information matrix of X (6), log scale and base_from_recon (6) by each of n gripper poses.
-
-    X is gripper_from_camera. Both transforms have the order translation (m), rotation vector (rad). `noise` (m, rad)
-    are the standard deviations of the random errors of a pose. The reconstruction frame is the base frame, in m.
-    """
-    # The frame of the reconstruction is arbitrary; here it is the base frame, in metres.
-    camera = base_from_gripper @ gripper_from_camera
-    _, j = pose_residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
-    j /= np.repeat(noise, 3)[:, None]
-    return np.swapaxes(j, 1, 2) @ j
-
-
-def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
-    """Return for each of c poses the index of the nearest `existing` pose, by translation (m) plus 0.3 m times angle."""
-    return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
-
-
-def candidate_poses(
-    base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
-) -> Float[ndarray, "k 4 4"]:
-    """Return k = CANDIDATES random poses base_from_gripper that look at the scene centre of `scene_of`, within 4 cm.
-
-    Camera distances are 0.7 to 1.3 times those of the poses `base_from_gripper` of the capture. `x` is
-    gripper_from_camera. `reach` is the box (min, max; m, base frame) of gripper positions; None: that of the capture,
-    enlarged by a quarter, at least 5 cm, on each side. The box grows slowly until k poses are found.
-    """
-    camera = base_from_gripper @ x
-    center = camera[:, :3, 3]
-    scene, distance = scene_of(camera)
-    if reach is None:
-        low, high = base_from_gripper[:, :3, 3].min(0), base_from_gripper[:, :3, 3].max(0)
-        slack = np.maximum(0.25 * (high - low), 0.05)
-        reach = np.stack([low - slack, high + slack])
-    kept = np.zeros((0, 4, 4))
-    widening = 1.0
-    while len(kept) < CANDIDATES:
-        n = 4 * CANDIDATES
-        like = rng.integers(len(camera), size=n)
-        tilt = rotation_exp(rng.normal(size=(n, 3)) * np.radians(25))
-        away = np.einsum("nij,nj->ni", tilt, (center - scene)[like] / distance[like, None])
-        far = distance[like] * rng.uniform(0.7, 1.3, n)
-        aim = scene + rng.uniform(-0.04, 0.04, (n, 3))
-        position = aim + far[:, None] * away
-        rotation = tilt @ camera[like, :3, :3]
-        # The smallest rotation turns the z axis onto the line of sight.
-        to_aim = (aim - position) / far[:, None]
-        cross = np.cross(rotation[:, :, 2], to_aim)
-        sine = np.linalg.norm(cross, axis=1, keepdims=True)
-        angle = np.arctan2(sine, (rotation[:, :, 2] * to_aim).sum(1, keepdims=True))
-        rotation = rotation_exp(cross / np.maximum(sine, 1e-12) * angle) @ rotation
-        roll = rotation_exp(rng.uniform(-np.pi / 3, np.pi / 3, n)[:, None] * [0.0, 0.0, 1.0])
-        gripper = transform(rotation @ roll, position) @ inverse(x)
-        inside = ((gripper[:, :3, 3] >= reach[0]) & (gripper[:, :3, 3] <= reach[1])).all(1)
-        # The box grows slowly, so that the search ends also in a box with hardly any possible pose.
-        kept = np.concatenate([kept, gripper[inside]])
-        widening *= 1.05
-        reach = np.stack([reach[0] - 0.002 * widening, reach[1] + 0.002 * widening])
-    return kept[:CANDIDATES]
 
 
 def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:

@@ -24,8 +24,8 @@ class Requirement:
     reached_deg: float
     """Bound on the rotation error that the calibration reaches."""
     more_images: int | None = None
-    """Number of images, at the proposed poses, to add until the required accuracy is reached; 0 if it is reached, None
-    if no reasonable number suffices."""
+    """Number of images to add until the required accuracy is reached, by an estimate; 0 if it is reached, None if no
+    reasonable number suffices."""
     at: Where = "camera"
     """Quantity to which the required and reached bounds refer."""
     valid_px: float | None = None

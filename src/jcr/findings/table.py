@@ -31,6 +31,7 @@ REACHED = (
 )
 """Template of the sentence with the reached and the required bound on 95 % of the errors."""
 NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
+ROTATED = "rotated by 20° or more about different axes"
 TILT = "tilt the wrist by 20° or more away from {axis} in two images"
 MOTIONS = {
     "no camera poses": ("everything: no camera poses", "{advice}"),
@@ -142,18 +143,17 @@ class FindingKind(StrEnum):
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used")
     UNCERTAIN = "too uncertain", KindRow("motion",
         "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={deg:!.1f}°|scale={percent:.0f} %} only",
-        "add images, rotated by 20° or more about different axes{noise_unknown:, or give the robot's repeatability "
-        "(--robot-noise MM DEG)|}",
+        f"add images, {ROTATED}{{noise_unknown:, or give the robot's repeatability (--robot-noise MM DEG)|}}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %")
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some")
     NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"not as exact as needed: {REACHED}",
-        "{concerns:images=add {more_images:.0f} more at the poses of next_poses|robot=most of it comes from systematic "
-        "robot errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; "
-        "move closer to the scene, or use a better camera or robot}",
+        f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of it comes from systematic robot "
+        "errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; move "
+        "closer to the scene, or use a better camera or robot}",
         means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
-        help="the images in `next_poses`; or the arm's name")
+        help="more images; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
         "the focal length {value:grows|shrinks} by {percent:!.1f} ± {std_percent:~} % from the nearest "
         "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT)

@@ -1,15 +1,14 @@
-"""Calibration that is updated after each image of a capture, with its accuracy, findings and the next gripper pose."""
+"""Calibration that is updated after each image of a capture, with its accuracy and findings."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
@@ -19,13 +18,11 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.arms import arm_named
 from jcr.estimation.prediction import FEWEST
 from jcr.files import locked
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
-from jcr.live.next_pose import propose
 from jcr.live.progress import Progress
 from jcr.options import checked_options
 from jcr.records import Capture, Intrinsics, Tracks
@@ -48,9 +45,8 @@ class LiveCalibration:
 
     `folder` is the folder of the capture, or its LiveFolder; a capture that was begun there is continued. `intrinsics`
     belong to all images; None: they are estimated. `robot` names the arm (`jcr capture --robot list` shows the names).
-    `reach` (2,3): lower and upper corner of the box (m, base frame) in which gripper positions are proposed. Images and
-    poses are written into the folder when they are added, so that jcr.read_capture can read the capture at any time.
-    Methods may be called from several threads.
+    Images and poses are written into the folder when they are added, so that jcr.read_capture can read the capture at
+    any time. Methods may be called from several threads.
     """
 
     def __init__(
@@ -60,7 +56,6 @@ class LiveCalibration:
         intrinsics: Intrinsics | None = None,
         robot: str | None = None,
         options: CalibrateOptions | Mapping[str, Any] | None = None,
-        reach: ArrayLike | None = None,
         exclusive: bool = False,
     ) -> None:
         """Open or begin a capture; raise InputError if the capture cannot be continued or an option is wrong.
@@ -79,16 +74,9 @@ class LiveCalibration:
         """Lock that is held while the capture, the map or `progress` is changed."""
         self._options = checked_options(options, CalibrateOptions)
         check_options(self._options)
-        name = self._options.robot or folder.robot
-        self.arm = None if name is None else arm_named(name)
-        self._box = None if reach is None else np.reshape(np.asarray(reach, np.float64), (2, 3))
-        """Box (2,3) of the gripper positions that may be proposed (m, base frame); None: unlimited."""
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
-        self._refused: list[Float[ndarray, "4 4"]] = []
-        self._propose: Callable[[], dict[str, Any]] = dict
-        """Function that returns the next pose, from the last calibration and `_refused`, as fields of Progress."""
         self.progress = Progress(images=tuple(folder.names))
 
     def add(
@@ -165,19 +153,7 @@ class LiveCalibration:
                 self._map = self._map or LiveMap(capture)
                 self._map.update(capture, new)
             added = list(new)[-1] if new and len(before) <= len(self._mapped) else None
-            self._refused.clear()
             self.progress = self._calibrated(capture, added)
-            return self.progress
-
-    @one_blas_thread
-    def propose_elsewhere(self, base_from_gripper: Float[ndarray, "4 4"]) -> Progress:
-        """Return the state with another proposed pose, because no image could be kept at `base_from_gripper` (m).
-
-        The camera is more than 0.06 m from where it was at that pose and at the poses of earlier calls, if possible.
-        """
-        with self._lock:
-            self._refused.append(base_from_gripper)
-            self.progress = replace(self.progress, **self._propose())
             return self.progress
 
     def close(self) -> None:
@@ -191,7 +167,7 @@ class LiveCalibration:
 
         `capture` has all images (None: there are none); `added` is the name of the image added last, None if none was.
         """
-        names, self._propose = self._mapped, dict
+        names = self._mapped
         state = Progress(images=names, added=added)
         if capture is None or self._map is None:
             return state
@@ -208,12 +184,7 @@ class LiveCalibration:
             some = replace(made, tracks=_longest(made.tracks, most))
             with suppress(RejectedError):
                 case = calibrate_case(capture, some, self._options, robot.of(rows))
-        # Joint angles of a kinematic model that contradicts the gripper poses would be wrong.
-        arm = self.arm if robot.unused is None else None
-        found = None if case is None else case.hand_eye
-        where = {"arm": arm, "box": self._box, "refused": self._refused}
-        self._propose = partial(propose, capture, rows, found, case, **where)
-        state = replace(state, registered=tuple(names[row] for row in rows), **self._propose())
+        state = replace(state, registered=tuple(names[row] for row in rows))
         if case is None:
             findings += [] if robot.unused is None else [robot.unused]
             few = Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(len(names)))

@@ -15,7 +15,6 @@ from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, 
 from jcr.capture.images import encode_png, read_image, size_of_all
 from jcr.capture.plain_files import contained, validated_content
 from jcr.errors import InputError
-from jcr.estimation.arms import ROBOT_NAMES
 from jcr.files import remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
@@ -69,11 +68,6 @@ class LiveFolder:
     def names(self) -> list[str]:
         """Names of the images, in the order in which they were taken."""
         return [one.image for one in self.images]
-
-    @property
-    def robot(self) -> str | None:
-        """Name of the arm in capture.json; None if none is given or jcr does not know the name."""
-        return self._content.robot if self._content.robot in ROBOT_NAMES else None
 
     @property
     def can_undo(self) -> bool:

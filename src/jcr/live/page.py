@@ -14,7 +14,7 @@ from jcr.calibration.options import GRASPING
 from jcr.calibration.words import leave_one_out_text
 from jcr.capture.images import read_image
 from jcr.findings import reached_in_words, sentence
-from jcr.live.progress import FIRST_ADVICE, accuracy_line, faults, finding_lines, next_lines
+from jcr.live.progress import accuracy_line, advice, faults, finding_lines
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
 from jcr.report.render import render
@@ -23,13 +23,12 @@ from jcr.report.verdict import Tile
 from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
-PARTS = ("head", "next", "images")
+PARTS = ("head", "images")
 """Names of the templates of the parts that change; each part is the content of the HTML element of that name."""
 LAYERS = {
     "cameras": "cameras",
     "grippers": "grippers",
     "grid": "base and grid",
-    "next": "next pose (green)",
     "tracks": "points of the scene (red)",
 }
 """Parts of the 3D view that can be hidden, and the labels of their check boxes."""
@@ -64,7 +63,6 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
         "has_report": has_report,
         "can_undo": state.can_undo,
         "tiles": _tiles(state, session.options.require or GRASPING),
-        "next": next_lines(state.progress, session.notation) if _is_proposed(state) else [],
         "images": _cards(state)[::-1],
     }
     return {
@@ -76,12 +74,6 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
         "parts": {name: render(f"{name}.html", {"state": content}, PACKAGE) for name in PARTS},
         "scene": json.dumps(_scene(state)),
     }
-
-
-def _is_proposed(state: SessionState) -> bool:
-    """Test whether the page proposes a next pose: the capture goes on, and its requirement is not met yet."""
-    progress = state.progress
-    return progress.next_pose is not None and not state.is_over and not progress.requirement_met
 
 
 def _cards(state: SessionState) -> list[dict[str, Any]]:
@@ -127,9 +119,8 @@ def verdict_lines(state: SessionState) -> list[str]:
     if progress.requirement_met:
         return ["good", "Requirement met, press Finish", *lines]
     if wrong:
-        return ["fair", *lines]
-    advice = [FIRST_ADVICE] if progress.reached is None else []
-    return ["", f"{count} images", accuracy_line(progress), *advice]
+        return ["fair", *lines, advice(progress)]
+    return ["", f"{count} images", accuracy_line(progress), advice(progress)]
 
 
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
@@ -154,7 +145,7 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
 
 
 def _scene(state: SessionState) -> dict[str, Any]:
-    """Return the data of the 3D view (`scene_data`) in the base frame: points, gripper poses, and the next pose.
+    """Return the data of the 3D view (`scene_data`) in the base frame: points and gripper poses.
 
     After a calibration, the data also contain the camera poses of the registered images.
     """
@@ -166,14 +157,9 @@ def _scene(state: SessionState) -> dict[str, Any]:
         camera = gripper @ x if found is not None and one.image in progress.registered else None
         views.append(scene_view(name, fault or one.image, not fault, gripper, camera))
     points = np.zeros((0, 3)) if progress.points_in_base is None else progress.points_in_base
-    proposed = progress.next_pose if _is_proposed(state) else None
-    next_poses = [] if proposed is None else [proposed.base_from_gripper]
     intrinsics = (found.intrinsics if found is not None else None) or ANY_CAMERA
-    poses = [*(one.base_from_gripper for one in state.images), *next_poses]
-    shown_in_base = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses)])
-    return scene_data(
-        [track_layer("points of the scene", points)], views, next_poses, x, intrinsics, shown_in_base
-    )
+    shown_in_base = np.array([np.zeros(3), *(one.base_from_gripper[:3, 3] for one in state.images)])
+    return scene_data([track_layer("points of the scene", points)], views, intrinsics, shown_in_base)
 
 
 @lru_cache(maxsize=128)

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame, frame_at_rest
-from jcr.live.progress import Notation, Progress, progress_lines
+from jcr.live.progress import Progress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_json import FrameEntry
 
@@ -40,17 +40,12 @@ Answer = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions:
-    """Options of a live capture: number of images, waiting time, reach, and required accuracy."""
+    """Options of a live capture: number of images, waiting time, and required accuracy."""
 
     images: int | None = None
     """Stop with this many images; unset: 12, and with --until-accurate 40."""
     patience: float = 5.0
     """Seconds to wait for an image at rest."""
-    reach: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
-    ] = None
-    """Box that contains all proposed gripper positions (m, base frame)."""
     require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Required accuracy: 95 % of errors of a point seen at the distance of the scene. Unset: 5 mm and 1°."""
     until_accurate: bool = False
@@ -96,17 +91,16 @@ class LiveSession:
         camera: Camera,
         options: SessionOptions | None = None,
         tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
-        notation: Notation | None = None,
         gripper: Callable[[], RobotState] | None = None,
     ) -> None:
         """Prepare a session that adds images of `camera` to `calibration`; `run` starts it.
 
         `tell` is called with each answer and each state of the calibration, as JSON and as lines for a person.
         `gripper` returns the present state of the arm, for an image on command and to detect motion after each image;
-        None: poses are typed or posted. `notation` is that of proposed poses.
+        None: poses are typed or posted.
         """
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
-        self.options, self.notation = options or SessionOptions(), notation or Notation(arm=calibration.arm)
+        self.options = options or SessionOptions()
         self._tell, self._gripper = tell, gripper
         self._most = self.options.images or (MOST_IMAGES if self.options.until_accurate else ENOUGH_IMAGES)
         self._frames = iter(camera.frames)
@@ -173,7 +167,7 @@ class LiveSession:
         """Take an image while the arm rests at `state`, start to calibrate all images, and return an answer for JSON.
 
         `state` is written with the image: gripper pose and joint angles. The answer has "accepted", and "image" (name)
-        or "reason". `waits`: wait for the calibration, and add its state and the next pose to the answer.
+        or "reason". `waits`: wait for the calibration, and add its state to the answer.
         """
         with self._lock:
             if self.state.is_over:
@@ -189,7 +183,6 @@ class LiveSession:
                     why = f"the image cannot be written ({error.strerror}); free the disk and take it again"
                 answer = {"accepted": False, "reason": why, "done": self.state.is_over}
                 self._say(f"refused: {why}", answer)
-                self._follow(state.base_from_gripper)
             else:
                 self._follow()
                 is_over = len(self.folder.names) >= self._most
@@ -274,15 +267,14 @@ class LiveSession:
         """Publish the reason why a request or command was not executed, on the page and through `tell`."""
         self._say(event, {"accepted": False, "reason": event.removeprefix("refused: ")})
 
-    def _follow(self, refused: Float[ndarray, "4 4"] | None = None) -> None:
-        """Call `_calibrate` in the worker thread; `refused` is a gripper pose without a usable image, or None."""
+    def _follow(self) -> None:
+        """Call `_calibrate` in the worker thread."""
         with suppress(RuntimeError):  # After the end of the session the worker accepts no requests.
-            self._following = self._worker.submit(self._calibrate, refused)
+            self._following = self._worker.submit(self._calibrate)
 
-    def _calibrate(self, refused: Float[ndarray, "4 4"] | None) -> None:
-        """Calibrate the images if they changed; propose a pose distant from the gripper pose `refused`, unless None.
+    def _calibrate(self) -> None:
+        """Calibrate the images if they changed.
 
-        Distant: its camera is more than 0.06 m from where the camera was, if possible.
         With --until-accurate, end the capture if the calibration of all images meets the requirement.
         """
         try:
@@ -295,8 +287,6 @@ class LiveSession:
                     required = result.calibration.requirement
                     if result.converged and required is not None and required.met:
                         self._show(is_over=True, result=result)
-            if refused is not None:
-                self._report(self.calibration.propose_elsewhere(refused))
         except (InputError, RejectedError) as error:
             self._refuse(f"no calibration: {error}")
         except OSError as error:
@@ -310,7 +300,7 @@ class LiveSession:
             state = self.state
             is_shown = not state.is_refusal and progress.images == state.names
             self._show("" if is_shown else state.event, is_refusal=state.is_refusal, progress=progress)
-        self._tell({"calibration": progress.as_json()}, progress_lines(progress, self.notation))
+        self._tell({"calibration": progress.as_json()}, progress_lines(progress))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
         """Publish an event (text) on the page, and with `answer` (JSON) through `tell`.

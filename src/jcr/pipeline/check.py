@@ -1,4 +1,4 @@
-"""Quick check of a capture before a run: files, motion, features, gripper poses to add, and the pose convention."""
+"""Quick check of a capture before a run: files, motion, features, and the pose convention."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -7,21 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from numpy.typing import ArrayLike
 
 from jcr.boards.proposal import proposed
+from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import (
-    assumptions_of,
-    assumptions_of_poses,
-    better_poses,
-    next_poses,
-    predictions,
-)
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
 from jcr.capture.formats.table import OpenConventionError, possible_options
@@ -30,7 +23,15 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.observability import observability
-from jcr.estimation.prediction import FEWEST, Assumptions, assumed, typical_camera
+from jcr.estimation.prediction import (
+    FEWEST,
+    Assumptions,
+    PredictedCamera,
+    assumed,
+    median_distance,
+    predict,
+    typical_camera,
+)
 from jcr.features.sift import WORKING_SIZE_PX
 from jcr.findings import (
     Finding,
@@ -43,7 +44,7 @@ from jcr.findings import (
 )
 from jcr.geometry import ARM, largest_motion
 from jcr.progress import Progress
-from jcr.records import Capture, NextPose, Observability, PosePairs, Uncertainty
+from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.rounding import significant
 from jcr.sfm.colmap import reconstruct_colmap
 
@@ -55,7 +56,7 @@ QUICK, QUICK_SIZE_PX = 8, 800
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """Result of the check of a capture: motion, expected uncertainty, poses to add, findings, and notes."""
+    """Result of the check of a capture: motion, expected uncertainty, findings, and notes."""
 
     sharpness: Float[ndarray, " n"]
     """Variance of the Laplacian of each image, divided by the median; empty for a capture without images."""
@@ -68,8 +69,6 @@ class Examination:
     """Predicted uncertainty of a calibration from the `counted` images; None for fewer than three of them."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did or, if not all were tried, the clear ones."""
-    suggestions: tuple[NextPose, ...]
-    """Gripper poses to add, best first."""
     hand_eye: Calibration | None
     """Calibration from sparse features, or from given camera poses; None if no images were registered."""
     findings: tuple[Finding, ...]
@@ -99,21 +98,18 @@ class _Comparison:
 
 def check_capture(
     capture: Capture | PosePairs | str | Path,
-    suggest: int = 0,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
-    reach: ArrayLike | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
-    """Examine a capture, or the capture at a path: its motion, images, expected uncertainty, and poses to add.
+    """Examine a capture, or the capture at a path: its motion, images, and expected uncertainty.
 
     `look`: reconstruct the images from sparse features and compare the camera poses with the gripper poses. A few images
     of reduced size are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have
-    given camera poses, which are compared instead. `suggest` is the number of gripper poses to propose, drawn with
-    `seed`. `robot_noise` is the standard deviation per axis (m, rad), `reach` (2,3) the box (min, max; m, base frame)
-    of proposed positions. Raises InputError if gripper poses and joint angles contradict each other.
+    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad), `seed`
+    that of the reconstruction. Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_and_compare(capture, progress=progress)[0]
@@ -143,18 +139,17 @@ def check_capture(
     of_motion = () if hand_eye is not None else seen.findings
     found = [*shown.findings, *of_motion, *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
-    of_rows, names = assumptions or assumed(gripper, camera, robot_noise), [capture.images[k] for k in rows]
-    known = of_rows, gripper, robot.of(rows)
-    added = better_poses(*known, suggest, None if reach is None else np.asarray(reach, float), seed)
-    predicted = predictions(*known, added)
+    expected = None
+    if len(counted) >= FEWEST:
+        of_rows = assumptions or assumed(gripper, camera, robot_noise)
+        expected = predict(of_rows, gripper, robot.of(rows).systematic)
     return Examination(
         sharpness=sharpness,
         largest_move_m=move_m,
         largest_rotation_rad=rotation_rad,
         observability=seen,
-        expected=predicted(0) if len(counted) >= FEWEST else None,
+        expected=expected,
         counted=counted,
-        suggestions=next_poses(gripper, names, added, predicted),
         hand_eye=hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
@@ -225,6 +220,33 @@ def _compare(
         notes=made.notes,
         registered=None if is_quick else registered,
         assumptions=assumptions,
+    )
+
+
+def assumptions_of(case: Case) -> Assumptions:
+    """Return the assumptions of predictions: new images and gripper poses are like the used ones of the case.
+
+    If the case's images were not adjusted, camera poses are assumed to be given and exact (`Assumptions.camera` None).
+    """
+    used, metric_std = case.base_from_gripper[case.used], case.reconstruction.metric_std
+    assumptions = assumptions_of_poses(case.hand_eye, used, metric_std)
+    if case.adjusted is None or (distance := case.scene_distance_m) is None:
+        return assumptions
+    return replace(assumptions, distance_m=distance, camera=PredictedCamera.of(case.adjusted))
+
+
+def assumptions_of_poses(
+    hand_eye: Calibration, used: Float[ndarray, "n 4 4"], scale_std: float | None
+) -> Assumptions:
+    """Return the assumptions of predictions for a calibration from camera poses; `used` are its used gripper poses.
+
+    `scale_std` is the relative standard deviation of a known scale; None: the scale is estimated.
+    """
+    return Assumptions(
+        gripper_from_camera=hand_eye.gripper_from_camera,
+        distance_m=median_distance(used @ hand_eye.gripper_from_camera),
+        noise=hand_eye.robot_noise,
+        scale_std=scale_std,
     )
 
 

@@ -18,7 +18,6 @@ from jcr.records.json_fields import (
     Matrix,
     Numbers,
     Numbers3,
-    Numbers7,
     PartCovariance7,
     Spread,
     Square,
@@ -86,25 +85,6 @@ class Excitation:
     """Directions as rows: unit vectors of translation (m), rotation times ARM, and log scale times `spread`."""
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NextPose:
-    """Gripper pose to add, and the predicted uncertainty of a calibration with this pose and those before it."""
-
-    base_from_gripper: Matrix
-    like: str
-    """Name of the image with the nearest gripper pose."""
-    expected_std: Numbers7
-    """Predicted standard deviations, in COVARIANCE_ORDER."""
-    within_95_mm: Spread
-    """Predicted bound on 95 % of the errors of a point (mm), as in PointUncertainty."""
-    rotation_95_deg: Spread
-    """Predicted bound on 95 % of the direction errors (degrees), as in PointUncertainty."""
-    moved_m: Annotated[Metres, Field(alias="moved_mm")] = 0.0
-    """Distance of the gripper's origin from its position at the image `like` (m)."""
-    rotation_rad: Annotated[Radians, Field(alias="rotated_deg")] = 0.0
-    """Rotation angle from the gripper pose at the image `like` (rad)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -138,8 +138,6 @@ class Capture:
     orientation: int = 1
     """EXIF orientation of all images. 1: as read from the sensor; otherwise the images were rotated upright, and the
     camera frame is that of the rotated images."""
-    pose_convention: str | None = None
-    """Convention of the poses in the source, a name in capture.controllers.CONVENTIONS; None: not stated."""
     depths: tuple[str | None, ...] | None = None
     """Depth image of each image, or None for an image without one: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"

@@ -207,7 +207,6 @@ class CaptureFile(Entry, extra="allow"):
     """Frames as JSON objects; each is validated as a FrameEntry later, because a few of them may be invalid."""
     intrinsics: IntrinsicsEntry | None = None
     intrinsics_std: StdEntry | None = None
-    pose_convention: Any = None
     robot: Any = None
     urdf: str | None = None
     cameras: CameraEntries | None = None

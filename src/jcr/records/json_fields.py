@@ -114,7 +114,6 @@ Spread = Annotated[float, Field(ge=0)]
 Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
 Numbers = Annotated[Float[ndarray, " _"], _arrays(None)]
 Numbers3 = Annotated[Float[ndarray, "3"], _arrays(3)]
-Numbers7 = Annotated[Float[ndarray, "7"], _arrays(7)]
 Square = Annotated[Float[ndarray, "_ _"], _arrays(None, None)]
 Matrix = Annotated[Float[ndarray, "4 4"], _arrays(4, 4, made=_rigid)]
 """Rigid transform, a 4x4 matrix."""

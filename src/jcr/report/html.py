@@ -28,7 +28,7 @@ LINKS = {
     "images": "Images",
     "cameras": "Cameras",
     "residuals": "Residuals",
-    "uncertainty": "Uncertainty, motion and poses to add",
+    "uncertainty": "Uncertainty and motion",
     "objects": "Objects",
     "notes": "Notes",
     "details": "Details",

@@ -1,23 +1,16 @@
-"""Section of observability, uncertainty and gripper poses to add in the report."""
+"""Section of observability and uncertainty in the report."""
 
-import json
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
 from jcr.calibration.words import given_in_words, seen_in_words
-from jcr.capture.controllers import CONVENTIONS, OF_ARM, numbers_from_poses
 from jcr.estimation.observability import WEAK, excitation
-from jcr.records import Capture, Excitation, NextPose
+from jcr.records import Excitation
 from jcr.report.render import Content
 from jcr.result import RunResult
 from jcr.rounding import significant
 
-ANY_CONVENTION = "quat-xyzw"
-"""Pose convention in which poses are shown if the robot's convention is unknown."""
-MATRICES = {"franka": "the matrix by columns", "matrix": "the matrix by rows"}
-"""Pose conventions that write all 16 numbers of the matrix, and their description."""
 PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
 """Names of the seven components of a direction, in records.COVARIANCE_ORDER."""
 NAMED = 0.4
@@ -30,7 +23,7 @@ Bar = tuple[str, float, float, str]
 
 
 def motion_section(result: RunResult) -> Content:
-    """Return the section on motion: bars of excitation and of standard deviations, and the gripper poses to add.
+    """Return the section on motion: bars of excitation and of standard deviations.
 
     Excitation is how strongly the motions determine gripper_from_camera and scale (seven parameters), by direction.
     """
@@ -56,7 +49,6 @@ def motion_section(result: RunResult) -> Content:
         "seen": seen,
         "spreads": spreads,
         "scale_percent": "" if uncertainty is None else significant(uncertainty.scale_std_percent),
-        "next_poses": _next_poses(result),
     }
 
 
@@ -83,42 +75,3 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"
-
-
-def _next_poses(result: RunResult) -> dict[str, Any] | None:
-    """Return the proposed gripper poses in the pose convention of the capture, ready to copy; None if there are none."""
-    if not (poses := result.calibration.next_poses):
-        return None
-    capture, convention = result.capture, ANY_CONVENTION
-    if isinstance(capture, Capture):
-        convention = capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
-    form = CONVENTIONS[convention]
-    units = f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
-    written = MATRICES.get(convention) or ", ".join(form.columns)
-    return {
-        "in_the_3d_view": isinstance(capture, Capture),
-        "notation": f"{written} ({units}), as {convention} writes poses",
-        "rows": [_next_pose(pose, convention) for pose in poses],
-    }
-
-
-def _next_pose(pose: NextPose, convention: str) -> dict[str, Any]:
-    """Return a proposed gripper pose in a convention, with motion and expected uncertainty as cells of a table.
-
-    The motion is that from the image with the nearest gripper pose. The uncertainty is expected of a calibration that
-    includes the pose.
-    """
-    numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
-    mm, deg = significant(1e3 * float(pose.expected_std[:3].max())), np.degrees(pose.expected_std[3:6].max())
-    percent = significant(100 * float(pose.expected_std[6]))
-    return {
-        "numbers": ", ".join(f"{value:.4f}" for value in numbers),
-        "is_short": len(numbers) < 16,
-        "matrix": json.dumps(pose.base_from_gripper.round(6).tolist()),
-        "cells": (
-            pose.like,
-            f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.rotation_rad):.0f}°",
-            f"{significant(pose.within_95_mm)}\u00a0mm, {significant(pose.rotation_95_deg)}°",
-            f"±{mm}\u00a0mm, ±{significant(float(deg))}°, ±{percent}\u00a0%",
-        ),
-    }

@@ -29,11 +29,7 @@ PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
 def scene_section(result: RunResult) -> Content:
     """Return the section of the 3D view: its data (cameras, grippers, points), check boxes, and legend of labels."""
     calibration, reconstruction = result.found, result.reconstruction
-    x, next_poses, base_from_recon = (
-        calibration.gripper_from_camera,
-        calibration.next_poses,
-        calibration.base_from_recon,
-    )
+    base_from_recon = calibration.base_from_recon
     base_from_camera = base_from_recon.rigid @ scale_translation(
         reconstruction.recon_from_camera, base_from_recon.scale
     )
@@ -62,10 +58,9 @@ def scene_section(result: RunResult) -> Content:
         for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
     ]
     others = _others(result, base_from_camera)
-    poses = [np.array(pose.base_from_gripper) for pose in next_poses]
     intrinsics = result.intrinsics or reconstruction.intrinsics
     drawn = [*layers, track_layer("tracked features", tracked)]
-    data = scene_data(drawn, views, poses, x, intrinsics, base_from_camera[:, :3, 3]) | {
+    data = scene_data(drawn, views, intrinsics, base_from_camera[:, :3, 3]) | {
         "others": others,
         "bases": [
             {"name": f"base of {arm.name}", "base": _rows(np.array(arm.base_from_other_base))}
@@ -74,7 +69,6 @@ def scene_section(result: RunResult) -> Content:
     }
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
-    checks += [("next", "poses to add (green)", False)] * bool(next_poses)
     checks.append(("tracks", "tracked features (red)", not layers))
     return {
         "layers": [name for name, *_ in layers] + ["no points"] * bool(layers),
@@ -94,15 +88,13 @@ def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:
 def scene_data(
     layers: Sequence[PointLayer],
     views: Sequence[Mapping[str, Any]],
-    next_poses: Sequence[Float[ndarray, "4 4"]],
-    gripper_from_camera: Float[ndarray, "4 4"],
     intrinsics: Intrinsics,
     shown_in_base: Float[ndarray, "m 3"],
 ) -> dict[str, Any]:
-    """Return the data of the 3D view for scene3d.js: layers of points, images, gripper poses to add, and intrinsics.
+    """Return the data of the 3D view for scene3d.js: layers of points, images, and intrinsics.
 
-    `views` are results of `scene_view`, `next_poses` the gripper poses to add. Coordinates of points are 16-bit
-    fractions of a box (m, base frame), which encloses most points of the layers and of `shown_in_base`.
+    `views` are results of `scene_view`. Coordinates of points are 16-bit fractions of a box (m, base frame), which
+    encloses most points of the layers and of `shown_in_base`.
     """
     everything = np.vstack([points for _, points, *_ in layers] + [shown_in_base])
     # A few distant outliers must not enlarge the box, which sets the resolution and the view.
@@ -121,7 +113,6 @@ def scene_data(
         "views": views,
         "others": [],
         "bases": [],
-        "next": [{"gripper": _rows(one), "camera": _rows(one @ gripper_from_camera)} for one in next_poses],
         "intrinsics": asdict(intrinsics),
     }
 

@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from jcr.capture.checks import checked_capture, require_frames
-from jcr.capture.controllers import CONVENTIONS
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, validated_content
@@ -119,7 +118,7 @@ def stated_fields(
     """
     angles = [frame.joints for frame in frames if frame.joints is not None]
     joints = np.array(angles) if angles and len(angles) == len(frames) else None
-    robot, notes, convention = content.robot, (), content.pose_convention
+    robot, notes = content.robot, ()
     if robot is not None and robot not in ROBOT_NAMES:
         known = ", ".join(ROBOT_NAMES)
         robot, notes = None, (f"robot {shown(robot)} is not one of {known}: its kinematics are not used",)
@@ -132,7 +131,6 @@ def stated_fields(
         "robot": robot,
         "urdf": None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf"),
         "depths": depths if any(depths) else None,
-        "pose_convention": convention if isinstance(convention, str) and convention in CONVENTIONS else None,
         "notes": notes,
     }
 
@@ -256,7 +254,6 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
         write_new(folder / URDF, urdf.read_bytes())  # so that the folder contains the whole capture
     optional = {
-        "pose_convention": capture.pose_convention,
         "robot": capture.robot,
         "urdf": None if urdf is None else URDF,
         "cameras": camera_entries(capture) or None,

@@ -90,7 +90,6 @@ def read(path: Path, options: ReadOptions) -> Capture:
         notes=(*notes, *capture.notes),
         depths=depths if any(depths) else None,
         intrinsics=read_camera_info(info, capture.image_size) if known else None,
-        pose_convention=table.convention,
     )
 
 
@@ -147,7 +146,6 @@ def pose_table(
         base_from_gripper=poses,
         images=None if image is None else tuple(map(str, image)),
         stamp_ns=None if stamp is None else np.array([stamp_ns(str(cell), where) for cell in stamp]),
-        convention=convention,
         faults=faults,
     )
 

@@ -41,7 +41,6 @@
     others: document.getElementById("scene-others")?.checked,
     grippers: document.getElementById("scene-grippers").checked,
     grid: document.getElementById("scene-grid").checked,
-    next: document.getElementById("scene-next")?.checked,
   });
 
   // Right, down and forward of the eye in the base frame, its centre, and its intrinsics in canvas pixels.
@@ -153,11 +152,6 @@
       cameras.forEach((camera) =>
         frustum(view, camera, intrinsics, chosen ? colors.accent : colorOf(k, colors), chosen ? 3 : fixed ? 2.5 : 1.5, fixed ? 0.08 : 0.05));
     });
-    if (show.next) scene.next.forEach(({ gripper, camera }) => {
-      triad(view, gripper, 0.03, 2.5);
-      line(view, [column(gripper, 3), column(camera, 3)], colors.next, 1);
-      frustum(view, camera, scene.intrinsics, colors.next, 2.5);
-    });
     if (show.others) drawNames(view, colors);
   }
 
@@ -227,7 +221,7 @@
     const show = shown();
     const view = eye();
     const style = getComputedStyle(canvas);
-    const colors = Object.fromEntries(["ink", "paper", "faint", "camera", "light", "accent", "bad", "next"].map((name) =>
+    const colors = Object.fromEntries(["ink", "paper", "faint", "camera", "light", "accent", "bad"].map((name) =>
       [name, style.getPropertyValue(`--scene-${name}`).trim()]));
     context.clearRect(0, 0, canvas.width, canvas.height);
     const picture = context.createImageData(canvas.width, canvas.height);
