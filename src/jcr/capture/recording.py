@@ -182,8 +182,7 @@ def _pose_information(base_from_gripper: Poses) -> Float[ndarray, "n 13 13"]:
     vector (rad). The poses have the random errors ASSUMED_NOISE (m, rad). The reconstruction frame is arbitrary; here
     it is the base frame, in metres.
     """
-    x = np.eye(4)
-    _, j = pose_residuals(x, 1.0, np.eye(4), base_from_gripper, base_from_gripper)
+    _, j = pose_residuals(np.eye(4), 1.0, np.eye(4), base_from_gripper, base_from_gripper)
     j /= np.repeat(ASSUMED_NOISE, 3)[:, None]
     return np.swapaxes(j, 1, 2) @ j
 

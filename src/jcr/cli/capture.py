@@ -40,9 +40,9 @@ class CaptureCommand:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the calibration is
-    updated, and its accuracy, its faults and what would improve it are printed. OUT/result is the calibration
-    of all images. After Ctrl-C the same command resumes. The live page, whose address is printed, has
-    buttons to take, retake and remove images, to undo, and to finish; the same commands can be typed.
+    updated, and its accuracy, its faults and what would improve it are printed. OUT/result is the calibration of all
+    images. After Ctrl-C the same command resumes. The live page, whose address is printed, has buttons to take, retake
+    and remove images, to undo, and to finish; the same commands can be typed.
 
     for example:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -64,7 +64,7 @@ class CaptureCommand:
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
     or http (a program posts them, jcr docs http)."""
     pose_convention: ConventionName = "auto"
-    """Notation of typed poses; auto: quat-xyzw."""
+    """Notation of typed poses; auto: 6 numbers end with a rotation vector, 7 with a quaternion xyzw, 16 are a matrix."""
     pose_units: UnitsName = "auto"
     """Units of typed poses; auto: those of the convention."""
     robot: Annotated[RobotName | Literal["list"] | None, tyro.conf.arg(metavar=f"{{list,{CHOICES[1:]}")] = (
