@@ -70,6 +70,11 @@ def test_the_images_that_are_missing_are_counted():
     hand_eye = calibrate_pose_pairs(given, asked)
     required = hand_eye.requirement
     assert required is not None and not required.met and required.more_images
+    more = calibrate_pose_pairs(pairs(12, 12 + required.more_images)[0]).requirement
+    assert more is not None and more.reached_mm < required.translation_mm
+    out_of_reach = CalibrateOptions(require=(0.01 * reached.reached_mm, 10.0))
+    far = calibrate_pose_pairs(given, out_of_reach).requirement
+    assert far is not None and far.more_images is None
     content, html = hand_eye, page(given, hand_eye)
     assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
     show = sentence(content.short)
