@@ -5,7 +5,7 @@ other points. The bundle adjustment takes the board's shape and size as a prior 
 between images, the position that most images agree on is used.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -26,21 +26,6 @@ SAME_PLACE = 0.006
 """Largest rms distance of detected corners from the projected triangulated ones, as a share of the image's width."""
 MOST_PAIRS = 100
 """Largest number of image pairs from which a body is triangulated in the search for the images that agree."""
-
-
-@dataclass(frozen=True)
-class _BodyCorners:
-    """Corners of one board or tag in m images: pixels (NaN where not detected), and positions on it (m or sides)."""
-
-    number: int
-    """Number of the tag; 0 for a board."""
-    x_px: Float[ndarray, "m c 2"]
-    x_in_body: Float[ndarray, "c 3"]
-
-    @property
-    def images(self) -> Int[ndarray, " i"]:
-        """Indices of the images that show at least FEWEST_POINTS corners of the board or tag."""
-        return np.flatnonzero(np.isfinite(self.x_px[..., 0]).sum(1) >= FEWEST_POINTS)
 
 
 def with_boards(
@@ -67,12 +52,12 @@ def with_boards(
         x_px = np.full((len(images), len(corner), 2), np.nan)
         for k, s in own:
             x_px[k, [corner[i] for i in s.index]] = s.x_px
-        seen = _BodyCorners(number, x_px, np.stack([x_in_body[i] for i in corner]))
-        agreeing = _at_one_place(seen, cameras, reconstruction.intrinsics)
-        elsewhere |= set(seen.images.tolist()) - set(agreeing.tolist())
+        shown = np.flatnonzero(np.isfinite(x_px[..., 0]).sum(1) >= FEWEST_POINTS)
+        agreeing = _at_one_place(x_px, shown, cameras, reconstruction.intrinsics)
+        elsewhere |= set(shown.tolist()) - set(agreeing.tolist())
         if len(agreeing) >= FEWEST_IMAGES:
-            tracks, body = _with_corners(tracks, seen, agreeing, cameras, reconstruction.intrinsics)
-            bodies.append(body)
+            tracks, kept, point = _with_corners(tracks, x_px, agreeing, cameras, reconstruction.intrinsics)
+            bodies.append(Body(number, point, np.stack([x_in_body[i] for i in corner])[kept]))
     found = Boards(
         spec=spec if board is readings[0] else board.name,
         side=board.side,
@@ -88,21 +73,25 @@ def with_boards(
 
 
 def _at_one_place(
-    seen: _BodyCorners, cameras: Float[ndarray, "m 4 4"], intrinsics: Intrinsics
+    x_px: Float[ndarray, "m c 2"],
+    images: Int[ndarray, " i"],
+    cameras: Float[ndarray, "m 4 4"],
+    intrinsics: Intrinsics,
 ) -> Int[ndarray, " a"]:
-    """Return the indices of the largest set of images that see the board at one position; empty if no two agree.
+    """Return the indices of the largest set of `images` that see the board at one position; empty if no two agree.
 
-    `cameras` are recon_from_camera of the m registered images, which the indices count. Images agree if their rms
-    distance from the projected triangulated corners is below SAME_PLACE image widths.
+    `x_px` are the pixels of the c corners in the m registered images, NaN where not detected; `cameras` are
+    recon_from_camera. `images` are the indices of those that show the board. Images agree if their rms distance from
+    the projected triangulated corners is below SAME_PLACE image widths.
     """
-    images, best, limit_px = seen.images, np.zeros(0, int), SAME_PLACE * intrinsics.width
+    best, limit_px = np.zeros(0, int), SAME_PLACE * intrinsics.width
 
     def agreeing(by: Int[ndarray, " b"]) -> Int[ndarray, " a"]:
         """Return the rows of images whose corners agree with the position triangulated from the images `by`."""
-        points, rows = _triangulated(seen.x_px[by], cameras[by], intrinsics), list[int]()
+        points, rows = _triangulated(x_px[by], cameras[by], intrinsics), list[int]()
         for k in images.tolist():
             x_in_camera = apply(inverse(cameras[k]), points)
-            off = ((project(intrinsics, x_in_camera) - seen.x_px[k]) ** 2).sum(1)
+            off = ((project(intrinsics, x_in_camera) - x_px[k]) ** 2).sum(1)
             shared = np.isfinite(off)
             ahead = (x_in_camera[shared, 2] > 0).all()
             if shared.sum() >= FEWEST_POINTS and ahead and off[shared].mean() < limit_px**2:
@@ -138,17 +127,18 @@ def _triangulated(
 
 def _with_corners(
     tracks: Tracks,
-    seen: _BodyCorners,
+    x_px: Float[ndarray, "m c 2"],
     images: Int[ndarray, " a"],
     cameras: Float[ndarray, "m 4 4"],
     intrinsics: Intrinsics,
-) -> tuple[Tracks, Body]:
-    """Return the tracks with a board's corners in some images added, and the record of the board in these tracks.
+) -> tuple[Tracks, Int[ndarray, " k"], Int[ndarray, " k"]]:
+    """Return the tracks with a board's corners in some images added, the k corners added, and their indices in them.
 
-    `images` are the indices of these among the m registered images; `cameras` are recon_from_camera of all m.
+    `x_px` are the pixels of the c corners in the m registered images, NaN where not detected. `images` are the indices
+    of the images whose corners are added; `cameras` are recon_from_camera of all m.
     """
-    points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
-    shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
+    points = _triangulated(x_px[images], cameras[images], intrinsics)
+    shown = np.isfinite(x_px[images, :, 0]) & np.isfinite(points[:, 0])
     kept = np.flatnonzero(shown.any(0))
     row = np.zeros(len(points), int)
     row[kept] = len(tracks.points_in_recon) + np.arange(len(kept))
@@ -159,11 +149,11 @@ def _with_corners(
     longer = replace(
         tracks,
         image=np.concatenate([tracks.image, images[image]]),
-        x_px=np.concatenate([tracks.x_px, seen.x_px[images[image], corner]]),
+        x_px=np.concatenate([tracks.x_px, x_px[images[image], corner]]),
         point=np.concatenate([tracks.point, row[corner]]),
-        points_in_recon=np.concatenate(
+        points_in_recon=np.vstack(
             [tracks.points_in_recon, points[kept].astype(tracks.points_in_recon.dtype)]
         ),
         std_px=std,
     )
-    return longer, Body(seen.number, row[kept], seen.x_in_body[kept])
+    return longer, kept, row[kept]

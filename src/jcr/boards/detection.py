@@ -77,24 +77,22 @@ def boards(spec: str) -> list[Board]:
         return [one for ratio in RATIOS for one in boards(spec.replace(MARKER, f"{ratio:g}"))]
     try:
         match kind, parts:
-            case "charuco", [count, length, marker, tags]:
-                side = _length(length)
-                detectors = _charuco(spec, _count(count), side, _length(marker), _tags(tags))
-            case "chessboard", [count, length]:
-                side = _length(length)
-                detectors = {spec: _chessboard(_count(count), side)}
-            case "circles", [count, length]:
-                side = _length(length)
-                detectors = {spec: _circles(_count(count), side)}
-            case (("aruco" | "apriltag"), [length, tags]):
-                side, name = _length(length), tags if kind == "aruco" else f"DICT_APRILTAG_{tags}"
-                detectors = {spec: _single_tags(side, _tags(name))}
+            case "charuco", [count, side, marker, tags]:
+                detectors = _charuco(spec, _count(count), _length(side), _length(marker), _tags(tags))
+            case "chessboard", [count, side]:
+                detectors = {spec: _chessboard(_count(count), _length(side))}
+            case "circles", [count, side]:
+                detectors = {spec: _circles(_count(count), _length(side))}
+            case "aruco", [side, tags]:
+                detectors = {spec: _single_tags(_length(side), _tags(tags))}
+            case "apriltag", [side, tags]:
+                detectors = {spec: _single_tags(_length(side), _tags(f"DICT_APRILTAG_{tags}"))}
             case _:
                 raise ValueError(f"no such board; write it as {'; '.join(KINDS)}")
     except ValueError as error:
         raise InputError(f"--board {spec}: {error}") from None
     size_std = None if SIDE in parts else PRINTED
-    return [Board(name, detect, side, size_std) for name, detect in detectors.items()]
+    return [Board(name, detect, _length(side), size_std) for name, detect in detectors.items()]
 
 
 def _count(text: str) -> tuple[int, int]:
@@ -217,15 +215,14 @@ def _circles(count: tuple[int, int], spacing: float) -> Detector:
     x_in_board = _grid(across, down)
     x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
     x_in_board *= spacing
-    blobs = cv2.SimpleBlobDetector.Params()
+    index, blobs = tuple(range(across * down)), cv2.SimpleBlobDetector.Params()
     blobs.minArea, blobs.maxArea, blobs.minDistBetweenBlobs = 20.0, 1e5, 4.0
     finder = cv2.SimpleBlobDetector.create(blobs)
 
     def detect(grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
         flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
         found, centers = cv2.findCirclesGrid(grey, count, flags=flags, blobDetector=finder)
-        x_px = centers.reshape(-1, 2).astype(np.float64) if found else None
-        return [] if x_px is None else [Sighting(0, tuple(range(across * down)), x_in_board, x_px)]
+        return [Sighting(0, index, x_in_board, centers.reshape(-1, 2).astype(np.float64))] if found else []
 
     return detect
 

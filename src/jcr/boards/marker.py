@@ -107,16 +107,13 @@ def _intrinsics(
             "check the board's kind and size, or give the intrinsics",
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
-    x_in_body, x_px = (
-        [np.asarray(s.x_in_body, np.float32) for s in shown],
-        [np.asarray(s.x_px, np.float32) for s in shown],
-    )
+    x_in_body = [np.asarray(s.x_in_body, np.float32) for s in shown]
+    x_px = [np.asarray(s.x_px, np.float32) for s in shown]
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
         x_in_body, x_px, capture.image_size, np.eye(3), np.zeros(5), flags=flags
     )
-    fx, fy, cx, cy, k1, k2 = (
-        float(v) for v in (*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *distortion.ravel()[:2])
-    )
+    fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    k1, k2, *_ = distortion.ravel().tolist()
     note = f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
     return Intrinsics(fx, fy, cx, cy, *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)), [note]
 

@@ -1,5 +1,6 @@
 """Proposal of the option --board from what the images show: tags by their family, chessboards by their corners."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import cv2
@@ -13,7 +14,8 @@ from jcr.records import Capture
 
 LOOKED_AT = 3
 """Number of images that are searched; a useful board is in most of them."""
-FAMILIES = ("4X4", "5X5", "6X6", "7X7", "APRILTAG_36h11", "APRILTAG_25h9")
+FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "APRILTAG_25h9")
+"""Largest dictionary of OpenCV with tags of each kind, without DICT_."""
 SIZES = (50, 100, 250, 1000)
 FEWEST = 2
 """Least number of images that must show the same tags or chessboard; in a single image, texture may look like one."""
@@ -41,23 +43,21 @@ def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     A tag counts if two or more images (FEWEST) show it. The tags of a ChArUco board are proposed as single tags,
     because the user has to count its squares.
     """
-    best: tuple[int, str, set[int]] = (0, "", set())
-    for family in FAMILIES:
-        name = f"DICT_{family}" if "APRIL" in family else f"DICT_{family}_1000"
-        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))
-        seen = [
-            {int(number) for number in np.ravel(ids)} if ids is not None else set[int]()
-            for _, ids, _ in map(detector.detectMarkers, grey)
-        ]
-        again = {number for number in set[int]().union(*seen) if sum(number in ids for ids in seen) >= FEWEST}
-        if len(again) > best[0]:
-            best = len(again), family, again
-    _, family, numbers = best
+    family, numbers = "", list[int]()
+    for name in FAMILIES:
+        tags = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+        detected = map(cv2.aruco.ArucoDetector(tags).detectMarkers, grey)
+        seen = Counter(
+            number for _, ids, _ in detected if ids is not None for number in np.unique(ids).tolist()
+        )
+        again = [number for number, images in seen.items() if images >= FEWEST]
+        if len(again) > len(numbers):
+            family, numbers = name, again
     if not numbers:
         return None
     if family.startswith("APRILTAG"):
         return f"apriltag:SIDE:{family.removeprefix('APRILTAG_')}"
-    return f"aruco:SIDE:DICT_{family}_{next(size for size in SIZES if max(numbers) < size)}"
+    return f"aruco:SIDE:DICT_{family[:3]}_{next(size for size in SIZES if max(numbers) < size)}"
 
 
 def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
@@ -83,9 +83,6 @@ def proposed(capture: Capture, board: str | None) -> tuple[Finding, ...]:
     """
     if board is not None or capture.mount == "base":
         return ()
-    found = board_in_view([read_image(capture.folder / name) for name in capture.images])
-    return (
-        ()
-        if found is None
-        else (Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=found),)
-    )
+    if (found := board_in_view([read_image(capture.folder / name) for name in capture.images])) is None:
+        return ()
+    return (Finding.of(FindingKind.BOARD_IN_VIEW, "warns", "reconstruction", board=found),)
