@@ -126,7 +126,7 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     path = tmp_path / name
     path.write_text(write(mount(doubt)))
     np.testing.assert_allclose(read(path), PARENT_FROM_CHILD, atol=1e-9)
-    line = ros.static_transform_publisher("tool0", "optical", PARENT_FROM_CHILD)
+    line = ros.static_transform_publisher(mount())
     np.testing.assert_allclose(of_publisher(line.split()[4:]), PARENT_FROM_CHILD, atol=1e-9)
     first = path.read_text()[:300]
     assert "optical in tool0" in first and "metres, radians" in first

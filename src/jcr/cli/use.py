@@ -106,8 +106,7 @@ class ExportCommand:
         sys.stderr.write(f"wrote {path}: {row.about}\n")
         lines, facts = list[str](), {"file": str(path), "format": row.name, "about": row.about}
         if row.name == "ros2":
-            mount = run.mount
-            facts["line"] = static_transform_publisher(mount.parent, mount.child, mount.parent_from_child)
+            facts["line"] = static_transform_publisher(run.mount)
             lines = [facts["line"]]
         self.output.result(lines, facts)
         if run.doubt is not None:
@@ -155,11 +154,10 @@ class QueryCommand:
         summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}"
         answers: dict[str, object] = {"label_names": list(scene.label_names)}
         if self.output.json:
-            for name, column in zip(_COLUMNS.split(","), columns, strict=True):  # JSON has no NaN
-                rounded = (
-                    column.tolist() if column.dtype.kind != "f" else column.astype(float).round(6).tolist()
-                )
-                answers[name] = [None if value != value else value for value in rounded]
+            for name, column in zip(_COLUMNS.split(","), columns, strict=True):
+                rounded = column.astype(float).round(6) if column.dtype.kind == "f" else column
+                # JSON has no NaN.
+                answers[name] = [None if value != value else value for value in rounded.tolist()]
         if self.write or not self.output.json:
             path = self.write or self.points.with_suffix(".answers.csv")
             rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]

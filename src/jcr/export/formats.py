@@ -135,7 +135,12 @@ class ExportedRun:
             raise InputError(
                 f"{out}: found no calibration to export ({self.calibration.doubt}); run it on a fixed capture"
             )
-        self.camera = None if options.camera is None else self._camera(options.camera)
+        cameras = () if self.run.cameras is None else self.run.cameras.cameras
+        self.placed = [camera for camera in cameras if camera.parent_from_camera is not None]
+        """Cameras other than the calibrated one whose pose was found."""
+        self.camera = next((camera for camera in self.placed if camera.name == options.camera), None)
+        if self.camera is None and options.camera is not None:
+            raise InputError(f"--camera {options.camera}: {out} has no such camera; see its cameras.json")
         self.doubt = self.calibration.doubt
         """Reason why the calibration or the chosen camera is rejected; None if accepted."""
         if self.doubt is None and self.camera is not None:
@@ -154,20 +159,18 @@ class ExportedRun:
         The parent is the gripper or, for a fixed camera, the base. Raises InputError if options and run do not fit.
         """
         options, found = self.options, self.calibration
+        matrix, intrinsics = found.parent_from_camera, found.intrinsics
+        if options.intrinsics == "given" and self.camera is None:
+            if (kept := found.with_given_intrinsics) is None:
+                raise InputError(
+                    f"--intrinsics given: {self.run.out} has no transform for given intrinsics: the capture gave "
+                    "none, or no others were estimated beside them; leave it out"
+                )
+            matrix, intrinsics = kept.gripper_from_camera, kept.intrinsics
         if self.camera is not None:
             mount = self._mount_of(self.camera, options.child_frame)
-        elif options.intrinsics == "estimated":
-            intrinsics = found.intrinsics
-            matrix = np.array(found.parent_from_camera)
-            mount = self._named(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
-        elif (kept := found.with_given_intrinsics) is None:
-            raise InputError(
-                f"--intrinsics given: {self.run.out} has no transform for given intrinsics: the capture gave "
-                "none, or no others were estimated beside them; leave it out"
-            )
         else:
-            pair = np.array(kept.gripper_from_camera), self.doubt, kept.intrinsics
-            mount = self._named(found.mount, options.child_frame, *pair)
+            mount = self._mount(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
         if options.to_root is None:
             return mount
         if options.root_from_optical is None:
@@ -187,17 +190,13 @@ class ExportedRun:
 
         Rejected cameras are included only with `options.force`.
         """
-        cameras = self.run.cameras
-        if cameras is None or self.camera is not None:
+        if self.run.cameras is None or self.camera is not None:
             return []
-        mounts = [
-            self._mount_of(camera, f"{camera.name}_optical_frame")
-            for camera in cameras.cameras
-            if camera.parent_from_camera is not None and (camera.doubt is None or self.options.force)
-        ]
+        shown = [camera for camera in self.placed if camera.doubt is None or self.options.force]
+        mounts = [self._mount_of(camera, f"{camera.name}_optical_frame") for camera in shown]
         return mounts + [
-            self._named("base", f"{arm.name}_{self.options.base_frame}", np.array(arm.base_from_other_base))
-            for arm in cameras.arms
+            self._mount("base", f"{arm.name}_{self.options.base_frame}", arm.base_from_other_base)
+            for arm in self.run.cameras.arms
         ]
 
     @property
@@ -210,25 +209,16 @@ class ExportedRun:
         """Map of the run in the base frame (m), from map.safetensors."""
         return load_map(self.run.out)
 
-    def _camera(self, name: str) -> "CameraPlacement":
-        """Return the run's other camera of this name; raise InputError if the run has no pose of such a camera."""
-        cameras = self.run.cameras
-        for camera in () if cameras is None else cameras.cameras:
-            if camera.name == name and camera.parent_from_camera is not None:
-                return camera
-        raise InputError(f"--camera {name}: {self.run.out} has no such camera; see its cameras.json")
-
     def _mount_of(self, camera: "CameraPlacement", child: str) -> ros.CameraMount:
         """Return the frame `child` of a camera other than the calibrated one, with its transform to its parent frame."""
-        intrinsics = camera.intrinsics
-        matrix = np.array(camera.parent_from_camera)
-        return self._named(camera.mount, child, matrix, camera.doubt, intrinsics, camera.arm)
+        matrix = camera.parent_from_camera
+        return self._mount(camera.mount, child, matrix, camera.doubt, camera.intrinsics, camera.arm)
 
-    def _named(
+    def _mount(
         self,
         on: str,
         child: str,
-        parent_from_child: Float[ndarray, "4 4"],
+        parent_from_child: Float[ndarray, "4 4"] | None,
         doubt: str | None = None,
         intrinsics: "Intrinsics | None" = None,
         arm: str | None = None,
@@ -243,7 +233,7 @@ class ExportedRun:
         return ros.CameraMount(
             parent=base if on == "base" else effector,
             child=child,
-            parent_from_child=parent_from_child,
+            parent_from_child=np.array(parent_from_child),
             base=base,
             effector=effector,
             doubt=doubt,

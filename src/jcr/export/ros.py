@@ -86,10 +86,9 @@ def on_root(
     return replace(mount, child=root, parent_from_child=mount.parent_from_child @ inverse(root_from_optical))
 
 
-def static_transform_publisher(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """Return the shell command that publishes parent_from_child (m), the pose of frame `child`, in ROS 2."""
-    arguments = _publisher_arguments(parent, child, parent_from_child)
-    return f"ros2 run tf2_ros static_transform_publisher {' '.join(arguments)}"
+def static_transform_publisher(mount: CameraMount) -> str:
+    """Return the shell command that publishes the transform of a mount in ROS 2."""
+    return f"ros2 run tf2_ros static_transform_publisher {' '.join(_publisher_arguments(mount))}"
 
 
 def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
@@ -102,7 +101,7 @@ def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
     """Return a ROS 2 launch file (XML) that publishes the transforms of the camera (`mount`) and of `others`."""
     nodes = []
     for k, one in enumerate((mount, *others)):
-        arguments = " ".join(_publisher_arguments(one.parent, one.child, one.parent_from_child))
+        arguments = " ".join(_publisher_arguments(one))
         name = "hand_eye_publisher" if k == 0 else f"{re.sub('[^A-Za-z0-9_]', '_', one.child)}_publisher"
         nodes.append(
             f"{_xml_comment(*notes(one))}\n"
@@ -114,7 +113,7 @@ def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
 def moveit_launch(mount: CameraMount) -> str:
     """Return a ROS 2 launch file (Python) in the layout that MoveIt Calibration saves."""
     kind = "EYE-TO-HAND" if mount.is_fixed else "EYE-IN-HAND"
-    arguments = _publisher_arguments(mount.parent, mount.child, mount.parent_from_child)
+    arguments = _publisher_arguments(mount)
     rows = "\n".join(
         f'                "{name}", "{value}",'
         for name, value in zip(arguments[::2], arguments[1::2], strict=True)
@@ -146,26 +145,21 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
     If there are cameras on a gripper and fixed cameras, a floating joint stands for the arm between base and gripper.
     """
     every = (mount, *others)
-    joints = [
-        f"{_xml_comment(*notes(one))}\n{_joint(one.parent, one.child, urdf_origin(one.parent_from_child))}"
-        for one in every
-    ]
-    if any(one.is_fixed for one in every):
-        arms = dict.fromkeys((one.base, one.parent) for one in every if not one.is_fixed)
-        arm = _xml_comment("stands for the arm, which moves: leave it out where the robot's own URDF has it")
-        joints += [f"{arm}\n{_joint(base, gripper)}" for base, gripper in arms]
-        links = dict.fromkeys(name for pair in arms for name in pair)
-    else:
-        links = {}
-    links |= dict.fromkeys(name for one in every for name in (one.parent, one.child))
+    fixed = [_joint(one.parent, one.child, urdf_origin(one.parent_from_child)) for one in every]
+    joints = [f"{_xml_comment(*notes(one))}\n{joint}" for one, joint in zip(every, fixed, strict=True)]
+    moving = [one for one in every if not one.is_fixed] if any(one.is_fixed for one in every) else []
+    arms = dict.fromkeys((one.base, one.parent) for one in moving)
+    arm = _xml_comment("stands for the arm, which moves: leave it out where the robot's own URDF has it")
+    joints += [f"{arm}\n{_joint(base, gripper)}" for base, gripper in arms]
+    pairs = [*arms, *((one.parent, one.child) for one in every)]
+    links = dict.fromkeys(name for pair in pairs for name in pair)
     named = "".join(f'  <link name="{name}"/>\n' for name in links)
-    snippet = _joint(mount.parent, mount.child, urdf_origin(mount.parent_from_child))
     return f"""<?xml version="1.0"?>
 <robot name="hand_eye">
 {named}{"".join(joints)}
   <!-- To add the camera to the URDF or xacro of a robot:
   <link name="{mount.child}"/>
-{snippet}  -->
+{fixed[0]}  -->
 </robot>
 """
 
@@ -245,12 +239,12 @@ def notes(mount: CameraMount) -> list[str]:
     return lines if mount.doubt is None else [*lines, f"REJECTED: {mount.doubt}"]
 
 
-def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
+def _publisher_arguments(mount: CameraMount) -> list[str]:
     """Return the arguments of static_transform_publisher: position (m), quaternion x, y, z, w, and both frames."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-    values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
+    values = [*mount.parent_from_child[:3, 3], *_quat_xyzw(mount.parent_from_child)]
     numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]
-    return [*numbers, "--frame-id", parent, "--child-frame-id", child]
+    return [*numbers, "--frame-id", mount.parent, "--child-frame-id", mount.child]
 
 
 def _quat_xyzw(a_from_b: Float[ndarray, "4 4"]) -> list[float]:

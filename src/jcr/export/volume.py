@@ -14,7 +14,6 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
 from jcr.extras import extra
-from jcr.files import write_bytes, written_whole
 from jcr.records import PointCloud
 from jcr.scene.robot import cover_with_spheres
 from jcr.scene.scene_map import FREE, OCCUPIED, SceneMap
@@ -48,7 +47,7 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
     tree.updateInnerOccupancy()
     first, rest = tree.writeBinary().split(b"\n", 1)
     comments = "".join(f"# {name}: {text}\n" for name, text in notes.items())
-    write_bytes(path, first + b"\n" + comments.encode() + rest)
+    path.write_bytes(first + b"\n" + comments.encode() + rest)
 
 
 def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
@@ -78,8 +77,8 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
 
 
 def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
-    """Write arrays and notes as .npz; an interrupted write leaves no partial file."""
-    with written_whole(path) as temporary, open(temporary, "wb") as file:
+    """Write arrays and notes as .npz."""
+    with open(path, "wb") as file:  # np.savez_compressed would append .npz to a path
         np.savez_compressed(file, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()})
 
 
@@ -110,7 +109,7 @@ def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:
     axes = {"axes": "the robot's, z up (not rotated to glTF's y up)"}
     exported = trimesh.Scene({"map": mesh}, metadata=notes | axes).export(file_type="glb")
     assert isinstance(exported, bytes)
-    write_bytes(path, exported)
+    path.write_bytes(exported)
 
 
 def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
@@ -150,25 +149,24 @@ def write_rrd(
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)
     intrinsics = views.intrinsics
-    with written_whole(path) as temporary:
-        recording = rr.RecordingStream("jcr")
-        recording.save(temporary)
-        about = "\n".join(f"{name}: {text}" for name, text in notes.items())
-        recording.log("about", rr.TextDocument(about), static=True)
-        recording.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        recording.log("base/cloud", rr.Points3D(cloud.points_in_base, colors=cloud.color), static=True)
-        surface = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colors)
-        recording.log("base/surface", surface, static=True)
-        poses = zip(views.images, views.base_from_camera, views.base_from_gripper, strict=True)
-        for image, base_from_camera, gripper in poses:
-            at = rr.Transform3D(translation=gripper[:3, 3], mat3x3=gripper[:3, :3])
-            recording.log(f"base/grippers/{image}", at, rr.TransformAxes3D(_GRIPPER_AXES_M), static=True)
-            at = rr.Transform3D(translation=base_from_camera[:3, 3], mat3x3=base_from_camera[:3, :3])
-            pinhole = rr.Pinhole(
-                image_from_camera=intrinsics.matrix,
-                resolution=[intrinsics.width, intrinsics.height],
-                camera_xyz=rr.ViewCoordinates.RDF,
-            )
-            pixels = rr.EncodedImage(path=views.folder / image)
-            recording.log(f"base/cameras/{image}", at, pinhole, pixels, static=True)
-        recording.disconnect()
+    recording = rr.RecordingStream("jcr")
+    recording.save(path)
+    about = "\n".join(f"{name}: {text}" for name, text in notes.items())
+    recording.log("about", rr.TextDocument(about), static=True)
+    recording.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    recording.log("base/cloud", rr.Points3D(cloud.points_in_base, colors=cloud.color), static=True)
+    surface = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colors)
+    recording.log("base/surface", surface, static=True)
+    poses = zip(views.images, views.base_from_camera, views.base_from_gripper, strict=True)
+    for image, base_from_camera, gripper in poses:
+        at = rr.Transform3D(translation=gripper[:3, 3], mat3x3=gripper[:3, :3])
+        recording.log(f"base/grippers/{image}", at, rr.TransformAxes3D(_GRIPPER_AXES_M), static=True)
+        at = rr.Transform3D(translation=base_from_camera[:3, 3], mat3x3=base_from_camera[:3, :3])
+        pinhole = rr.Pinhole(
+            image_from_camera=intrinsics.matrix,
+            resolution=[intrinsics.width, intrinsics.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+        )
+        pixels = rr.EncodedImage(path=views.folder / image)
+        recording.log(f"base/cameras/{image}", at, pinhole, pixels, static=True)
+    recording.disconnect()

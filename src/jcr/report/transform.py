@@ -75,7 +75,7 @@ def transform_section(hand_eye: Calibration) -> Content:
             }
             for title, names, value, note in notations
         ],
-        "ros": static_transform_publisher(parent, CHILD, x),
+        "ros": static_transform_publisher(mounted),
         "urdf": urdf_origin(x),
         "covariance": "\n".join(" ".join(f"{value:>10.2e}" for value in row) for row in hand_eye.covariance),
         "copied_covariance": json.dumps({"order": order, "covariance": hand_eye.covariance.tolist()}),
