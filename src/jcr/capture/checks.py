@@ -42,10 +42,8 @@ def checked_capture(
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
         contained(folder, name, f"{where}: frame {k}")
-    found = dict(faults or {})
-    found |= far_faults(
-        base_from_gripper[:, :3, 3], where, [f"{where}: the pose of {name}" for name in images]
-    )
+    names = [f"{where}: the pose of {name}" for name in images]
+    found = {**(faults or {}), **far_faults(base_from_gripper[:, :3, 3], where, names)}
     decoded, digests = dict[int, tuple[tuple[int, int], int]](), dict[bytes, int]()
     for k in sorted(set(range(len(images))) - found.keys()):
         try:

@@ -81,11 +81,8 @@ def read_yaml(file: Path) -> Any:
 
     text = read_text(file, MAX_YAML)
     try:
-        documents = [
-            one
-            for one in yaml.load_all(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-            if one is not None
-        ]
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        documents = [one for one in yaml.load_all(text, Loader=loader) if one is not None]
         return documents[0] if len(documents) == 1 else documents or None
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         # Invalid dates and characters, and thousands of digits or brackets, raise other errors than YAMLError.

@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -116,28 +117,25 @@ class TfTree:
                 f"{source}: no transforms join {base} (below {up[-1]}) and {gripper} (below {down[-1]})"
             )
         joint = next(frame for frame in up if frame in down)
-        edges = [[self._edge(frame, source) for frame in chain[: chain.index(joint)]] for chain in (up, down)]
+        edges = [
+            [self._poses_of(frame, source) for frame in chain[: chain.index(joint)]] for chain in (up, down)
+        ]
 
         def poses_at(stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
             gap, products = np.zeros(len(stamp_ns), np.int64), []
             for of_chain in edges:
-                poses = np.tile(np.eye(4), (len(stamp_ns), 1, 1))
-                for at, samples, is_static in of_chain:
-                    if is_static:
-                        poses = samples[at.argmax()] @ poses
-                        continue
-                    parent_from_child, edge_gap = interpolated_poses(at, samples, stamp_ns)
-                    poses, gap = parent_from_child @ poses, np.maximum(gap, edge_gap)
-                products.append(poses)
+                products.append(np.tile(np.eye(4), (len(stamp_ns), 1, 1)))
+                for parent_from_child_at in of_chain:
+                    parent_from_child, edge_gap = parent_from_child_at(stamp_ns)
+                    products[-1], gap = parent_from_child @ products[-1], np.maximum(gap, edge_gap)
             return inverse(products[0]) @ products[1], gap
 
         return poses_at
 
-    def _edge(self, child: str, source: Path) -> tuple[ndarray, ndarray, bool]:
-        """Return times (k,) in ns and samples (k,4,4) of a child's parent_from_child, and whether it is static.
+    def _poses_of(self, child: str, source: Path) -> PosesAt:
+        """Return the function from time stamps (ns) to parent_from_child of a frame and the gaps (ns) of its samples.
 
-        Samples are in the order of the messages. Raises InputError, begun with `source`, for numbers that are no
-        transform.
+        Raises InputError, begun with `source`, for numbers that are no transform.
         """
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
@@ -145,4 +143,7 @@ class TfTree:
             text = "holds a transform that is none; record again"
             raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
         poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
-        return stamps, poses, child in self._static
+        if child in self._static:
+            latest = poses[stamps.argmax()]
+            return lambda at: (np.tile(latest, (len(at), 1, 1)), np.zeros(len(at), np.int64))
+        return partial(interpolated_poses, stamps, poses)

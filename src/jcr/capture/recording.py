@@ -90,9 +90,8 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
             )
         return np.array(values)
 
-    rows, remarks = best_frames(
-        recording.base_from_gripper, recording.speed, fresh, sharpness_of, options.frames
-    )
+    poses = recording.base_from_gripper
+    rows, remarks = best_frames(poses, recording.speed, fresh, sharpness_of, options.frames)
     images, depths = list[str](), list[str | None]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         name = recording.names[row]
@@ -106,7 +105,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     known = recording.intrinsics_of_size
     if options.camera_info is not None:
         known = partial(read_camera_info, options.camera_info)
-    capture, kept = checked_capture(into, images, recording.base_from_gripper[rows], str(recording.source))
+    capture, kept = checked_capture(into, images, poses[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
     return replace(
         capture,
@@ -132,10 +131,8 @@ def best_frames(
     Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
     necessary. Raises InputError if fewer than three frames are left.
     """
-    moments = [
-        run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]]
-        for run in _runs(usable & (speed < STILL))
-    ]
+    still = _runs(usable & (speed < STILL))
+    moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]
     if len(moments) < count:  # add the slowest frame of each of about 4 · count equal pieces of the motion
         moving = _runs(usable & (speed >= STILL))
         piece = max(sum(map(len, moving)) // (4 * count), 1)

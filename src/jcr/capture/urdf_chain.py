@@ -37,9 +37,8 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
             if joint.origin is not None:
                 require_rigid(np.reshape(joint.origin, (4, 4)), f"{where}: origin")
             if not (axis.shape == (3,) and np.isfinite([*axis, *_limits(joint)]).all() and axis.any()):
-                raise InputError(
-                    f"{where}: its axis is no direction, or its limits are not finite; correct them there"
-                )
+                what = "its axis is no direction, or its limits are not finite; correct them there"
+                raise InputError(f"{where}: {what}")
             joints_to(plain, joint.child)
         return yourdfpy.URDF(plain.robot, load_meshes=False, build_collision_scene_graph=False)
     except InputError:
@@ -67,19 +66,15 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
     URDF has no such chain or several, or if a joint does not rotate.
     """
     urdf = load_urdf(where) if isinstance(where, Path) else where
-    chains = {link.name: joints_to(urdf, link.name) for link in urdf.robot.links}
+    chains = [joints_to(urdf, link.name) for link in urdf.robot.links]
     # A chain ends with its last moving joint: links that are fixed to it belong to the gripper.
-    chains = {
-        link: chain
-        for link, chain in chains.items()
-        if chain and chain[-1].type != "fixed" and sum(joint.type != "fixed" for joint in chain) == dof
-    }
+    chains = [chain for chain in chains if chain and chain[-1].type != "fixed"]
+    chains = [chain for chain in chains if sum(joint.type != "fixed" for joint in chain) == dof]
     if len(chains) != 1:
-        found = f"chains to {', '.join(chains)}" if chains else "no chain"
+        found = f"chains to {', '.join(chain[-1].child for chain in chains)}" if chains else "no chain"
         raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
-    (chain,) = chains.values()
-    frames, axes, limits = [], [], []
-    frame: Float[ndarray, "4 4"] = np.eye(4)
+    (chain,) = chains
+    frames, frame, moving = [], np.eye(4), [joint for joint in chain if joint.type != "fixed"]
     for joint in chain:
         frame = frame @ (np.eye(4) if joint.origin is None else joint.origin)
         if joint.type == "fixed":
@@ -90,13 +85,16 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
                 "are modelled for rotating joints only: leave the URDF out"
             )
         frames.append(frame)
-        axes.append(joint.axis / np.linalg.norm(joint.axis))
-        limits.append(_limits(joint))
         frame = np.eye(4)
-    both = np.array(limits, float)
-    rest = np.where((both[:, 0] <= 0) & (both[:, 1] >= 0), 0.0, both.mean(1))
-    arm: dict[str, ndarray] = {"parent_from_joint": np.stack(frames), "axes": np.array(axes, float)}
-    return Arm(name="robot of the URDF", last_from_gripper=frame, limits=both, rest=rest, **arm)
+    limits = np.array([_limits(joint) for joint in moving], float)
+    return Arm(
+        name="robot of the URDF",
+        parent_from_joint=np.stack(frames),
+        axes=np.array([joint.axis / np.linalg.norm(joint.axis) for joint in moving], float),
+        last_from_gripper=frame,
+        limits=limits,
+        rest=np.where((limits[:, 0] <= 0) & (limits[:, 1] >= 0), 0.0, limits.mean(1)),
+    )
 
 
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:

@@ -142,13 +142,11 @@ def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     seen = None if found.expected is None else found.expected.seen
-    sharpness = found.sharpness.tolist() or [None] * len(capture)
+    images = zip(capture.images, found.sharpness.tolist() or [None] * len(capture), strict=True)
     observed = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
-        "images": [
-            {"image": name, "sharpness": own} for name, own in zip(capture.images, sharpness, strict=True)
-        ],
+        "images": [{"image": name, "sharpness": own} for name, own in images],
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
         "observability": {name: getattr(found.observability, name) for name in observed},
@@ -337,14 +335,10 @@ class TouchCommand:
             remedy = "check the tip's calibration (a constant error), then calibrate again (jcr run)"
             lines += labelled("Remedy", remedy)
         lines += labelled("Mean", f"{numbers(mean, 2, '+')} mm")
-        points = [
-            {"image": image, "error_mm": error, "std_mm": std}
-            for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True)
-        ]
-        lines += [
-            f"{one['image']}: {numbers(one['error_mm'], 2, '+')} mm (± {numbers(one['std_mm'], 2)})"
-            for one in points
-        ]
+        points = []
+        for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True):
+            points.append({"image": image, "error_mm": error, "std_mm": std})
+            lines.append(f"{image}: {numbers(error, 2, '+')} mm (± {numbers(std, 2)})")
         facts = {"rms_mm": rms, "expected_mm": expected, "p": found.p_value, "mean_mm": mean}
         self.output.result(lines, facts | {"points": points})
         return 3 if is_larger else 0

@@ -49,9 +49,8 @@ class BoardCommand:
             raise InputError(f"jcr board {self.out}: writes a PDF; name a file that ends in .pdf")
         write_bytes(self.out, as_pdf(*board_sheet(self.board, self.paper)))
         use = f"print at 100 % on {self.paper}, measure the rulers, then calibrate with --board {self.board}"
-        self.output.result(
-            [f"{self.out}: {use}"], {"file": str(self.out), "board": self.board, "paper": self.paper}
-        )
+        facts = {"file": str(self.out), "board": self.board, "paper": self.paper}
+        self.output.result([f"{self.out}: {use}"], facts)
         return 0
 
 

@@ -144,10 +144,9 @@ class BatchCommand:
             rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
         summary, lines = out / "summary.html", list[str]()
         for rank, row in enumerate(rows, start=1):
-            std = (
-                "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
-            )
-            used = f"{row.used:3d}/{row.images:<3d}"
+            std, used = "", f"{row.used:3d}/{row.images:<3d}"
+            if row.offset_std_mm is not None:
+                std = f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
             line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
             lines.append(line.rstrip())
         self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})

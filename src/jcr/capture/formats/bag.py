@@ -204,14 +204,10 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
     """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
     # A topic /compressed repeats the images of its raw topic.
-    colour = [
-        topic
-        for topic in topics
-        if "depth" not in topic.lower() and topic.removesuffix("/compressed") not in {*topics} - {topic}
-    ]
-    return chosen_name(
-        topics, options.camera_topic, colour, f"{path}: the wrist camera's topic", "--camera-topic"
-    )
+    repeats = {f"{topic}/compressed" for topic in topics}
+    colour = [topic for topic in topics if "depth" not in topic.lower() and topic not in repeats]
+    what = f"{path}: the wrist camera's topic"
+    return chosen_name(topics, options.camera_topic, colour, what, "--camera-topic")
 
 
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:

@@ -88,9 +88,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
-    camera = chosen_name(
-        cameras, options.camera_topic, cameras, f"{path}: the wrist camera", "--camera-topic"
-    )
+    what = f"{path}: the wrist camera"
+    camera = chosen_name(cameras, options.camera_topic, cameras, what, "--camera-topic")
     states = [key for key, feature in features.items() if feature.dtype.startswith("float")]
     usual = [key for key in ((STATE,) if options.urdf else (CARTESIAN, STATE)) if key in states][:1]
     key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
@@ -204,9 +203,8 @@ def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: fl
         for row, number in zip(mine.tolist(), numbers, strict=True):
             file = images[number].get("bytes") if isinstance(images[number], dict) else None
             if not file:
-                raise InputError(
-                    f"{episode.table}: holds no {key} of frame {number}; write the data set with embedded images"
-                )
+                what = f"holds no {key} of frame {number}; write the data set with embedded images"
+                raise InputError(f"{episode.table}: {what}")
             yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
 
 

@@ -103,10 +103,8 @@ def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
     names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}
-        seconds, nanoseconds = (
-            parts.get("sec", parts.get("secs")),
-            parts.get("nanosec", parts.get("nsecs", 0)),
-        )
+        seconds = parts.get("sec", parts.get("secs"))
+        nanoseconds = parts.get("nanosec", parts.get("nsecs", 0))
         if type(seconds) is int and type(nanoseconds) is int:
             yield "timestamp", seconds * 10**9 + nanoseconds
         elif set("xyzw") <= parts.keys():

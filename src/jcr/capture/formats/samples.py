@@ -30,20 +30,17 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
     keys = pair_keys(content)
     if keys is None:
         raise InputError(f"{path}: no samples of MoveIt Calibration or easy_handeye2; name such a file")
-    parameters = (
-        content.get("parameters") if isinstance(content, dict) else {"calibration_type": "eye_in_hand"}
-    )
-    kind = parameters.get("calibration_type") if isinstance(parameters, dict) else None
+    kind = "eye_in_hand"  # MoveIt Calibration writes a list, without parameters
+    if isinstance(content, dict):
+        parameters = content.get("parameters")
+        kind = parameters.get("calibration_type") if isinstance(parameters, dict) else None
     if kind == "eye_on_base":
         raise InputError(
             f"{path}: calibration_type eye_on_base, a camera beside the robot; jcr calibrates cameras on the gripper"
         )
     notes = () if kind == "eye_in_hand" else ("calibration_type is not given; taken as eye_in_hand",)
-    gripper, marker = (
-        pose_table(*read_rows(content, where, key), options, where)
-        for key in keys
-        for where in [f"{path}: {key}"]
-    )
+    tables = ((read_rows(content, f"{path}: {key}", key), f"{path}: {key}") for key in keys)
+    gripper, marker = (pose_table(*rows, options, where) for rows, where in tables)
     faults = {**marker.faults, **gripper.faults}
     sound = [row for row in range(len(gripper.base_from_gripper)) if row not in faults]
     require_frames(len(sound), str(path))

@@ -186,11 +186,12 @@ def _named_columns(
             convention = _EXPLICIT.get(cell, convention)
         if convention == "auto":
             convention = _convention_of(names, where)
-        usual = CONVENTIONS[convention].units()
-        length = next((unit for unit in METRES if unit in stated), usual[0])
-        angle = next((unit for unit in ("deg", "rad") if unit in stated), usual[1])
-        units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
-        units = units if options.pose_units == "auto" and {*stated} - {"", "s", "ns"} else options.pose_units
+        units = options.pose_units
+        if units == "auto" and {*stated} - {"", "s", "ns"}:
+            length, angle = CONVENTIONS[convention].units()
+            length = next((unit for unit in METRES if unit in stated), length)
+            angle = next((unit for unit in ("deg", "rad") if unit in stated), angle)
+            units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
         return dict(zip(names, columns, strict=True)), units, convention
     named = dict[str, tuple[Any, ...]]()
     if number_of(columns[0][0]) is None:
