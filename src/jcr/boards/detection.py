@@ -78,7 +78,10 @@ def boards(spec: str) -> list[Board]:
     try:
         match kind, parts:
             case "charuco", [count, side, marker, tags]:
-                detectors = _charuco(spec, _count(count), _length(side), _length(marker), _tags(tags))
+                size, lengths, detectors = _count(count), (_length(side), _length(marker)), {}
+                for (across, down), legacy in product((size, size[::-1]), (False, True)):
+                    name = spec.replace(count, f"{across}x{down}") + " printed as before OpenCV 4.6" * legacy
+                    detectors[name] = _charuco((across, down), *lengths, _tags(tags), legacy)
             case "chessboard", [count, side]:
                 detectors = {spec: _chessboard(_count(count), _length(side))}
             case "circles", [count, side]:
@@ -125,26 +128,17 @@ def _tags(name: str) -> cv2.aruco.Dictionary:
 
 
 def _charuco(
-    spec: str, count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary
-) -> dict[str, Detector]:
-    """Return by name the detectors of a ChArUco board in both layouts, and with columns and rows swapped.
+    count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary, legacy: bool
+) -> Detector:
+    """Return the detector of the inner corners of a ChArUco board; its pixels have whole numbers at pixel centres.
 
-    `spec` is the board's name, `count` its squares (columns, rows); `square` and `marker` are side lengths (m). Raises
-    ValueError for a marker that is not smaller than the square.
+    `count` are the board's squares (columns, rows); `square` and `marker` are side lengths (m). `legacy` is the layout
+    of OpenCV before 4.6. Raises ValueError for a marker that is not smaller than the square.
     """
     if marker >= square:
         raise ValueError(f"a marker of {marker} m does not fit into a square of {square} m")
-    detectors = {}
-    for size, legacy in product((count, count[::-1]), (False, True)):
-        board = cv2.aruco.CharucoBoard(size, square, marker, tags)
-        board.setLegacyPattern(legacy)
-        name = spec.replace(f"{count[0]}x{count[1]}", f"{size[0]}x{size[1]}")
-        detectors[name + " printed as before OpenCV 4.6" * legacy] = _charuco_detector(board)
-    return detectors
-
-
-def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Detector:
-    """Return the detector of the inner corners of a ChArUco board; its pixels have whole numbers at pixel centres."""
+    board = cv2.aruco.CharucoBoard(count, square, marker, tags)
+    board.setLegacyPattern(legacy)
     detector = cv2.aruco.CharucoDetector(board)
     corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()
 

@@ -259,44 +259,39 @@ class VerifyCommand:
             capture = read_capture(self.capture, self.read, into=scratch, progress=progress, at_least=1)
             found = verify_run(self.out, capture, self.verify, progress)
         cameras = (found, *found.others)
-        lines = [line for one in cameras for line in _drift_lines(one, self.output.verbose)]
-        facts = _drift_facts(found) | {"cameras": {one.fixed: _drift_facts(one) for one in found.others}}
-        self.output.result(lines, facts)
+        drifts = [_drift(one, self.output.verbose) for one in cameras]
+        (_, facts), *others = drifts
+        others = {one.fixed: other for one, (_, other) in zip(found.others, others, strict=True)}
+        self.output.result([line for lines, _ in drifts for line in lines], facts | {"cameras": others})
         return 3 if any(one.moved for one in cameras) else 0
 
 
-def _drift_lines(found: "Verification", verbose: bool) -> list[str]:
-    """Return the lines of `jcr verify` on one camera: verdict, remedy, motion with its standard deviation, warnings."""
+def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, Any]]:
+    """Return the result of `jcr verify` for one camera: the lines to print, and the content of --json.
+
+    The lines are verdict, remedy, motion with its standard deviation, images and warnings.
+    """
+    mm, mm_std = (1e3 * part[:3] for part in (found.offset, found.std))
+    deg, deg_std = (np.degrees(part[3:]) for part in (found.offset, found.std))
+    seen_mm, seen_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
     drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
-    mm, mm_std = (numbers(1e3 * part[:3], 2) for part in (found.offset, found.std))
-    deg, deg_std = (numbers(np.degrees(part[3:]), 3) for part in (found.offset, found.std))
-    parent = "gripper" if found.fixed is None else "base"
-    noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
+    moved = f"{numbers(mm, 2)} ± {numbers(mm_std, 2)} mm, {numbers(deg, 3)} ± {numbers(deg_std, 3)}°"
     verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
     if warnings and not found.moved:
         verdict += f" with {warnings} warning{'s' * (warnings > 1)}"
-    return [
+    noticed = f"9 of 10 drifts of {seen_mm:.1f} mm or {seen_deg:.2f}° are noticed"
+    lines = [
         f"{verdict}: {found.finding}, {drift}",
         *(labelled("Remedy", found.advice) if found.moved else ()),
-        *labelled("Drift", f"{mm} ± {mm_std} mm, {deg} ± {deg_std}° (1σ, {parent} axes)"),
-        *labelled("Images", f"{len(found.images)}, {found.how}; 9 of 10 drifts of {noticed} are noticed"),
+        *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
+        *labelled("Images", f"{len(found.images)}, {found.how}; {noticed}"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
-
-
-def _drift_facts(found: "Verification") -> dict[str, object]:
-    """Return the result of `jcr verify` for one camera as the content of --json."""
     same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes", "how")}
-    return same | {
-        "cause": found.cause if found.moved else None,
-        "drift_mm": 1e3 * found.offset[:3],
-        "drift_deg": np.degrees(found.offset[3:]),
-        "drift_std_mm": 1e3 * found.std[:3],
-        "drift_std_deg": np.degrees(found.std[3:]),
-        "detectable_mm": 1e3 * found.detectable[0],
-        "detectable_deg": float(np.degrees(found.detectable[1])),
-    }
+    cause = {"cause": found.cause if found.moved else None}
+    drifts = {"drift_mm": mm, "drift_deg": deg, "drift_std_mm": mm_std, "drift_std_deg": deg_std}
+    return lines, same | cause | drifts | {"detectable_mm": seen_mm, "detectable_deg": seen_deg}
 
 
 @dataclass(frozen=True)

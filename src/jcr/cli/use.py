@@ -5,7 +5,7 @@ import sys
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import tyro
@@ -21,9 +21,6 @@ from jcr.files import write_bytes, write_text
 from jcr.progress import progress_bars
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
-
-if TYPE_CHECKING:
-    from jcr.segments.measure import Measurement
 
 _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
 _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
@@ -228,39 +225,28 @@ class MeasureCommand:
         from jcr.pipeline.run import measure
         from jcr.result import load_run
 
-        measured = measure(self.out)
+        measured, lines = measure(self.out), list[str]()
+        support, objects = measured.support, measured.objects
+        x, y, z = support.base_from_support[:3, 2]
+        lines.append(
+            f"support plane through z = {support.base_from_support[2, 3]:.4f} m, normal {x:.4f} {y:.4f} {z:.4f}, "
+            f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
+        )
+        width = max([6, *(len(size.name) for size in objects)])
+        columns = f"{'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m), ± 1 σ"
+        lines.append(f"{'object':<{width}}  {columns}" if objects else "nothing stands on it")
+        for size in objects:
+            sides = zip(1e3 * size.box_size, 1e3 * size.box_std, strict=True)
+            length, across, height = (f"{value:.1f} ± {std:.1f}" for value, std in sides)
+            height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
+            x, y = size.base_from_box[:2, 3]
+            lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
         # Metres, base frame, one sigma; `on_plane` is left out because it has a value for each point of the cloud.
-        support = {name: value for name, value in vars(measured.support).items() if name != "on_plane"}
-        facts = {"support": support, "objects": [vars(size) for size in measured.objects]}
-        self.output.result(sizes_lines(measured), facts)
+        plane = {name: value for name, value in vars(support).items() if name != "on_plane"}
+        self.output.result(lines, {"support": plane, "objects": [vars(size) for size in objects]})
         if (doubt := load_run(self.out).doubt) is not None:
             raise RejectedError(f"sizes rejected: {doubt}")
         return 0
-
-
-def sizes_lines(measured: "Measurement") -> list[str]:
-    """Return the lines of a measurement: one for the support plane, and one for each object.
-
-    An object has height, length and width in mm with standard deviations, and its centre x, y (m, base frame).
-    """
-    support = measured.support
-    x, y, z = support.base_from_support[:3, 2]
-    lines = [
-        f"support plane through z = {support.base_from_support[2, 3]:.4f} m, normal {x:.4f} {y:.4f} {z:.4f}, "
-        f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
-    ]
-    if not measured.objects:
-        return [*lines, "nothing stands on it"]
-    width = max(6, *(len(size.name) for size in measured.objects))
-    columns = f"{'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m), ± 1 σ"
-    lines.append(f"{'object':<{width}}  {columns}")
-    for size in measured.objects:
-        sides = zip(1e3 * size.box_size, 1e3 * size.box_std, strict=True)
-        length, across, height = (f"{value:.1f} ± {std:.1f}" for value, std in sides)
-        height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
-        x, y = size.base_from_box[:2, 3]
-        lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
-    return lines
 
 
 @dataclass(frozen=True, kw_only=True)
