@@ -55,11 +55,8 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     notes += intrinsics_notes
     if (fold_px := fold_distance_px(intrinsics)) is not None:
         centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
-
-        def within(s: Sighting) -> bool:
-            return bool(np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px)
-
-        seen = [list(filter(within, sightings)) for sightings in seen]
+        for sightings in seen:
+            sightings[:] = [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
     poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)

@@ -93,8 +93,9 @@ def static_transform_publisher(mount: CameraMount) -> str:
 
 def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
     """Return parent_from_child as the XML element `origin` of a URDF joint: xyz (m), rpy (rad, about fixed axes)."""
-    xyz, rpy = parent_from_child[:3, 3], roll_pitch_yaw(parent_from_child[:3, :3])
-    return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
+    parts = parent_from_child[:3, 3], roll_pitch_yaw(parent_from_child[:3, :3])
+    xyz, rpy = (" ".join(f"{value:.12f}" for value in part) for part in parts)
+    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
 
 
 def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
@@ -114,10 +115,8 @@ def moveit_launch(mount: CameraMount) -> str:
     """Return a ROS 2 launch file (Python) in the layout that MoveIt Calibration saves."""
     kind = "EYE-TO-HAND" if mount.is_fixed else "EYE-IN-HAND"
     arguments = _publisher_arguments(mount)
-    rows = "\n".join(
-        f'                "{name}", "{value}",'
-        for name, value in zip(arguments[::2], arguments[1::2], strict=True)
-    )
+    pairs = zip(arguments[::2], arguments[1::2], strict=True)
+    rows = "\n".join(f'                "{name}", "{value}",' for name, value in pairs)
     return f'''{_comments(mount)}
 """{kind}: {mount.parent} -> {mount.child}"""
 from launch import LaunchDescription
@@ -243,18 +242,13 @@ def _publisher_arguments(mount: CameraMount) -> list[str]:
     """Return the arguments of static_transform_publisher: position (m), quaternion x, y, z, w, and both frames."""
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     values = [*mount.parent_from_child[:3, 3], *_quat_xyzw(mount.parent_from_child)]
-    numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]
+    numbers = [word for name, value in zip(names, values, strict=True) for word in (name, f"{value:.12f}")]
     return [*numbers, "--frame-id", mount.parent, "--child-frame-id", mount.child]
 
 
 def _quat_xyzw(a_from_b: Float[ndarray, "4 4"]) -> list[float]:
     """Return the rotation of a transform as quaternion x, y, z, w with w >= 0."""
     return Rotation.from_matrix(a_from_b[:3, :3]).as_quat(canonical=True).tolist()
-
-
-def _number(value: float) -> str:
-    """Return a number as text with twelve decimals and no exponent."""
-    return f"{value:.12f}"
 
 
 def _comments(mount: CameraMount, *more: str) -> str:
