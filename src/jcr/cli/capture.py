@@ -144,16 +144,16 @@ def _conclude(
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
     is_accepted, is_met = False, False
+    facts |= {"result": None, "verdict": None}
     if result is not None:
         required, is_accepted = result.calibration.requirement, result.converged
         is_met = is_accepted and required is not None and required.met and requirement_met
         lines = summary(result.calibration).splitlines()
+        facts |= {"result": str(result.out), "verdict": result.verdict}
     command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_accepted else f"jcr check {out}"
     if images < LEAST_IMAGES:
         command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
     lines += [*labelled("Capture", f"{images} images in {out}"), *labelled("Next", command)]
-    facts |= {"result": None if result is None else str(result.out)}
-    facts |= {"verdict": None if result is None else result.verdict}
     arguments.output.result(lines, facts)
     if arguments.session.until_accurate:
         return 0 if is_met else 3

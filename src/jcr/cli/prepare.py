@@ -87,11 +87,9 @@ def pages() -> dict[str, Path]:
         with suppress(PackageNotFoundError):  # when run from source files, without installation
             installed = [Path(str(file.locate())) for file in files(DISTRIBUTION) or []]
             found = [one for one in installed if one.suffix == ".md" and f"doc/{DISTRIBUTION}/" in str(one)]
-    sections = {name: number for number, name in enumerate(SECTIONS)}
-    named = [file for file in found if file.parent.name in sections and file.stem not in ("index", "README")]
-    named.sort(key=lambda file: (sections[file.parent.name], file))
-    results = "results"
-    return {f"{results}/{file.stem}" if file.parent.name == results else file.stem: file for file in named}
+    named = [file for file in found if file.parent.name in SECTIONS and file.stem not in ("index", "README")]
+    named.sort(key=lambda file: (SECTIONS.index(file.parent.name), file))
+    return {"results/" * (file.parent.name == "results") + file.stem: file for file in named}
 
 
 def page(name: str) -> str:
