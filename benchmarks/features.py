@@ -70,7 +70,7 @@ def _match_all(
     matcher: Matcher, gripper: Float[ndarray, "n 4 4"], working: Intrinsics, *_: object
 ) -> MatchedPairs:
     """Match without gripper poses: all pairs, none judged, as if the gripper moved between all images."""
-    pairs = list(combinations(range(len(matcher.x_px)), 2))
+    pairs = list(combinations(range(len(matcher.features.x_px)), 2))
     moving = np.zeros((len(gripper), len(gripper)), bool)
     geometries = matcher.geometries(pairs, np.zeros((len(pairs), 2)), moving)
     return MatchedPairs(geometries=geometries, intrinsics=working)

@@ -68,7 +68,7 @@ def test_a_rotated_image_is_matched_when_it_is_rotated_back(roll: float, tableto
     image = cv2.resize(read_image(sorted((tabletop / "images").iterdir())[0]), (320, 240))
     rotation = cv2.getRotationMatrix2D((159.5, 119.5), math.degrees(roll), 1.0)  # against y down, by -roll
     rotated = cv2.warpAffine(image, rotation, (320, 240))
-    features = LearnedFeatures([image, rotated])
+    features = LearnedFeatures([image, rotated], (320, 240))
     rows = features.matches([(0, 1)], np.array([[0.0, roll]]))[0]
     x, y = features.x_px[0][rows[:, 0]], features.x_px[1][rows[:, 1]]
     error = np.linalg.norm(x @ rotation[:, :2].T + rotation[:, 2] - y, axis=1)

@@ -86,7 +86,7 @@ class PointsOfATable:
 
 def matcher_of_points(features: PointsOfATable) -> Matcher:
     """Return the matcher of these features."""
-    return Matcher(features, np.ones(2), colmap_camera(INTRINSICS, True), True, 0)
+    return Matcher(features, colmap_camera(INTRINSICS, True), True, 0)
 
 
 def matched_pairs_of(features: PointsOfATable, base_from_gripper: Transforms) -> MatchedPairs:

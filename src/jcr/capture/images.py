@@ -37,6 +37,7 @@ USUAL_GREY = 2.0
 """Smallest contrast (grey levels) by which details are normalised; noise of 4 levels has 0.6 after the filter."""
 DEPTH = "depth"
 """Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
+JPEG_QUALITY = 80
 DARK, BRIGHT = 12, 243
 """Mean grey levels (0 to 255) below and above which an image is too dark or too bright to be used."""
 
@@ -182,6 +183,12 @@ def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> b
     """Encode grey (h,w) or RGB (h,w,3) pixels as PNG, without loss."""
     bgr = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
     return cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def encode_jpeg(pixels: UInt8[ndarray, "h w 3"]) -> bytes:
+    """Return an RGB image encoded as a JPEG of quality JPEG_QUALITY, for pages."""
+    bgr = np.ascontiguousarray(pixels[..., ::-1])
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:

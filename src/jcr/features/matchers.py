@@ -42,7 +42,7 @@ class Features(Protocol):
     """Interface of one kind of features: keypoints and descriptors of a capture's images, and their matching."""
 
     x_px: list[Float[ndarray, "_ 2"]]
-    """Keypoints of every image found so far, px; pixel centres are whole numbers."""
+    """Keypoints of every image found so far, in pixels of the size of matching; pixel centres are whole numbers."""
     descriptors: list[Float32[ndarray, "_ d"]]
     """Descriptors of these keypoints, of unit length."""
     farthest: float
@@ -64,16 +64,12 @@ class Features(Protocol):
 class Matcher:
     """Verified matches between a capture's images, all of one camera; results are cached."""
 
-    def __init__(
-        self, features: Features, scale: Float[ndarray, "2"], camera: pycolmap.Camera, known: bool, seed: int
-    ) -> None:
+    def __init__(self, features: Features, camera: pycolmap.Camera, known: bool, seed: int) -> None:
         """Create a matcher without matches; `camera` is COLMAP's camera of the images at the size of matching.
 
-        `scale` is this size over the size of the images that have the features, for x and y. `known` is true if the
-        intrinsics of `camera` are given; `seed` is that of RANSAC.
+        `known` is true if the intrinsics of `camera` are given; `seed` is that of RANSAC.
         """
-        self.features, self._scale = features, scale
-        self._camera, self.known, self.seed = camera, known, seed
+        self.features, self._camera, self.known, self.seed = features, camera, known, seed
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
         """All matches of the pairs that were matched last, correct or wrong."""
         self.still: Bool[ndarray, "r c"] | None = None
@@ -82,11 +78,6 @@ class Matcher:
         """Verified geometries by pair and matches; None where the verification failed."""
         self._pairs: dict[tuple[Key, int, Intrinsics], Pair] = {}
         """Pairs by key, identity of the geometry, and intrinsics; the pair keeps the identity of its geometry unique."""
-
-    @property
-    def x_px(self) -> list[Float[ndarray, "_ 2"]]:
-        """Keypoints of every image in pixels of the size of matching; XFeat adds some for every image rotation."""
-        return [(x + 0.5) * self._scale - 0.5 for x in self.features.x_px]
 
     def geometries(
         self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], repeats: Bool[ndarray, "n n"]
@@ -99,20 +90,18 @@ class Matcher:
         new = [k for k, key in enumerate(pairs) if self.features.needs_upright or key not in self.raw]
         some = [pairs[k] for k in new]
         self.raw |= dict(zip(some, self.features.matches(some, rolls[new]), strict=True))
-        x_px = self.x_px
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = pool.map(lambda key: self.verified(key, self.raw[key], x_px, not repeats[key]), pairs)
+            found = pool.map(lambda key: self.verified(key, self.raw[key], not repeats[key]), pairs)
             return {key: geometry for key, geometry in zip(pairs, found, strict=True) if geometry is not None}
 
-    def verified(
-        self, key: Key, rows: Int[ndarray, "m 2"], x_px: Sequence[Float[ndarray, "_ 2"]], moved: bool
-    ) -> pycolmap.TwoViewGeometry | None:
+    def verified(self, key: Key, rows: Int[ndarray, "m 2"], moved: bool) -> pycolmap.TwoViewGeometry | None:
         """Return the two-view geometry of the matches of image pair `key`; None with fewer than MIN_INLIERS inliers.
 
-        `rows` has a match in each row: the rows of its keypoints in the first and in the second image. `x_px` are the
-        keypoints of each image (`Matcher.x_px`). If the gripper `moved`, matches that keep their pixel are discarded.
-        Matches in the cells of `self.still` are always discarded. The result is cached.
+        `rows` has a match in each row: the rows of its keypoints in the first and in the second image. If the gripper
+        `moved`, matches that keep their pixel are discarded. Matches in the cells of `self.still` are always discarded.
+        The result is cached.
         """
+        x_px = self.features.x_px
         if moved:
             x_i, x_j = (x_px[image][own] for image, own in zip(key, rows.T, strict=True))
             rows = rows[np.linalg.norm(x_i - x_j, axis=1) > STATIONARY_PX]
@@ -129,25 +118,19 @@ class Matcher:
             )
             for of in (inliers, rows)
         )
-        return found if shown.all() else self.verified(key, rows[usable], x_px, moved)
+        return found if shown.all() else self.verified(key, rows[usable], moved)
 
-    def pair(
-        self,
-        x_px: Sequence[Float[ndarray, "_ 2"]],
-        intrinsics: Intrinsics,
-        key: Key,
-        geometry: pycolmap.TwoViewGeometry,
-    ) -> Pair:
+    def pair(self, intrinsics: Intrinsics, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
 
-        `x_px` are the keypoints of each image (`Matcher.x_px`), `intrinsics` those at the size of matching, and
-        `geometry` is the result of `verified`.
+        `intrinsics` are those at the size of matching, and `geometry` is the result of `verified`.
         """
         depends = key, id(geometry), intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
             ray_i, ray_j = (
-                unproject(intrinsics, x_px[row][own])[:, :2] for row, own in zip(key, rows.T, strict=True)
+                unproject(intrinsics, self.features.x_px[row][own])[:, :2]
+                for row, own in zip(key, rows.T, strict=True)
             )
             found = camera_motions(ray_i, ray_j, intrinsics.fx, *matrices(geometry, intrinsics))
             self._pairs[depends] = Pair(key, rows, tuple(found), geometry)

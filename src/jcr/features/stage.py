@@ -82,10 +82,8 @@ class _Search:
     matcher: Matcher
     motion: Float[ndarray, "n n 4 4"]
     """Gripper's motions i_from_j."""
-    x_px: Sequence[Float[ndarray, "_ 2"]]
-    """Keypoints of every image at the size of matching (`Matcher.x_px`)."""
     intrinsics: Intrinsics
-    """Intrinsics at this size, given or estimated."""
+    """Intrinsics at the size of matching, given or estimated."""
     repeats: Bool[ndarray, "n n"]
     """True for pairs of images between which the gripper did not move."""
     pairs: dict[Key, Pair] = field(default_factory=dict)
@@ -119,10 +117,8 @@ class _Search:
         if not todo:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), self.repeats)
-        if self.matcher.features.needs_upright:  # rotated images have added keypoints
-            self.x_px = self.matcher.x_px
         for key, geometry in found.items():
-            if self._is_better(pair := self.matcher.pair(self.x_px, self.intrinsics, key, geometry)):
+            if self._is_better(pair := self.matcher.pair(self.intrinsics, key, geometry)):
                 self.pairs[key] = pair
 
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
@@ -156,17 +152,17 @@ class _Search:
         """
         moving = [key for key in self.matcher.raw if not self.repeats[key]]
         size = self.intrinsics.width, self.intrinsics.height
-        still = still_cells(self.x_px, self.matcher.raw, size, moving)
+        still = still_cells(self.matcher.features.x_px, self.matcher.raw, size, moving)
         if not still.any():
             return
         self.matcher.still = still
         for key in list(self.pairs):
             rows, moved = self.matcher.raw[key], not self.repeats[key]
-            geometry = self.matcher.verified(key, rows, self.x_px, moved)
+            geometry = self.matcher.verified(key, rows, moved)
             if geometry is None:
                 del self.pairs[key]
             else:
-                self.pairs[key] = self.matcher.pair(self.x_px, self.intrinsics, key, geometry)
+                self.pairs[key] = self.matcher.pair(self.intrinsics, key, geometry)
 
     def _is_better(self, new: Pair) -> bool:
         """Test whether the new geometry of a pair replaces the one in `pairs`.
@@ -186,7 +182,7 @@ class _Search:
         if not self.matcher.known and (intrinsics := self._intrinsics_by_robot()) is not None:
             self.intrinsics = intrinsics
             for key, pair in self.pairs.items():
-                self.pairs[key] = self.matcher.pair(self.x_px, intrinsics, key, pair.geometry)
+                self.pairs[key] = self.matcher.pair(intrinsics, key, pair.geometry)
         return self.classify()
 
     def _intrinsics_by_robot(self) -> Intrinsics | None:
@@ -196,7 +192,7 @@ class _Search:
         (LEAST_SUPPORT).
         """
         size = self.intrinsics.width, self.intrinsics.height
-        angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
+        x_px, angle = self.matcher.features.x_px, np.asarray(rotation_angle(self.motion[..., :3, :3]))
         rotated = [pair for pair in self.pairs.values() if angle[pair.key] > math.radians(8)]
         best, support = None, LEAST_SUPPORT
         for focal in FOCALS.tolist():
@@ -204,7 +200,7 @@ class _Search:
             for pair in rotated:
                 essential, homography = matrices(pair.geometry, intrinsics)
                 some = zip(pair.key, pair.rows[:FOCAL_MATCHES].T, strict=True)
-                ray_i, ray_j = (unproject(intrinsics, self.x_px[row][own])[:, :2] for row, own in some)
+                ray_i, ray_j = (unproject(intrinsics, x_px[row][own])[:, :2] for row, own in some)
                 found = starting_motions(ray_i, ray_j, essential if homography is None else None, homography)
                 if found:
                     of_camera = rotation_angle(np.stack([rotation for rotation, _ in found]))
@@ -233,9 +229,7 @@ def match_with_robot(
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     matcher.still = None
-    search = _Search(
-        matcher=matcher, motion=motion, x_px=matcher.x_px, intrinsics=intrinsics, repeats=repeats(motion)
-    )
+    search = _Search(matcher=matcher, motion=motion, intrinsics=intrinsics, repeats=repeats(motion))
     everything = (
         list(combinations(range(n), 2)) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
     )
@@ -259,7 +253,7 @@ def match_with_robot(
         kept, notes, warnings = search.pairs, (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
-        some = pairs_of_common_scene(search.x_px, search.intrinsics, found, motion)
+        some = pairs_of_common_scene(features.x_px, search.intrinsics, found, motion)
         found = search.match_upright(some or everything, upright, found)
         report("matching", 0.8)
         rows = [row for pair in found.confirmed for row in pair.key]

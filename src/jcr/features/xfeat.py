@@ -168,14 +168,19 @@ class LearnedFeatures:
     every_pair = 12
     farthest = FARTHEST
 
-    def __init__(self, images: Sequence[UInt8[ndarray, "h w 3"]], report: Progress = silent) -> None:
-        """Load the networks for these images (RGB); keypoints are found when pairs are matched."""
-        self._images, self._report = list(images), report
+    def __init__(
+        self, images: Sequence[UInt8[ndarray, "h w 3"]], size: tuple[int, int], report: Progress = silent
+    ) -> None:
+        """Load the networks for these images (RGB); keypoints are found when pairs are matched.
+
+        `size` is the width and height of the images in whose pixels `x_px` are given.
+        """
+        self._images, self._size, self._report = list(images), size, report
         self._network, self._matcher = networks()
         self._sets: dict[tuple[int, int], _Keypoints] = {}
         """Keypoints by row of the image and angle (degrees) of its rotation."""
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
-        """Keypoints of every image at all angles, px; pixel centres are whole numbers."""
+        """Keypoints of every image at all angles, in pixels of images of `size`; pixel centres are whole numbers."""
         self.descriptors: list[Float32[ndarray, "_ d"]] = [np.zeros((0, LENGTH), np.float32) for _ in images]
         """Descriptors of these keypoints, of unit length."""
 
@@ -198,11 +203,11 @@ class LearnedFeatures:
 
         with ThreadPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
             new = [one for one in dict.fromkeys(sum(rotated, [])) if one not in self._sets]
-            for (row, degrees), (x_px, descriptor, size, given_px) in zip(
+            for (row, degrees), (x_px, descriptor, size, matching_px) in zip(
                 new, pool.map(self._detected, new), strict=True
             ):
                 self._sets[row, degrees] = _Keypoints(len(self.x_px[row]), x_px, descriptor, size)
-                self.x_px[row] = np.concatenate([self.x_px[row], given_px])
+                self.x_px[row] = np.concatenate([self.x_px[row], matching_px])
                 self.descriptors[row] = np.concatenate([self.descriptors[row], descriptor.numpy()])
             found = pool.map(of_pair, rotated)
             return [rows for _, rows in zip(steps(self._report, "matching", pairs), found, strict=True)]
@@ -212,8 +217,8 @@ class LearnedFeatures:
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k d"], tuple[int, int], Float[ndarray, "k 2"]]:
         """Find keypoints in an image rotated by an angle, `key` = (row, degrees), clockwise on the screen.
 
-        Returns keypoints and descriptors in the rotated image, its size (width, height), and the keypoints in the
-        original image. The long side is first reduced to LONG_SIDE_PX.
+        Returns keypoints and descriptors in the rotated image, its size (width, height), and the keypoints in pixels of
+        an image of `size`. The long side is first reduced to LONG_SIDE_PX.
         """
         image, roll = self._images[key[0]], math.radians(key[1])
         height, width = image.shape[:2]
@@ -235,8 +240,9 @@ class LearnedFeatures:
         x_px, descriptor = detect(self._network, pixels)
         given = x_px.double().numpy() @ given_from_rotated[:, :2].T + given_from_rotated[:, 2]
         inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in the replicated border
-        kept = torch.from_numpy(inside)
-        return x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]), given[inside]
+        kept, matching_from_given = torch.from_numpy(inside), np.array(self._size) / [width, height]
+        matching = (given[inside] + 0.5) * matching_from_given - 0.5
+        return x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]), matching
 
 
 def _one_thread() -> None:

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import GRASPING
 from jcr.calibration.words import leave_one_out_text
-from jcr.capture.images import read_image
+from jcr.capture.images import encode_jpeg, read_image
 from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import accuracy_line, advice, faults, finding_lines
 from jcr.live.session import LiveSession, SessionState
@@ -165,7 +165,7 @@ def _scene(state: SessionState) -> dict[str, Any]:
 @lru_cache(maxsize=128)
 def image_card(file: Path) -> bytes:
     """Return an image file as the bytes of a JPEG that is 330 px (CARD_PX) wide."""
-    return _jpeg(_small(read_image(file), CARD_PX))
+    return encode_jpeg(_small(read_image(file), CARD_PX))
 
 
 def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
@@ -175,15 +175,10 @@ def camera_image(image: UInt8[ndarray, "h w 3"]) -> tuple[bytes, str]:
     for feature in found:
         cv2.circle(small, (round(feature.pt[0]), round(feature.pt[1])), 3, (60, 235, 120), 1, cv2.LINE_AA)
     few = "" if len(found) >= FEW_FEATURES else " Few: put textured things into view."
-    return _jpeg(small), f"{len(found)} features.{few}"
+    return encode_jpeg(small), f"{len(found)} features.{few}"
 
 
 def _small(image: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h2 w2 3"]:
     """Return a copy of an image that is scaled to a `width` (px) with its aspect ratio, averaged over areas."""
     size = width, max(1, round(width * image.shape[0] / image.shape[1]))
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _jpeg(image: UInt8[ndarray, "h w 3"]) -> bytes:
-    """Return an RGB image encoded as JPEG."""
-    return cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()

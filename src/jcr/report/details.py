@@ -77,11 +77,11 @@ def cameras_section(cameras: CamerasFile) -> Content:
         ]
         about = {"rejected": camera.doubt is not None, "remarks": camera.warnings, "images": images}
         matrix = _matrix(camera.parent_from_camera, camera.uncertainty)
-        cards.append({"title": f"{camera.name}: {name}", "name": name, **about, **matrix})
+        cards.append({"title": f"{camera.name}: {name}", "name": name} | about | matrix)
+    about, name = {"rejected": False, "remarks": (), "images": ()}, "base_from_other_base"
     for arm in cameras.arms:
-        name, matrix = "base_from_other_base", _matrix(np.array(arm.base_from_other_base), arm.uncertainty)
-        about = {"rejected": False, "remarks": (), "images": ()}
-        cards.append({"title": f"arm {arm.name}: {name}", "name": name, **about, **matrix})
+        matrix = _matrix(np.array(arm.base_from_other_base), arm.uncertainty)
+        cards.append({"title": f"arm {arm.name}: {name}", "name": name} | about | matrix)
     return {"cards": cards}
 
 

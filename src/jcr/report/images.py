@@ -1,7 +1,6 @@
 """Section of the images in the report: each with its residuals and the reprojection errors of its features."""
 
 import base64
-import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,10 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
-from jcr.capture.images import read_image
+from jcr.capture.images import encode_jpeg, read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics
 from jcr.report.render import Content
@@ -21,7 +19,6 @@ from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Largest and smallest width (px) of the images in the report, and largest number of all their pixels, about 1 MB."""
-JPEG_QUALITY = 80
 MARKS, MAGNIFIED = 120, 20
 """Largest number of features drawn over an image, and factor by which their reprojection errors are magnified."""
 SHOWN = 12
@@ -125,9 +122,8 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
     def thumbnail(name: str) -> str:
         """Return one image as a data URL."""
         pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
-        stream, shown = io.BytesIO(), pixels if undistort is None else undistort(pixels)
-        Image.fromarray(shown).save(stream, "JPEG", quality=JPEG_QUALITY)
-        return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+        jpeg = encode_jpeg(pixels if undistort is None else undistort(pixels))
+        return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(thumbnail, capture.images))

@@ -130,13 +130,8 @@ def scene_view(
     metres.
     """
     camera = None if base_from_camera is None else _rows(base_from_camera)
-    return {
-        "name": name,
-        "used": used,
-        "caption": caption,
-        "gripper": _rows(base_from_gripper),
-        "camera": camera,
-    }
+    about = {"name": name, "used": used, "caption": caption}
+    return about | {"gripper": _rows(base_from_gripper), "camera": camera}
 
 
 def _rows(a_from_b: Float[ndarray, "4 4"]) -> list[list[float]]:
@@ -156,14 +151,12 @@ def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> lis
     known = {camera.name: camera for camera in result.capture.others}
     shown = []
     for found in result.cameras.cameras:
-        if found.parent_from_camera is None or (intrinsics := found.intrinsics) is None:
-            continue
-        fixed, places = found.mount == "base", [np.array(found.parent_from_camera)]
-        if not fixed:
-            if found.name not in known:
-                continue
+        fixed, places = found.mount == "base", list[ndarray]()
+        if fixed and found.parent_from_camera is not None:
+            places = [np.array(found.parent_from_camera)]
+        elif not fixed and found.name in known:
             places = result.cameras.base_from_camera(known[found.name], found, by_row)
-        if not places:
+        if not places or (intrinsics := found.intrinsics) is None:
             continue
         arm = "" if found.arm is None else f" of arm {found.arm}"
         doubt = "" if found.doubt is None else "\nrejected"

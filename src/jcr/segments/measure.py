@@ -131,9 +131,8 @@ def _shape(
     rotation_rad = given_rad or 0.0
     if given_rad is None:
         hull = _outline(xy - middle)
-        angle = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
-        length, width = np.ptp(hull @ _axes(angle).T, axis=0)
-        rotation_rad = angle + np.pi / 2 * float(length < width)
+        _, (length, width), degrees = cv2.minAreaRect(hull.astype(np.float32))
+        rotation_rad = float(np.radians(degrees) + np.pi / 2 * (length < width))
     along = (xy - middle) @ _axes(rotation_rad).T
     low, high = np.quantile(along, [SIDE_SHARE, 1 - SIDE_SHARE], axis=0, weights=area, method="inverted_cdf")
     within = ((along >= low) & (along <= high)).all(1)

@@ -153,7 +153,7 @@ def matched_database(
         matcher = matcher_of(images, camera, known, features, seed, report)
         working = resized(intrinsics, camera.width, camera.height)
         matched = match_with_robot(matcher, capture.base_from_gripper, working, capture.images, report)
-        yield write_database(Path(folder), camera, matcher.x_px, matched.geometries), camera
+        yield write_database(Path(folder), camera, matcher.features.x_px, matched.geometries), camera
 
 
 def _adjusted(
@@ -238,7 +238,7 @@ def map_images(
         cameras = [colmap_camera(matched.intrinsics, matcher.known), *cameras]
     model, matching = begun, len({row for key in matched.geometries for row in key})
     with tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
-        database = write_database(Path(folder), cameras[0], matcher.x_px, matched.geometries)
+        database = write_database(Path(folder), cameras[0], matcher.features.x_px, matched.geometries)
         if model is None or model.num_reg_images() < matching:
             some = cameras if model is None else [model.camera(1)]
             model = _map_incrementally(database, some, matcher, report, model)
@@ -264,18 +264,16 @@ def matcher_of(
     `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`. `seed` is
     that of RANSAC.
     """
+    size = camera.width, camera.height
     if features != "xfeat":
         give_back()
-        size, threads = (camera.width, camera.height), min(os.cpu_count() or 1, _SIFT_THREADS)
-        found = SiftFeatures(images, size, threads, report)
+        found = SiftFeatures(images, size, min(os.cpu_count() or 1, _SIFT_THREADS), report)
         give_back()
-        return Matcher(found, np.ones(2), camera, known, seed)
+        return Matcher(found, camera, known, seed)
     extra("torch", "match", f"--features {features}")
     from jcr.features.xfeat import LearnedFeatures
 
-    height, width = images[0].shape[:2]
-    scale = np.array([camera.width / width, camera.height / height])
-    return Matcher(LearnedFeatures(images, report), scale, camera, known, seed)
+    return Matcher(LearnedFeatures(images, size, report), camera, known, seed)
 
 
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
@@ -315,7 +313,11 @@ def _map_incrementally(
     relaxed if the model lacks more than half of the images. A model `begun` is continued with the images that it lacks.
     The progress is the share of images in the model; it falls when another camera is tried.
     """
-    n_images, folder, pipeline = len(matcher.x_px), database.parent, pycolmap.IncrementalPipelineOptions()
+    n_images, folder, pipeline = (
+        len(matcher.features.x_px),
+        database.parent,
+        pycolmap.IncrementalPipelineOptions(),
+    )
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
     pipeline.extract_colors = False
@@ -374,7 +376,7 @@ def _not_registered(
 
     `matched` are the pairs that were mapped, and `model` is the largest model, None if there is none.
     """
-    x_px, pairs = matcher.x_px, len(matched.geometries)
+    x_px, pairs = matcher.features.x_px, len(matched.geometries)
     features = int(np.median([len(x) for x in x_px]))
     if features < _FEW_FEATURES:
         reason = f"too little texture, {features} features in the median image where {_FEW_FEATURES} are few"

@@ -35,7 +35,7 @@ class LiveMap:
         self._cameras = working_cameras(self._all_intrinsics, self._known)
         camera = self._cameras[0]
         self._features = SiftFeatures([], (camera.width, camera.height), 1, silent)
-        self._matcher = Matcher(self._features, np.ones(2), camera, self._known, seed=0)
+        self._matcher = Matcher(self._features, camera, self._known, seed=0)
         self._names: list[str] = []
         self._geometries: Geometries = {}
         self._model: pycolmap.Reconstruction | None = None

@@ -157,7 +157,7 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     A keypoint within `radius_px` (working size) is added if its descriptor is the nearest one to the point's mean
     descriptor. Its distance must be below the features' `farthest` and below RATIO times that of the second nearest.
     """
-    image, x_px, descriptors = model.image(image_id), matcher.x_px, matcher.features.descriptors
+    image, x_px, descriptors = model.image(image_id), matcher.features.x_px, matcher.features.descriptors
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
     free = np.array([k for k, keypoint in enumerate(image.points2D) if not keypoint.has_point3D()], int)
     point_ids = np.array(sorted(set(model.point3D_ids()) - observed), int)

@@ -132,19 +132,17 @@ class Viewer:
         server: viser.ViserServer,
         run: RunResult,
         urdf: Path | None = None,
-        progress: Progress | None = None,
+        report: Progress = silent,
     ) -> None:
         """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
 
         There is no robot if `urdf` is None and the capture has no URDF or no joint values. Raises InputError as
         `read_robot` does.
         """
-        report = progress or silent
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()
         self.cloud, self.scene = run.cloud, run.scene
-        base_from_recon = self.calibration.base_from_recon
-        self.image_index = self.reconstruction.image_index
+        base_from_recon, self.image_index = self.calibration.base_from_recon, self.reconstruction.image_index
         recon_from_camera = scale_translation(self.reconstruction.recon_from_camera, base_from_recon.scale)
         self.base_from_camera = base_from_recon.rigid @ recon_from_camera
         self.tracks_in_base = base_from_recon(self.reconstruction.tracks.points_in_recon)
@@ -257,11 +255,8 @@ class Viewer:
         unknown = map.query(x.reshape(-1, 3)).unknown.reshape(x.shape[:3])
         if unknown.any() and not unknown.all():
             vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
-            in_base, style = (
-                low + pitch * (vertices + 0.5),
-                {"color": GREY, "opacity": 0.25, "side": "double"},
-            )
-            scene.add_mesh_simple("/unknown", in_base, faces, visible=False, **style)
+            in_base, style = low + pitch * (vertices + 0.5), {"opacity": 0.25, "side": "double"}
+            scene.add_mesh_simple("/unknown", in_base, faces, visible=False, color=GREY, **style)
         size, turned = (high - low)[:2].tolist(), (0.0, 1.0, 0.0, 0.0)
         empty = np.zeros((2, 2, 4), np.uint8)
         self._slice = scene.add_image("/slice", empty, *size, wxyz=turned, visible=False)
@@ -282,12 +277,9 @@ class Viewer:
         with self._lock:
             row = self.image.value
             image = self.calibration.images[row]
-            parts = (
-                f"**{image.image}**",
-                "used" if image.used else f"rejected: {image.reason}",
-                image_numbers(image),
-            )
-            self._about_image.content = " · ".join(filter(None, parts))
+            state = "used" if image.used else f"rejected: {image.reason}"
+            parts = filter(None, (f"**{image.image}**", state, image_numbers(image)))
+            self._about_image.content = " · ".join(parts)
             for own, frustum in zip(self.image_index.tolist(), self.frusta, strict=True):
                 used = self.calibration.images[own].used
                 frustum.color = CHOSEN if own == row else CAMERA if used else REJECTED
@@ -322,15 +314,10 @@ class Viewer:
             self.points, self._legend.content = x, legend
             tracks = self.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
             red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1))
-            draw = partial(
-                self.server.scene.add_point_cloud,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-            )
+            draw = partial(self.server.scene.add_point_cloud, point_shape="circle", precision="float32")
             for name, points, rgb, size in (("/points", x, color, POINT_M), ("/tracks", tracks, red, 0.004)):
                 if len(points):
-                    draw(name, points, rgb, point_size=size)
+                    draw(name, points, rgb, point_size=size, point_shading="flat")
                 else:
                     self.server.scene.remove_by_name(name)
 
@@ -372,9 +359,8 @@ class Viewer:
             at = self.scene.query(center, unknown)
             self.ball.radius, self.ball.color = radius, COLLIDES if hit else FREE
             distance, (x, y, z) = float(at.distance[0]), center[0]
-            where = (
-                "outside of the workspace" if np.isnan(distance) else f"surface {1e3 * distance:.0f} mm away"
-            )
+            where = f"surface {1e3 * distance:.0f} mm away"
+            where = "outside of the workspace" if np.isnan(distance) else where
             seen = "unseen space" if at.unknown[0] else "seen space"
             verdict = "collides" if hit else "free"
             self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"

@@ -326,18 +326,12 @@
     const [u, v] = [event.clientX - box.left, event.clientY - box.top];
     const view = eye();
     let [best, nearest] = [-1, 18];
-    scene.views.forEach((image, k) => {
-      for (const matrix of [image.camera, image.gripper]) {
-        if (!matrix || state.through >= 0) continue;
-        const [x, y, z] = project(view, column(matrix, 3));
-        const away = Math.hypot(x / ratio - u, y / ratio - v);
-        if (z > 0 && away < nearest) [best, nearest] = [k, away];
-      }
-    });
-    if (shown().others && state.through < 0) scene.others.forEach(({ cameras }, k) => cameras.forEach((matrix) => {
+    const others = shown().others ? scene.others.map(({ cameras }) => cameras) : [];
+    const pickable = [...scene.views.map(({ camera, gripper }) => [camera, gripper].filter(Boolean)), ...others];
+    if (state.through < 0) pickable.forEach((matrices, k) => matrices.forEach((matrix) => {
       const [x, y, z] = project(view, column(matrix, 3));
       const away = Math.hypot(x / ratio - u, y / ratio - v);
-      if (z > 0 && away < nearest) [best, nearest] = [scene.views.length + k, away];
+      if (z > 0 && away < nearest) [best, nearest] = [k, away];
     }));
     if (best !== picked) { picked = best; redraw(); }
     tooltip.hidden = best < 0;
