@@ -152,7 +152,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     assert stated in elements.text and all(f"±{significant(std)} mm" in elements.text for std in mm)
     for image in written["images"]:
         if image["used"]:
-            assert f"{significant(image['reprojection_px'])} px" in elements.text
+            assert f"{significant(image['reprojection_px'])}\u00a0px" in elements.text
 
 
 def test_rejected_images_are_reported_with_why(run: RunResult, page: str):

@@ -14,7 +14,7 @@ from jcr.calibration.words import facts
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
 from jcr.report.render import Content, label_colors
-from jcr.rounding import significant
+from jcr.rounding import decimals_of, significant
 from jcr.segments.measure import Measurement
 
 StageOptions = Mapping[str, Mapping[str, Any]]
@@ -49,9 +49,10 @@ def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Cont
     colors = label_colors(len(label_names)).tolist()
     rows = []
     for one in measured.objects:
+        digits = [max(1, decimals_of(1e3 * std)) for std in one.box_std]
         length, width, height = (
-            f"{1e3 * value:.1f} ±\u00a0{1e3 * std:.1f}"
-            for value, std in zip(one.box_size, one.box_std, strict=True)
+            f"{1e3 * value:.{n}f} ±\u00a0{1e3 * std:.{n}f}"
+            for value, std, n in zip(one.box_size, one.box_std, digits, strict=True)
         )
         if not one.top_seen:
             height = f"at least {1e3 * one.height:.1f}"

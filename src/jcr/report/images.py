@@ -36,9 +36,9 @@ def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
 def image_numbers(image: ImageVerdict) -> str:
     """Return translation and rotation residual and median reprojection error of an image as text; none if unknown."""
     parts = [
-        (image.translation_residual_mm, " mm"),
+        (image.translation_residual_mm, "\u00a0mm"),
         (image.rotation_residual_deg, "°"),
-        (image.reprojection_px, " px"),
+        (image.reprojection_px, "\u00a0px"),
     ]
     return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
 

@@ -107,6 +107,6 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
         yield (
             "Scale",
             f"±{percent}\u00a0%",
-            f"{significant(calibration.scale, 4)} m per unit of the images",
+            f"{significant(calibration.scale, 4)} m per unit of the reconstruction",
             True,
         )
