@@ -95,7 +95,6 @@ class CaptureCommand:
         if self.out is None:
             raise InputError("OUT: required, and not given (jcr capture --help)")
         from jcr.live.calibration import LiveCalibration
-        from jcr.live.folder import LiveFolder
         from jcr.live.server import LOOPBACK, LiveServer
 
         options, out = self.session, self.out
@@ -115,19 +114,21 @@ class CaptureCommand:
             _print("\n".join(lines))
 
         with locked(out), open_camera(self.camera, self.settings) as camera:
-            folder = LiveFolder(out, given or camera.intrinsics, self.robot)
-            calibration = LiveCalibration(folder, options={"require": options.require})
+            given, limits = given or camera.intrinsics, {"require": options.require}
+            calibration = LiveCalibration(out, intrinsics=given, robot=self.robot, options=limits)
             gripper = None if states is None else lambda: next(states())
             session = LiveSession(calibration, camera, options, tell, gripper)
             token = os.environ.get("JCR_TOKEN") or None
             try:
                 with LiveServer(session, *address, token, self.poses == "http") as server:
-                    _print(f"{len(folder.names)} images in {out}; open {server.address} in a browser")
+                    _print(
+                        f"{len(calibration.live.names)} images in {out}; open {server.address} in a browser"
+                    )
                     session.run(_source(self, session, states, server))
                     result = session.finish()
             finally:
                 calibration.close()
-        facts = {"capture": str(out), "images": folder.names, "answers": answers}
+        facts = {"capture": str(out), "images": calibration.live.names, "answers": answers}
         return _conclude(self, facts, result, calibration.progress.requirement_met)
 
 

@@ -43,17 +43,17 @@ MOST_POINTS = 3000
 class LiveCalibration:
     """Calibration that is computed again whenever an image is added to its capture or removed from it.
 
-    `folder` is the folder of the capture, or its LiveFolder; a capture that was begun there is continued. `intrinsics`
-    belong to all images; None: they are estimated. `robot` names the arm (`jcr capture --robot list` shows the names).
+    `folder` is the folder of the capture; a capture that was begun there is continued. `intrinsics` belong to all
+    images; None: they are estimated. `robot` names the arm (`jcr capture --robot list` shows the names).
     Images and poses are written into the folder when they are added, so that jcr.read_capture can read the capture at
     any time. Methods may be called from several threads.
     """
 
     def __init__(
         self,
-        folder: LiveFolder | str | Path,
+        folder: str | Path,
         *,
-        intrinsics: Intrinsics | None = None,
+        intrinsics: Intrinsics | IntrinsicsEntry | None = None,
         robot: str | None = None,
         options: CalibrateOptions | Mapping[str, Any] | None = None,
         exclusive: bool = False,
@@ -64,12 +64,10 @@ class LiveCalibration:
         `close`; InputError if another one holds the lock.
         """
         self._opened = ExitStack()
-        if not isinstance(folder, LiveFolder):
-            if exclusive:
-                self._opened.enter_context(locked(Path(folder)))
-            given = None if intrinsics is None else IntrinsicsEntry.of(intrinsics)
-            folder = LiveFolder(Path(folder), given, robot)
-        self.live = folder
+        if exclusive:
+            self._opened.enter_context(locked(Path(folder)))
+        given = IntrinsicsEntry.of(intrinsics) if isinstance(intrinsics, Intrinsics) else intrinsics
+        self.live = LiveFolder(Path(folder), given, robot)
         self._lock = threading.RLock()
         """Lock that is held while the capture, the map or `progress` is changed."""
         self._options = checked_options(options, CalibrateOptions)
@@ -77,7 +75,7 @@ class LiveCalibration:
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
-        self.progress = Progress(images=tuple(folder.names))
+        self.progress = Progress(images=tuple(self.live.names))
 
     def add(
         self,

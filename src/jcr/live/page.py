@@ -52,26 +52,18 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 
     `has_report` states that the report of the final calibration exists and can be opened.
     """
-    # "kind" selects the colour of the headline; "images" are the cards of the list, the newest first.
+    # "kind" selects the colour of the headline; "cards" are those of the images, the newest first.
     kind, *lines = verdict_lines(state)
     headline, *below = (line[:1].upper() + line[1:] for line in lines)
-    content = {
-        "kind": kind,
-        "headline": headline,
-        "lines": below,
-        "is_over": state.is_over,
-        "has_report": has_report,
-        "can_undo": state.can_undo,
-        "tiles": _tiles(state, session.options.require or GRASPING),
-        "images": _cards(state)[::-1],
-    }
+    content = {"state": state, "has_report": has_report, "kind": kind, "headline": headline, "lines": below}
+    content |= {"cards": _cards(state)[::-1], "tiles": _tiles(state, session.options.require or GRASPING)}
     return {
         "version": state.version,
         "is_over": state.is_over,
         "is_done": state.is_done,
         "has_report": has_report,
         "images": len(state.images),
-        "parts": {name: render(f"{name}.html", {"state": content}, PACKAGE) for name in PARTS},
+        "parts": {name: render(f"{name}.html", content, PACKAGE) for name in PARTS},
         "scene": json.dumps(_scene(state)),
     }
 
