@@ -12,7 +12,6 @@ from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.calibration.words import summary
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run import show, show_calibration
-from jcr.estimation.point_uncertainty import within_95
 from jcr.findings import sentence
 from jcr.geometry import step_between
 from jcr.records import PosePairs
@@ -32,13 +31,6 @@ def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
 
 def page(of: PosePairs, hand_eye: Calibration) -> str:
     return report_html(RunResult("out", capture=of, calibration=hand_eye, reconstruction=of))
-
-
-@pytest.mark.parametrize("spread", [(3, 1, 0.1), (1, 0, 0)])
-def test_95_percent_of_errors_are_below_the_length(spread: tuple[float, float, float]):
-    errors = np.random.default_rng(0).normal(size=(100_000, 3)) * spread
-    length = within_95(np.diag(np.square(spread).astype(float)))
-    assert (np.linalg.norm(errors, axis=1) < length).mean() == pytest.approx(0.95, abs=0.005)
 
 
 def test_what_is_reached_is_of_a_point_seen_or_of_the_camera():

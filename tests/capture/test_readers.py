@@ -329,10 +329,6 @@ FAULTS: dict[str, tuple[Spoil, str, str]] = {
         lambda f: edit_info(f, "image_width: 640", "image_width: 1280"), "auto",
         "intrinsics of 1280x480 pixels, images of 640x480",
     ),
-    "YAML that makes objects": (
-        lambda f: (f.parent / "camera_info.yaml").write_text("!!python/object/apply:os.system [echo]"), "auto",
-        "not YAML",
-    ),
 }  # fmt: skip
 """Changes of a table or its folder, and the convention with which it is read."""
 ROW_FAULTS: dict[str, tuple[int, Spoil, str]] = {

@@ -11,7 +11,7 @@ from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import pose_problem
-from jcr.estimation.robot_noise import Equations, arm_errors, most_likely, smooth_errors
+from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.geometry import rotation_exp, transform
 from simulation.arms import PresetName
@@ -24,24 +24,6 @@ def poses(rng: np.random.Generator, count: int) -> np.ndarray:
     return transform(rotation_exp(0.6 * rng.normal(size=(count, 3))), 0.2 * rng.normal(size=(count, 3)))
 
 
-def equations(rng: np.random.Generator, count: int, systematic_rad: float) -> Equations:
-    """Residuals drawn from the model itself, of a fit of one vector of six unknowns and a seventh of each pose's own."""
-    base_from_gripper = poses(rng, count)
-    alike = smooth_errors(base_from_gripper)
-    drawn = rng.multivariate_normal(
-        np.zeros(6 * count), systematic_rad**2 * alike, method="cholesky", tol=1e-6
-    )
-    drawn = drawn + np.tile(np.repeat(WHITE, 3), count) * rng.normal(size=6 * count)
-    jacobian = np.column_stack([np.tile(np.eye(6), (count, 1)), rng.normal(size=6 * count)])
-    return Equations(
-        residual=drawn,
-        jacobian=jacobian,
-        prior_information=np.zeros((7, 7)),
-        prior_gradient=np.zeros(7),
-        systematic=alike,
-    )
-
-
 def test_smooth_errors_are_a_covariance_that_the_choice_of_the_base_does_not_change():
     base_from_gripper = poses(np.random.default_rng(0), 9)
     alike = smooth_errors(base_from_gripper)
@@ -52,16 +34,6 @@ def test_smooth_errors_are_a_covariance_that_the_choice_of_the_base_does_not_cha
     np.testing.assert_allclose(
         smooth_errors(other @ base_from_gripper), rotated @ alike @ rotated.T, atol=1e-9
     )
-
-
-def test_the_sizes_are_found_from_many_poses():
-    found = []
-    for seed in range(8):
-        sizes, _ = most_likely(equations(np.random.default_rng(seed), 40, np.radians(0.3)))
-        found.append(np.exp(sizes))
-    middle = np.median(found, axis=0)
-    np.testing.assert_allclose(middle[:2], WHITE, rtol=0.15)
-    assert middle[2] == pytest.approx(np.radians(0.3), rel=0.4)
 
 
 @pytest.mark.slow

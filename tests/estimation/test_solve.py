@@ -315,15 +315,6 @@ def test_rotations_about_the_board_and_errors_of_depth_are_weighed_and_in_the_un
 
 repeatable = settings(derandomize=True, deadline=None, max_examples=30)
 seeds = st.integers(0, 2**32 - 1)
-counts = st.integers(3, 9)
-angles = st.sampled_from([0.0, 1e-9, 0.7, np.pi - 1e-9, np.pi]) | st.floats(0, np.pi)
-
-
-def noisy(seed: int, count: int):
-    """Gripper and camera poses that belong together up to the robot pose noise, and the generator for what follows."""
-    rng = np.random.default_rng(seed)
-    problem = hand_eye_problem(rng, count, robot_noise=(1e-4, 2e-4))
-    return problem.base_from_gripper, problem.recon_from_camera, rng
 
 
 def any_rigid(rng: np.random.Generator, angle: float):
@@ -332,32 +323,11 @@ def any_rigid(rng: np.random.Generator, angle: float):
     return transform(rotation_exp(angle * axis / np.linalg.norm(axis)), rng.normal(size=3))
 
 
-def assert_same(found, expected, tolerance: float = 1e-7):
+def assert_same(found, expected, tolerance: float):
     (x, scale, z), (x_expected, scale_expected, z_expected) = found, expected
     assert np.abs(step_between(x, x_expected)).max() < tolerance
     assert scale == pytest.approx(scale_expected, rel=tolerance)
     assert np.abs(step_between(z, z_expected)).max() < 10 * tolerance
-
-
-@repeatable
-@given(seeds, counts, angles)
-def test_another_base_moves_base_from_recon_alone(seed, count, angle):
-    gripper, camera, rng = noisy(seed, count)
-    x, scale, z = closed_form(gripper, camera)
-    other = any_rigid(rng, angle)
-    assert_same(closed_form(other @ gripper, camera), (x, scale, other @ z))
-
-
-@repeatable
-@given(seeds, counts, angles)
-def test_another_frame_on_the_gripper_moves_x_alone(seed, count, angle):
-    # Without noise: the least squares weigh errors where the gripper's origin is.
-    rng = np.random.default_rng(seed)
-    problem = hand_eye_problem(rng, count)
-    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
-    x, scale, z = closed_form(gripper, camera)
-    tool = any_rigid(rng, angle)
-    assert_same(closed_form(gripper @ tool, camera), (inverse(tool) @ x, scale, z))
 
 
 @repeatable

@@ -109,7 +109,6 @@ def nothing(path: Path) -> None:
 CALIBRATE, TOO_LONG = "calibrate capture out --quiet", r"[45]\.\d ± \d\.\d % too long for a ur5e"
 QUERY = "query done points.csv"
 FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
-    "no such folder": ("capture", shutil.rmtree, CALIBRATE, "no such"),
     "positions too long": ("capture/capture.json", too_long, CALIBRATE, f"{TOO_LONG}.*check the unit"),
     "positions too long, checked": ("capture/capture.json", too_long, "check capture --poses-only", TOO_LONG),
     "output that nobody may write": (
@@ -120,9 +119,6 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
     ),
     "output that is a file": ("out", lambda p: p.write_text("precious"), CALIBRATE, "is a file"),
     "calibration of a newer format": ("done/calibration.json", other_format, "compare done done", "format"),
-    "calibration cut in half": ("done/calibration.json", cut, "compare done done", "JSON|damaged"),
-    "map cut in half": ("done/map.safetensors", cut, QUERY, "damaged"),
-    "map of noise": ("done/map.safetensors", lambda p: p.write_bytes(b"\x07" * 1000), QUERY, "damaged"),
     "no map": ("done/map.safetensors", Path.unlink, QUERY, "no map here"),
     "state that is a pipe": ("done/run.json", pipe, "map done --quiet", "a pipe or a device"),
     "state that is a link to itself": ("done/run.json", linked_to_itself, "map done --quiet", "holds no run"),
@@ -134,7 +130,6 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
     ),
     "cloud that is a pipe": ("done/cloud.ply", pipe, "measure done", "a pipe or a device"),
     "predictions with code": ("pairs.npz", pickled, f"{CALIBRATE} --predictions pairs.npz", r"pairs\.npz"),
-    "no such kind of board": ("out", nothing, f"{CALIBRATE} --board chess:9x6:0.025", "--board"),
 }
 """File, its change, the command, and words of its error."""
 
