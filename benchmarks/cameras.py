@@ -19,10 +19,10 @@ from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
 from jcr.errors import RejectedError
-from jcr.estimation.intrinsics_prior import CameraPrior, camera_with_prior
+from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
-from jcr.geometry import apply, inverse, scale_translation, step_between
+from jcr.geometry import inverse, scale_translation, step_between
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import CellCamera
 from simulation.arms import PresetName
@@ -36,7 +36,6 @@ DRAWS, COUNT = 10, 10
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
 WITHHELD = 4
 """Every this many of a real capture's images are declared images of fixed cameras, one each."""
-UNMOVED = np.eye(4)
 Of = Callable[[State], Float[ndarray, "4 4"]]
 
 
@@ -83,23 +82,7 @@ def wanted(problem: CellProblem) -> dict[str, Of]:
     return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.world_from_rig[-1], p.scale)}
 
 
-def cell_of(
-    problem: CellProblem, cameras: Sequence[CameraPrior], world: Float[ndarray, "4 4"] = UNMOVED
-) -> tuple[Problem, State]:
-    """Return the problem without its observations, and its initial state, in a world that is moved by `world`."""
-    unmove = scale_translation(inverse(world), problem.scale)
-    state = State(
-        x=np.stack([x for x, _ in problem.starts]),
-        scale=1.0,
-        z=np.stack([z @ unmove for _, z in problem.starts]),
-        world_from_rig=world @ problem.world_from_rig,
-        rig_from_camera=problem.rig_from_camera,
-        points_in_world=apply(world, problem.points_in_world),
-    )
-    return Problem(arms=tuple(problem.arms), n_rigs=len(state.world_from_rig), cameras=tuple(cameras)), state
-
-
-def answered(problem: CellProblem, seed: int, world: Float[ndarray, "4 4"] = UNMOVED) -> Solution:
+def answered(problem: CellProblem, seed: int) -> Solution:
     """Adjust a cell by its images and poses; intrinsics are off by the usual error of given ones."""
     rng = np.random.default_rng([seed, 17])
     cameras = []
@@ -108,17 +91,26 @@ def answered(problem: CellProblem, seed: int, world: Float[ndarray, "4 4"] = UNM
         off = free.directions @ (free.std * rng.normal(size=len(free.std)))
         free = camera_with_prior(with_parameters(camera, parameters(camera) + off))
         cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
-    return solve(*with_observations(*cell_of(problem, cameras, world), problem.observations))
+    state = State(
+        x=np.stack([x for x, _ in problem.starts]),
+        scale=1.0,
+        z=np.stack([z for _, z in problem.starts]),
+        world_from_rig=problem.world_from_rig,
+        rig_from_camera=problem.rig_from_camera,
+        points_in_world=problem.points_in_world,
+    )
+    unseen = Problem(arms=tuple(problem.arms), n_rigs=len(state.world_from_rig), cameras=tuple(cameras))
+    return solve(*with_observations(unseen, state, problem.observations))
 
 
 def run(captures: Path, every: int = 1) -> str:
-    """Return the page in Markdown: simulated cells of each kind, and withheld images of one capture in `every`."""
-    faults = [cells for seed in CELL_SEEDS for cells in _with_faults(seed)]
+    """Return the page in Markdown, of one draw, rendered cell and capture in `every`."""
+    faults = [cells for seed in CELL_SEEDS[::every] for cells in _with_faults(seed)]
     real = [row for folder in folders_with_captures(captures, every) for row in _withheld(folder)]
-    every, rows = [], []
+    drawn, rows = [], []
     for kind, preset in product(get_args(Kind), PRESET_NAMES):
-        for name, draws in _draws(kind, preset).items():
-            every += draws
+        for name, draws in _draws(kind, preset, DRAWS // every).items():
+            drawn += draws
             middle, most = (np.quantile([draw[:2] for draw in draws], share, axis=0) for share in (0.5, 0.95))
             sizes = [f"{mm:.2f} mm {deg:.3f}°" for mm, deg in (middle, most)]
             beyond = f"{100 * np.mean([draw.sigmas > 3 for draw in draws]):.0f} %"
@@ -126,8 +118,8 @@ def run(captures: Path, every: int = 1) -> str:
             rows.append([kind, preset, name, *sizes, f"{100 * _inside(draws):.0f} %", beyond, squared])
     placed = np.array([off for _, off in real if off is not None])
     lines = [
-        f"> Simulated cells of {COUNT} poses an arm: {100 * _inside(every):.0f} % of {len(every)} results lie within "
-        f"their own 95 % ellipsoid, {100 * np.mean([draw.sigmas > 3 for draw in every]):.1f} % are beyond 3 σ."
+        f"> Simulated cells of {COUNT} poses an arm: {100 * _inside(drawn):.0f} % of {len(drawn)} results lie within "
+        f"their own 95 % ellipsoid, {100 * np.mean([draw.sigmas > 3 for draw in drawn]):.1f} % are beyond 3 σ."
     ]
     if len(placed):
         (mm, deg), tried = np.median(placed, axis=0), sum(cells[1] != "rejected" for cells, _ in real)
@@ -156,10 +148,10 @@ def run(captures: Path, every: int = 1) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _draws(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
+def _draws(kind: Kind, preset: PresetName, count: int) -> dict[str, list[Draw]]:
     """Return the errors of every transform of a kind of cell."""
     out: dict[str, list[Draw]] = {}
-    for seed in range(DRAWS):
+    for seed in range(count):
         problem = cell_problem(kind, preset, COUNT, seed)
         answer = answered(problem, seed)
         for name, of in wanted(problem).items():

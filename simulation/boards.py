@@ -9,32 +9,31 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Boards, Body
 from simulation.faults import INTRINSICS, FaultyCapture
 
+CORNERS, SIDE_M, NOISE_PX = (9, 6), 0.025, 0.1
+"""Inner corners, side of a square, and standard deviation of a coordinate of a corner."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
     """Chessboard that lies among other things, with the size that its user states."""
 
-    corners: tuple[int, int] = (9, 6)
-    side_m: float = 0.025
     stated_m: float | None = 0.025
     """Stated side; None where it is unknown."""
     bend_m: float = 0.0
     """Height of its short edges over its middle."""
     size_error: float = 0.0
-    """Relative excess of the printed size over `side_m`."""
+    """Relative excess of the printed size over SIDE_M."""
     stretch: float = 0.0
     """Relative excess of its first side over its second."""
     moved_m: float = 0.0
     """Distance along x by which it is moved before the last third of the images."""
-    noise_px: float = 0.1
-    """Standard deviation of a coordinate of a corner."""
 
 
 def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> FaultyCapture:
     """Return the capture with the corners of a sheet among its points, in the images that show all of it."""
-    grid = np.stack(np.meshgrid(*map(np.arange, sheet.corners)), axis=-1).reshape(-1, 2).astype(float)
+    grid = np.stack(np.meshgrid(*map(np.arange, CORNERS)), axis=-1).reshape(-1, 2).astype(float)
     grid = np.column_stack([grid - grid.mean(0), np.zeros(len(grid))])
-    printed = sheet.side_m * (1 + sheet.size_error) * grid
+    printed = SIDE_M * (1 + sheet.size_error) * grid
     printed[:, 0] *= 1 + sheet.stretch
     printed[:, 2] = sheet.bend_m * (grid[:, 0] / grid[:, 0].max()) ** 2
     base_from_sheet = transform(
@@ -48,11 +47,11 @@ def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> 
         seen = project(found.intrinsics, apply(inverse(camera), x_in_base + moved))
         if ((seen > 0) & (seen < [INTRINSICS.width, INTRINSICS.height])).all():
             image.append(np.full(len(grid), k))
-            x_px.append(seen + sheet.noise_px * rng.normal(size=seen.shape))
+            x_px.append(seen + NOISE_PX * rng.normal(size=seen.shape))
     row = first + np.arange(len(grid))
     unit = 1.0 if sheet.stated_m is None else sheet.stated_m
     boards = Boards(
-        spec=f"chessboard:{sheet.corners[0]}x{sheet.corners[1]}:{'SIDE' if sheet.stated_m is None else unit}",
+        spec=f"chessboard:{CORNERS[0]}x{CORNERS[1]}:{'SIDE' if sheet.stated_m is None else unit}",
         side=unit,
         size_std=None if sheet.stated_m is None else 0.002,
         bodies=(Body(0, row, unit * grid),),

@@ -25,6 +25,8 @@ BOXES = np.array(
     ]
 )
 ROWS_ABOVE = np.array([[-1.5, -1.5, 0.0], [1.5, 1.5, 2.0]])
+GROWTH_DEG = 60.0
+"""Angle between the views at which the errors of second views are twice those of first ones."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,6 @@ class PairErrors:
     """Smooth over the image, across the line of sight (rad)."""
     pair_rotation_deg: float = 0.0
     """Rigid rotation of second views about the first camera, per axis."""
-    baseline_growth_deg: float = 60.0
-    """Angle between the views at which the errors of second views are twice those of first ones."""
     outliers: float = 0.02
     """Fraction of pixels with errors 20 times larger and low confidence."""
     wrong_pairs: int = 0
@@ -117,7 +117,7 @@ def predicted_pairs(
             )
         for view, image in enumerate((first, second)):
             exact = apply(first_from_second, x_in_camera[image]) if view else x_in_camera[image]
-            growth = 1 + view * baseline_deg / errors.baseline_growth_deg
+            growth = 1 + view * baseline_deg / GROWTH_DEG
             outlier = rng.random((height, width)) < errors.outliers
             made = _with_errors(exact, depth[image], outlier, growth, errors, rng)
             if e in spoilt[errors.wrong_pairs :]:

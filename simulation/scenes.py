@@ -112,10 +112,7 @@ def _table_top(rng: np.random.Generator, table: str, plain: bool) -> Part:
         color = (0.80, 0.79, 0.76) if table == "light" else (0.16, 0.16, 0.17)
         texture = textures.laminate(rng, *shape, color, contrast=0.03 if table == "light" else 0.08)
     else:
-        light, dark = ((0.80, 0.66, 0.48), (0.50, 0.34, 0.20))
-        if table == "dark":
-            light, dark = ((0.36, 0.25, 0.17), (0.13, 0.08, 0.05))
-        texture = textures.wood(rng, *shape, light, dark)
+        texture = textures.wood(rng, *shape, (0.80, 0.66, 0.48), (0.50, 0.34, 0.20))
     r, g, b = texture.reshape(-1, 3).mean(0) / 255
     return Part(box(_TABLE_SIZE, ("+z",)), (float(r), float(g), float(b)), texture, shine=0.0)
 
