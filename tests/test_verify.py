@@ -236,6 +236,9 @@ def test_images_that_would_not_show_a_drift_that_matters_are_a_warning(std_mm: f
     judged = _judged(found, VerifyOptions(), ["0.png"], (), "in the old scene")
     assert not judged.moved and (judged.verdict == "accepted with warnings") is is_blind
     assert any("would not be noticed" in note for note in judged.notes) is is_blind
+    shift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = _of_two(shift, covariance, VerifyOptions())
+    assert _judged(found, VerifyOptions(), ["0.png"], (), "in the old scene").moved is not is_blind
 
 
 @pytest.fixture(scope="module")

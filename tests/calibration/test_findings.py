@@ -14,6 +14,7 @@ from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
+from jcr.findings.finding import verdict_of
 from jcr.findings.table import GROUPS
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Intrinsics
@@ -87,6 +88,8 @@ def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solv
     assert found.verdict == "rejected" and found.findings[0].severity == "rejects" and not found.converged
     small = with_findings(solved, (replace(fault, shift=(1e-4, *shift[1:6], 0.0)),))
     assert small.verdict == "accepted with warnings" and small.warnings == (sentence(fault),)
+    severities = ("warns", "rejects", "informs")
+    assert verdict_of([replace(fault, severity=one) for one in severities]) == "rejected"
     # What else speaks against it comes after.
     uncertain = replace(example(FindingKind.UNCERTAIN), severity="rejects")
     found = with_findings(solved.with_findings(uncertain), (fault,))

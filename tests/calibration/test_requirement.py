@@ -48,6 +48,9 @@ def test_what_is_reached_is_of_a_point_seen_or_of_the_camera():
     assert (1e3 * np.linalg.norm(moved, axis=1) < required.reached_mm).mean() == pytest.approx(0.95, abs=0.01)
     alone = 1e3 * np.linalg.norm(steps[:, :3], axis=1)
     assert (alone < at_camera.reached_mm).mean() == pytest.approx(0.95, abs=0.01)
+    turned = np.degrees(np.linalg.norm(steps[:, 3:6], axis=1))
+    for reached_deg in (required.reached_deg, at_camera.reached_deg):
+        assert (turned < reached_deg).mean() == pytest.approx(0.95, abs=0.01)
     off = 1e3 * np.linalg.norm(step_between(at_point.gripper_from_camera, x)[:3])
     assert off < 1.5 * at_camera.reached_mm
 
