@@ -13,7 +13,15 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 import jcr
-from benchmarks.page import folders_with_captures, largest_std, mm_deg, of_rows, squared_distance, table
+from benchmarks.page import (
+    farthest,
+    folders_with_captures,
+    largest_std,
+    mm_deg,
+    of_rows,
+    squared_distance,
+    table,
+)
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
@@ -218,8 +226,6 @@ def _with_faults(seed: int) -> Iterator[list[object]]:
             names = ", ".join(dict.fromkeys(one.kind for one in placed.findings)) or "–"
             off = ["–"] * 3
             if placed.parent_from_camera is not None and placed.covariance is not None:
-                steps = [step_between(placed.parent_from_camera, true) for true in truths]
-                sigmas = [float(np.abs(step / np.sqrt(np.diag(placed.covariance))).max()) for step in steps]
-                far = int(np.argmax(sigmas))
-                off = [f"{value:.2f}" for value in (*mm_deg(steps[far]), sigmas[far])]
+                step, sigmas = farthest(placed.parent_from_camera, placed.covariance, truths)
+                off = [f"{value:.2f}" for value in (*mm_deg(step), sigmas)]
             yield [kind, fault, placed.verdict, names, *off]

@@ -18,13 +18,12 @@ from numpy import ndarray
 from scipy.special import chdtrc
 
 import jcr
-from benchmarks.page import mm_deg, squared_distance, table
+from benchmarks.page import farthest, mm_deg, squared_distance, table
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.errors import InputError, RejectedError
 from jcr.findings import FindingKind, kinds_of
-from jcr.geometry import step_between
 from simulation import image_faults as make
 from simulation import scene_faults as scenes
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
@@ -213,7 +212,25 @@ def run(every: int = 1) -> str:
         faults = Faults(robot_noise=(1e-4 * size + 5e-5, 3e-4 * size))
         clean.append(outcome(*calibrated(faults, 1000 + seed, (8, 12, 20)[seed % 3], seed % 2 == 0)))
     clean_images = [through_images(1000 + k, ImageFault(), k % 2 == 0) for k in range(CLEAN_IMAGES)]
-    return page(observed, images, clean, clean_images)
+    lines = [
+        _claim("observations", observed, clean),
+        _claim("images through `jcr calibrate`", images, clean_images),
+        "",
+        "*named*: a finding that warns or rejects names the fault, or the wrong images are left out. *within 3 σ*: "
+        "accepted, on every axis and jointly (p > 0.27 %). *warned*: accepted with a warning and farther off. "
+        "**silent**: accepted without a warning and farther off. A camera that moved is compared before and after, "
+        "whichever is farther. Positions too long in one proportion change nothing that an image shows.",
+    ]
+    for title, rows in (
+        (
+            f"Observations: {IMAGES} images, 500 points with 0.4 px, robot pose noise 0.3 mm and 0.06°",
+            observed,
+        ),
+        (f"Images: {FEW_IMAGES} of 640x480, rendered scenes and arms with typical systematic errors", images),
+    ):
+        head = "fault | captures | named | as | rejected | within 3 σ | warned | silent | off, median: mm | ° | σ"
+        lines += ["", f"## {title}", "", *table(head, (_cells(case, row) for case, row in rows.items()))]
+    return "\n".join(lines) + "\n"
 
 
 def calibrated(
@@ -255,9 +272,7 @@ def _judged(
 ) -> Outcome:
     """Compare a calibration with the truth that is farthest from it."""
     covariance = hand_eye.covariance[:6, :6]
-    std = np.sqrt(np.diag(covariance))
-    steps = [step_between(hand_eye.gripper_from_camera, x) for x in truths]
-    step = max(steps, key=lambda one: float(np.abs(one / std).max()))
+    step, sigmas = farthest(hand_eye.gripper_from_camera, covariance, truths)
     joint_p = float(chdtrc(6, squared_distance(step, covariance)))
     # Findings that a user reads as a warning; insufficient accuracy is no fault.
     kinds = frozenset(
@@ -266,34 +281,10 @@ def _judged(
         if one.severity != "informs" and one.kind is not FindingKind.NOT_EXACT_ENOUGH
     )
     remarks = frozenset(one.kind for one in hand_eye.findings if one.severity == "informs")
-    sigmas = float(np.abs(step / std).max())
     return Outcome(hand_eye.converged, kinds, remarks, left_out, *mm_deg(step), sigmas, joint_p)
 
 
 Rows = dict[Case, list[Outcome]]
-
-
-def page(observed: Rows, images: Rows, clean: Sequence[Outcome], clean_images: Sequence[Outcome]) -> str:
-    """Return the page of measured captures in Markdown."""
-    lines = [
-        _claim("observations", observed, clean),
-        _claim("images through `jcr calibrate`", images, clean_images),
-        "",
-        "*named*: a finding that warns or rejects names the fault, or the wrong images are left out. *within 3 σ*: "
-        "accepted, on every axis and jointly (p > 0.27 %). *warned*: accepted with a warning and farther off. "
-        "**silent**: accepted without a warning and farther off. A camera that moved is compared before and after, "
-        "whichever is farther. Positions too long in one proportion change nothing that an image shows.",
-    ]
-    for title, rows in (
-        (
-            f"Observations: {IMAGES} images, 500 points with 0.4 px, robot pose noise 0.3 mm and 0.06°",
-            observed,
-        ),
-        (f"Images: {FEW_IMAGES} of 640x480, rendered scenes and arms with typical systematic errors", images),
-    ):
-        head = "fault | captures | named | as | rejected | within 3 σ | warned | silent | off, median: mm | ° | σ"
-        lines += ["", f"## {title}", "", *table(head, (_cells(case, row) for case, row in rows.items()))]
-    return "\n".join(lines) + "\n"
 
 
 def _claim(what: str, rows: Rows, clean: Sequence[Outcome]) -> str:

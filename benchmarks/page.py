@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg
+from jcr.geometry import step_between
 from jcr.records import Capture
 
 
@@ -44,8 +44,16 @@ def squared_distance(
 
 def apart(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
     """Return the distance of two hand-eye transforms in mm and degrees."""
-    mm = 1e3 * float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
-    return mm, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
+    return mm_deg(step_between(x, reference))
+
+
+def farthest(
+    found: Float[ndarray, "4 4"], covariance: Float[ndarray, "6 6"], truths: Iterable[Float[ndarray, "4 4"]]
+) -> tuple[Float[ndarray, "6"], float]:
+    """Return the step to the truth that is farthest in standard deviations on an axis, and that number."""
+    steps, std = [step_between(found, true) for true in truths], np.sqrt(np.diag(covariance))
+    sigmas = [float(np.abs(step / std).max()) for step in steps]
+    return steps[int(np.argmax(sigmas))], max(sigmas)
 
 
 def of_rows(capture: Capture, rows: Sequence[int]) -> Capture:

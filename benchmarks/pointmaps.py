@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.stats import chi2
 
 import jcr
-from benchmarks.page import mm_deg, squared_distance, table
+from benchmarks.page import farthest, mm_deg, squared_distance, table
 from jcr.camera import unproject
 from jcr.capture.formats import capture_json
 from jcr.capture.read import read_capture
@@ -143,9 +143,7 @@ def with_fault(what: str, focal: float, given: bool, faults: Faults, is_shuffled
             found = jcr.calibrate(made, Path(folder) / "out", options)
         except RejectedError as error:
             return [what, "given" if given else "none", "rejected", str(error), *["–"] * 5]
-    std = np.sqrt(np.diag(found.covariance)[:6])
-    steps = [step_between(found.gripper_from_camera, true) for true in (mounts[0], mounts[-1])]
-    step = max(steps, key=lambda one: float(np.abs(one / std).max()))
+    step, sigmas = farthest(found.gripper_from_camera, found.covariance[:6, :6], (mounts[0], mounts[-1]))
     seen, true = (unproject(one, np.zeros(2)) for one in (found.reconstruction.intrinsics, camera))
     points = [
         apply(a, 0.6 * ray / np.linalg.norm(ray))
@@ -158,6 +156,6 @@ def with_fault(what: str, focal: float, given: bool, faults: Faults, is_shuffled
     names_found = (
         ", ".join(dict.fromkeys(one.kind for one in found.findings if one.severity != "informs")) or "–"
     )
-    sizes = [f"{one:.2f}" for one in (*mm_deg(step), np.abs(step / std).max())]
+    sizes = [f"{one:.2f}" for one in (*mm_deg(step), sigmas)]
     corner = [f"{one:.1f}" for one in (1e3 * np.linalg.norm(points[0] - points[1]), within)]
     return [what, "given" if given else "none", found.verdict, names_found, *sizes, *corner]
