@@ -141,15 +141,10 @@ def test_resampled_pixels_show_what_their_rays_see(factor: int) -> None:
     assert np.abs(difference).max() < 0.6
 
 
-def reaching(camera: Intrinsics) -> np.ndarray:
-    """Rays all over the image."""
-    u, v = np.meshgrid(np.linspace(5, camera.width - 6, 15), np.linspace(5, camera.height - 6, 11))
-    return unproject(camera, np.stack([u, v], -1))
-
-
 @pytest.mark.parametrize("camera", MODELS)
 def test_each_model_is_opencvs_and_has_its_inverse_and_derivatives(camera: Intrinsics):
-    x = 0.8 * reaching(camera)
+    u, v = np.meshgrid(np.linspace(5, camera.width - 6, 15), np.linspace(5, camera.height - 6, 11))
+    x = 0.8 * unproject(camera, np.stack([u, v], -1))
     project_by = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
     flat, origin = x.reshape(-1, 1, 3), np.zeros(3)
     expected = project_by(flat, origin, origin, camera.matrix, np.array(camera.distortion))[0]

@@ -27,7 +27,7 @@ from jcr.pipeline.options import VerifyOptions
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import touch
 from jcr.pipeline.verify import _judged, _of_two
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture
 from jcr.result import RunOptions, RunResult
 from scenes import reconstruction_of, reference_of
 from simulation.capture import with_robot_noise
@@ -57,14 +57,6 @@ def cameras(capture: Capture, x: np.ndarray) -> np.ndarray:
     """recon_from_camera of every image, in a frame and unit of no meaning."""
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
     return scale_translation(recon_from_base @ capture.base_from_gripper @ x, 1 / SCALE)
-
-
-@pytest.fixture(scope="module")
-def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
-    """Of the old images, as a structure from motion without error would give."""
-    intrinsics = capture.intrinsics
-    assert intrinsics is not None
-    return reconstruction_of(cameras(capture, x)[:OLD], intrinsics=intrinsics)
 
 
 def drifts(
@@ -127,7 +119,7 @@ def test_a_moved_table_is_distinguished_from_a_moved_camera(capture: Capture, x:
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstruction: Reconstruction) -> Path:
+def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, x: np.ndarray) -> Path:
     """The run folder of a calibration from the first nine images, with the noise of a good robot."""
     folder = tmp_path_factory.mktemp("run")
     content = json.loads((capture.folder / "capture.json").read_text())
@@ -136,6 +128,8 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
         frame["base_from_gripper"] = pose.tolist()
     old = write_capture(folder / "yesterday", capture, noisy, range(OLD))
     (folder / "out").mkdir()
+    # As a structure from motion without error would give.
+    reconstruction = reconstruction_of(cameras(capture, x)[:OLD], intrinsics=capture.intrinsics)
     hand_eye = calibrate_reconstruction(old, reconstruction)
     assert hand_eye.converged
     write_calibration(folder / "out/calibration.json", hand_eye)

@@ -9,7 +9,7 @@ import pytest
 
 from jcr.calibration.case import with_findings
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.record import Calibration, read_calibration
+from jcr.calibration.record import read_calibration
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
 from jcr.calibration.words import summary
 from jcr.errors import InputError
@@ -59,12 +59,6 @@ def example(kind: FindingKind) -> Finding:
     )
 
 
-@pytest.fixture(scope="module")
-def solved() -> Calibration:
-    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
-    return solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-
-
 @pytest.mark.parametrize("kind", FindingKind)
 def test_every_kind_has_words_of_one_line(kind: FindingKind):
     finding = example(kind)
@@ -79,7 +73,9 @@ def test_what_a_kind_explains_are_kinds_and_its_group_has_a_title(kind: FindingK
     assert kind not in kind.row.explains
 
 
-def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solved: Calibration):
+def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences():
+    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
+    solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert solved.verdict == "accepted"
     shift = (0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01)
     fault = replace(example(FindingKind.DELAY), concerns="poses", shift=shift)

@@ -228,19 +228,13 @@ def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture: Path, smal
     np.testing.assert_array_equal(mapped.gripper_from_camera, whole.gripper_from_camera)
 
 
-def result_points(done: Path) -> np.ndarray:
-    """A few hundred points of a run's cloud."""
-
-    return read_cloud(done / "cloud.ply").points_in_base[::500]
-
-
 def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     truth = json.loads((tabletop / "truth" / "scene.json").read_text())
     table = truth["table_height"]
     capture = jcr.read_capture(tabletop)
     over = capture.base_from_gripper[:, :2, 3].mean(0)
     points = tmp_path / "points.csv"
-    surface = result_points(done)
+    surface = read_cloud(done / "cloud.ply").points_in_base[::500]
     rows = [[over[0], over[1], table + 0.3], [9.0, 9.0, 9.0], *surface]
     points.write_text("x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in rows))
     answered = run_jcr("query", done, points, "--json")

@@ -118,15 +118,10 @@ def reconstructed(capture: Capture, predict) -> Reconstruction:
     return reconstruct_any_view(capture, lambda weights, device: predict, weights, "cpu", "da3")
 
 
-@pytest.fixture(scope="module")
-def found(capture: Capture) -> Reconstruction:
-    """By one pass of the model."""
-    return reconstructed(capture, Fake())
-
-
-def test_matches_by_colour_put_predicted_cameras_right(capture: Capture, found: Reconstruction) -> None:
+def test_matches_by_colour_put_predicted_cameras_right(capture: Capture) -> None:
     from jcr.calibration.stage import calibrate_reconstruction
 
+    found = reconstructed(capture, Fake())
     assert found.evidence is None and "refined" in found.notes[-1]
     truth = base_from_camera()
     base, scale = fit_similarity(truth[:, :3, 3], found.recon_from_camera[:, :3, 3])

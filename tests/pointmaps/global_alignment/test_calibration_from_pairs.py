@@ -91,15 +91,12 @@ def case(
     )
 
 
-def slipped(gripper: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the poses under which the camera slips by 6 mm and 2° after the fifth image."""
-    slip = transform(rotation_exp(np.radians([1.2, -1.2, 1.0])), np.array([0.004, -0.003, 0.003]))
-    return np.concatenate([gripper[:5], gripper[5:] @ x @ inverse(x @ slip)])
-
-
 def test_a_slip_is_named_beside_a_wrong_focal_length():
     made = case(12, 3, (1e-4, 3e-4), PairErrors(focal=0.03))
-    poses = slipped(made.capture.base_from_gripper, made.gripper_from_camera)
+    gripper, x = made.capture.base_from_gripper, made.gripper_from_camera
+    # By 6 mm and 2° after the fifth image.
+    slip = transform(rotation_exp(np.radians([1.2, -1.2, 1.0])), np.array([0.004, -0.003, 0.003]))
+    poses = np.concatenate([gripper[:5], gripper[5:] @ x @ inverse(x @ slip)])
     wrong = replace(made, capture=replace(made.capture, base_from_gripper=poses))
     assert (
         calibrate_reconstruction(wrong.capture, wrong.reconstruction()).findings[0].kind is FindingKind.SLIP
