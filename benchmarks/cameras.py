@@ -117,7 +117,7 @@ def run(captures: Path, every: int = 1) -> str:
     real = [row for folder in folders_with_captures(captures, every) for row in _withheld(folder)]
     drawn, rows = [], []
     for kind, preset in product(get_args(Kind), PRESET_NAMES):
-        for name, draws in _draws(kind, preset, DRAWS // every).items():
+        for name, draws in _draws(kind, preset, max(DRAWS // every, 1)).items():
             drawn += draws
             middle, most = (np.quantile([draw[:2] for draw in draws], share, axis=0) for share in (0.5, 0.95))
             sizes = [f"{mm:.2f} mm {deg:.3f}°" for mm, deg in (middle, most)]

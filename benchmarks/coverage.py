@@ -62,9 +62,9 @@ SOLVERS: dict[str, Callable[[BentProblem], Calibration]] = {
 
 def run(every: int = 1) -> str:
     """Return the page in Markdown, of one arm and one draw in `every`: claims, then the three tables."""
-    draws = DRAWS // every
+    draws = max(DRAWS // every, 1)
     robots, seen = measure_robots(ROBOT_NAMES[::every]), measure_seen(draws)
-    ahead = predicted(PREDICTED_DRAWS // every)
+    ahead = predicted(max(PREDICTED_DRAWS // every, 1))
     return "\n".join([*_claims(robots, seen, ahead), *_tables(robots, seen, draws, ahead)]) + "\n"
 
 

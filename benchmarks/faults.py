@@ -205,9 +205,8 @@ def run(every: int = 1) -> str:
     images = {case: [through_images(1, case.fault, case.given)]
               for case in RENDERED[::every] if isinstance(case.fault, ImageFault)}  # fmt: skip
     clean = []
-    for seed in range(
-        CLEAN // every
-    ):  # 8 to 20 images, robots of 0.1 to 0.45 mm, intrinsics given and estimated
+    # 8 to 20 images, robots of 0.1 to 0.45 mm, intrinsics given and estimated
+    for seed in range(max(CLEAN // every, 1)):
         size = 2.0 ** (seed % 4 - 1)
         faults = Faults(robot_noise=(1e-4 * size + 5e-5, 3e-4 * size))
         clean.append(outcome(*calibrated(faults, 1000 + seed, (8, 12, 20)[seed % 3], seed % 2 == 0)))

@@ -281,8 +281,8 @@ def camera_errors(base_from_camera: Poses, recon_from_camera: Poses) -> tuple[fl
 def run(every: int = 1) -> str:
     """Return the page in Markdown, with one in `every` of the captures of solvers and images."""
     parts = {
-        "Hand-eye solvers": solvers_page(range(TRIALS // every)),
-        "Images": images_page(range(CAPTURES // every)),
+        "Hand-eye solvers": solvers_page(range(max(TRIALS // every, 1))),
+        "Images": images_page(range(max(CAPTURES // every, 1))),
         "Global alignment": alignment_page(),
     }
     claims, lines = [], []
