@@ -36,28 +36,20 @@ class Convention:
     rotation: str
     """Notation of the rotation: a key of QUATERNIONS, `rotvec`, `matrix`, or SciPy's sequence of Euler angles (lower
     case: about fixed axes, upper case: about moving axes)."""
-    length: str = "m"
-    angle: str = "rad"
+    usual: UnitsName = "m-rad"
+    """Units of position and angle that the robot uses."""
 
     @property
     def has_angles(self) -> bool:
         """True if the pose has numbers in a unit of angle; False if its rotation is a quaternion or a matrix."""
         return self.rotation not in (*QUATERNIONS, "matrix")
 
-    def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
-        """Return the units of position and angle, such as ("mm", "deg"), from `asked` ("mm-deg").
-
-        For `asked` "auto" they are the usual units of this convention.
-        """
-        length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
-        return length, angle
-
     def scales(self, asked: UnitsName) -> tuple[float, float]:
         """Return the factors from the pose's numbers to metres and to radians, for the units `asked`, such as "mm-deg".
 
         For `asked` "auto" they are those of the convention's usual units.
         """
-        length, angle = self.units(asked)
+        length, angle = (self.usual if asked == "auto" else asked).split("-")
         return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
 
@@ -75,12 +67,12 @@ CONVENTIONS = {
     "rpy": Convention(_XYZ + _RPY, "xyz"),
     "ur": Convention(_XYZ + _VECTOR, "rotvec"),
     "franka": Convention(tuple(f"m{row}{column}" for column in range(4) for row in range(4)), "matrix"),
-    "xarm": Convention(_XYZ + _RPY, "xyz", "mm", "deg"),
-    "xarm-axis-angle": Convention(_XYZ + _VECTOR, "rotvec", "mm", "deg"),
-    "kuka": Convention((*_XYZ, "a", "b", "c"), "ZYX", "mm", "deg"),
-    "fanuc": Convention((*_XYZ, "w", "p", "r"), "xyz", "mm", "deg"),
-    "yaskawa": Convention(_XYZ + _VECTOR, "xyz", "mm", "deg"),
-    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), "wxyz", "mm"),
+    "xarm": Convention(_XYZ + _RPY, "xyz", "mm-deg"),
+    "xarm-axis-angle": Convention(_XYZ + _VECTOR, "rotvec", "mm-deg"),
+    "kuka": Convention((*_XYZ, "a", "b", "c"), "ZYX", "mm-deg"),
+    "fanuc": Convention((*_XYZ, "w", "p", "r"), "xyz", "mm-deg"),
+    "yaskawa": Convention(_XYZ + _VECTOR, "xyz", "mm-deg"),
+    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), "wxyz", "mm-rad"),
     "unitree": Convention(_XYZ + _RPY, "xyz"),
     "realman": Convention(_XYZ + _WXYZ, "wxyz"),
 }

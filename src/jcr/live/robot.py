@@ -114,7 +114,7 @@ def pose_columns(convention: ConventionName, units: UnitsName) -> str:
         return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
     form = CONVENTIONS[convention]
     names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
-    return f"{names}; {', '.join(form.units(units))}"
+    return f"{names}; {(form.usual if units == 'auto' else units).replace('-', ', ')}"
 
 
 def states_of(source: str) -> States | None:

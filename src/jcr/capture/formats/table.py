@@ -188,7 +188,7 @@ def _named_columns(
             convention = _convention_of(names, where)
         units = options.pose_units
         if units == "auto" and {*stated} - {"", "s", "ns"}:
-            length, angle = CONVENTIONS[convention].units()
+            length, angle = CONVENTIONS[convention].usual.split("-")
             length = next((unit for unit in METRES if unit in stated), length)
             angle = next((unit for unit in ("deg", "rad") if unit in stated), angle)
             units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
