@@ -46,6 +46,7 @@ def test_blur_is_measured_by_the_image_itself(tabletop: Path):
     for blurred in (cv2.GaussianBlur(sharp[0], (0, 0), 5), cv2.filter2D(sharp[0], -1, along)):
         assert edge_width(np.asarray(blurred, np.uint8)) > BLURRED_EDGE
     assert edge_width(RNG.normal(120, 4, sharp[0].shape).astype(np.uint8)) == 0.0
+    assert edge_width(sharp[0][:16, :16]) == 0.0, "too small to be measured"
 
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():

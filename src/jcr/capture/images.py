@@ -27,6 +27,8 @@ BLURRED_EDGE = 1 / 80
 """Largest `edge_width` of a sharp image; images of eleven real arms have 1/300 to 1/98."""
 EDGES_AT = 640
 """Long side (px) to which images are reduced before edges are measured; smaller images are measured as they are."""
+FAR_PX = 16
+"""Distance over which the whole rise of grey levels across an edge is measured."""
 LEAST_CONTRAST = 20
 """Smallest rise of grey levels across the strongest edges from which their width is measured."""
 ONE_VIEW = 0.25
@@ -140,14 +142,16 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
 
     The image is first reduced to a long side of 640 px; a smaller one is not, but counts as one of 640 px. The width is
     2 px times the ratio of the grey-level differences (99 % quantiles) over 16 and 2 px, divided by 640. Sharp edges
-    have 1/320, the largest width is 1/40, and 0 means no edges.
+    have 1/320, the largest width is 1/40, and 0 means no edges. An axis of 16 px or fewer is not measured.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = min(EDGES_AT / max(grey.shape), 1.0)
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32)
     widths = [0.0]
     for along in (grey, grey.T):
-        near, far = (float(np.quantile(np.abs(along[n:] - along[:-n]), 0.99)) for n in (2, 16))
+        if len(along) <= FAR_PX:
+            continue
+        near, far = (float(np.quantile(np.abs(along[n:] - along[:-n]), 0.99)) for n in (2, FAR_PX))
         if far > LEAST_CONTRAST:
             widths.append(2 * far / max(near, 1.0) / EDGES_AT)
     return max(widths)
