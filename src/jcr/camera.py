@@ -1,19 +1,20 @@
 """Camera models of OpenCV: projection with derivatives, unprojection, resizing, cropping, undistortion of images.
 
 Models: pinhole with five distortion coefficients, rational with eight, rational with thin prism with twelve ("Camera
-Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_radial`,
-`_distorted`, `_slopes`, `by_parameters` and, for the fisheye, `_fisheye_rays` depend on the model.
+Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_distorted` and, for
+the fisheye, `_fisheye_rays` depend on the model. Derivatives are exact: the imaginary part of the distortion after a
+tiny imaginary step (Squire and Trapp, SIAM Review 40, 1998).
 Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
 precision: float32 points give float32 pixels.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Inexact, UInt8
 from numpy import ndarray
 
 from jcr.records import COEFFICIENTS, Intrinsics
@@ -26,7 +27,9 @@ WITHIN_FOLD = 0.9
 """Share of `fold_distance_px` up to which a distortion is inverted."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
 """Camera whose pixel coordinates are x/z, y/z."""
-Coordinate = Float[ndarray, "*batch"] | np.floating
+Coordinate = Inexact[ndarray, "*batch"] | np.inexact
+STEP = 1e-20
+"""Length of the imaginary step, whose square is below all rounding."""
 _WIDEST_TANGENT = 10.0
 """Tangent of the largest angle of a ray to the optical axis that the models describe, 84°."""
 _WIDEST_ANGLE = float(np.arctan(_WIDEST_TANGENT))
@@ -75,7 +78,7 @@ def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Floa
     """
     x, y, z = x_in_camera[..., 0], x_in_camera[..., 1], x_in_camera[..., 2]
     if is_distorted(camera):
-        x, y = _distorted(camera, x / z, y / z)
+        x, y = _distorted(camera.model, camera.distortion, x / z, y / z)
         return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=-1)
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
 
@@ -92,11 +95,10 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
     found = target
     for _ in range(30 if is_distorted(camera) else 0):
         x, y = found[..., 0], found[..., 1]
-        error = np.stack(_distorted(camera, x, y), axis=-1) - target
+        error = np.stack(_distorted(camera.model, camera.distortion, x, y), axis=-1) - target
         if np.abs(error).max(initial=0.0) < 1e-13:
             break
-        slopes = np.stack(_slopes(camera, x, y), axis=-1).reshape(*x.shape, 2, 2)
-        found = found - np.linalg.solve(slopes, error[..., None])[..., 0]
+        found = found - np.linalg.solve(_slopes(camera, x, y), error[..., None])[..., 0]
     return np.concatenate([found, np.ones_like(found[..., :1])], axis=-1)
 
 
@@ -107,10 +109,10 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
     """
     depth = x_in_camera[..., 2]
     x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
-    x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, x, y)
     out = np.empty((*x.shape, 2, 3), x.dtype)
-    out[..., 0, 0], out[..., 0, 1] = camera.fx * x_by_x / depth, camera.fx * x_by_y / depth
-    out[..., 1, 0], out[..., 1, 1] = camera.fy * y_by_x / depth, camera.fy * y_by_y / depth
+    out[..., :2] = _slopes(camera, x, y) / depth[..., None, None]
+    out[..., 0, :2] *= camera.fx
+    out[..., 1, :2] *= camera.fy
     out[..., 2] = -(out[..., 0] * x[..., None] + out[..., 1] * y[..., None])
     return out
 
@@ -123,86 +125,53 @@ def by_parameters(
     The rows are pixel x and y, the columns fx, fy, cx, cy and the distortion coefficients. Points have z > 0.
     """
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
-    r2, xy, none = x * x + y * y, 2 * x * y, np.zeros_like(x)
     out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
-    out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
+    out[..., 0, 0], out[..., 1, 1] = _distorted(camera.model, camera.distortion, x, y)
     out[..., 0, 2] = out[..., 1, 3] = 1.0
-    # Derivatives of the distorted coordinates by the distortion coefficients:
-    if camera.model == "fisheye":
-        r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
-        shares = [np.arctan(r) ** power / r for power in (3, 5, 7, 9)]
-        of_x, of_y = [x * share for share in shares], [y * share for share in shares]
-    else:
-        above, below = [r2, r2**2, r2**3], []
-        if camera.model in ("rational", "thin_prism"):
-            k4, k5, k6 = list(camera.distortion)[5:8]
-            denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-            above = [power / denominator for power in above]
-            below = [-_radial(camera, r2)[0] * power for power in above]
-        of_x = [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)]
-        of_y = [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)]
-        if camera.model == "thin_prism":
-            of_x += [r2, r2 * r2, none, none]
-            of_y += [none, none, r2, r2 * r2]
-    out[..., 0, 4:], out[..., 1, 4:] = camera.fx * np.stack(of_x, -1), camera.fy * np.stack(of_y, -1)
+    for k, along in enumerate(1j * STEP * np.eye(len(camera.distortion))):
+        x_out, y_out = _distorted(camera.model, (camera.distortion + along).tolist(), x, y)
+        out[..., 0, 4 + k], out[..., 1, 4 + k] = (
+            camera.fx * x_out.imag / STEP,
+            camera.fy * y_out.imag / STEP,
+        )
     return out
 
 
-def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Return the distorted coordinates x and y of rays (x, y, 1), before focal lengths and principal point."""
-    r2 = x * x + y * y
-    radial, _ = _radial(camera, r2)
-    if camera.model == "fisheye":
-        return x * radial, y * radial
-    p1, p2 = camera.distortion[2:4]
-    x_out = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    y_out = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    if camera.model != "thin_prism":
-        return x_out, y_out
-    s1, s2, s3, s4 = list(camera.distortion)[8:]
-    return x_out + r2 * (s1 + s2 * r2), y_out + r2 * (s3 + s4 * r2)
+def _distorted(
+    model: str, distortion: Sequence[float | complex], x: Coordinate, y: Coordinate
+) -> tuple[Coordinate, Coordinate]:
+    """Return the distorted coordinates x and y of rays (x, y, 1), before focal lengths and principal point.
 
-
-def _slopes(
-    camera: Intrinsics, x: Coordinate, y: Coordinate
-) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Return derivatives of the distorted coordinates of `_distorted`: of x by x, x by y, y by x, y by y.
-
-    `x` and `y` are the undistorted coordinates of rays (x, y, 1).
+    `distortion` holds the coefficients of the `model` of Intrinsics. Coefficients and coordinates may be complex.
     """
     r2 = x * x + y * y
-    radial, slope = _radial(camera, r2)
-    by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
-    if camera.model == "fisheye":
-        return by_x, cross, cross, by_y
-    p1, p2 = camera.distortion[2:4]
-    by_x, by_y = by_x + 2 * p1 * y + 6 * p2 * x, by_y + 6 * p1 * y + 2 * p2 * x
-    cross = cross + 2 * (p1 * x + p2 * y)
-    if camera.model != "thin_prism":
-        return by_x, cross, cross, by_y
-    s1, s2, s3, s4 = list(camera.distortion)[8:]
-    in_x, in_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
-    return by_x + x * in_x, cross + y * in_x, cross + x * in_y, by_y + y * in_y
-
-
-def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Return the radial distortion factor of rays (x, y, 1) with x² + y² = r2, and its derivative by r2."""
-    if camera.model == "fisheye":
-        k = camera.distortion
+    if model == "fisheye":
+        k1, k2, k3, k4 = distortion
         r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
         angle = np.arctan(r)
         a2 = angle * angle
-        bent = angle * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
-        by_angle = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])))
-        return bent / r, (by_angle / (1 + r * r) - bent / r) / (2 * r * r)
-    k1, k2, _, _, k3, *more = list(camera.distortion)
+        radial = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r
+        return x * radial, y * radial
+    k1, k2, p1, p2, k3, *more = distortion
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    if not more:
-        return radial, slope
-    k4, k5, k6 = more[:3]
-    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    return radial / below, (slope - radial / below * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    if more:
+        k4, k5, k6 = more[:3]
+        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    x_out = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    y_out = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    if model != "thin_prism":
+        return x_out, y_out
+    s1, s2, s3, s4 = more[3:]
+    return x_out + r2 * (s1 + s2 * r2), y_out + r2 * (s3 + s4 * r2)
+
+
+def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> Float[ndarray, "*batch 2 2"]:
+    """Return the derivatives (...,2,2) of the coordinates that `_distorted` returns by x and y (columns)."""
+    out = np.empty((*x.shape, 2, 2), x.dtype)
+    for column, moved in enumerate(((x + 1j * STEP, y), (x, y + 1j * STEP))):
+        x_out, y_out = _distorted(camera.model, camera.distortion, *moved)
+        out[..., 0, column], out[..., 1, column] = x_out.imag / STEP, y_out.imag / STEP
+    return out
 
 
 def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
@@ -238,8 +207,8 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)[:, None]
     ray = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones((4001, len(angle)))], axis=-1)
-    x_by_x, x_by_y, y_by_x, y_by_y = _slopes(camera, ray[..., 0], ray[..., 1])
-    folded = x_by_x * y_by_y <= x_by_y * y_by_x
+    slopes = _slopes(camera, ray[..., 0], ray[..., 1])
+    folded = slopes[..., 0, 0] * slopes[..., 1, 1] <= slopes[..., 0, 1] * slopes[..., 1, 0]
     x_px = project(camera, ray)
     outside = ((x_px < -0.5) | (x_px > [camera.width - 0.5, camera.height - 0.5])).any(-1)
     # A ray that is still in the frame at the widest angle counts as folded there.
