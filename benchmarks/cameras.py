@@ -107,8 +107,13 @@ def answered(problem: CellProblem, seed: int) -> Solution:
         rig_from_camera=problem.rig_from_camera,
         points_in_world=problem.points_in_world,
     )
-    unseen = Problem(arms=tuple(problem.arms), n_rigs=len(state.world_from_rig), cameras=tuple(cameras))
-    return solve(*with_observations(unseen, state, problem.observations))
+    cell = Problem(
+        arms=tuple(problem.arms),
+        n_rigs=len(state.world_from_rig),
+        cameras=tuple(cameras),
+        observations=problem.observations,
+    )
+    return solve(*with_observations(cell, state))
 
 
 def run(captures: Path, every: int = 1) -> str:

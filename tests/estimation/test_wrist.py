@@ -177,6 +177,7 @@ def two_cameras(nuisances: bool) -> tuple[CellProblem, Problem, State]:
         arms=tuple(cell.arms),
         n_rigs=len(cell.world_from_rig),
         cameras=(own, replace(second, mount_free=True)),
+        observations=cell.observations,
     )
     if nuisances:
         problem = replace(
@@ -192,7 +193,7 @@ def two_cameras(nuisances: bool) -> tuple[CellProblem, Problem, State]:
         rig_from_camera=cell.rig_from_camera,
         points_in_world=cell.points_in_world,
     )
-    return cell, *with_observations(problem, state, cell.observations)
+    return cell, *with_observations(problem, state)
 
 
 @pytest.mark.slow

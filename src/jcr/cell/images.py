@@ -1,7 +1,7 @@
 """Estimation problem of a whole cell: images of all cameras, the capture's own first, and poses of all arms."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +10,7 @@ from numpy import ndarray
 from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
 from jcr.estimation.intrinsics_prior import camera_about
-from jcr.estimation.problem import Observations, Problem, State, freed, with_observations
-from jcr.estimation.solve import Solution, solve
+from jcr.estimation.problem import Observations, Problem, State
 from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
@@ -19,48 +18,11 @@ EXACT = 1e-6
 """Standard deviation (m, rad) added to the covariance of given camera poses."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CellImages:
-    """Estimation problem of a cell (cameras and arms at one scene), its initial state and its observations.
+def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, State]:
+    """Return the estimation problem of a cell and its initial state: own images, then used ones of `members`.
 
-    Camera 0 is the capture's own camera.
+    Camera 0 is the capture's own camera. The world is its recon frame, in metres.
     """
-
-    problem: Problem
-    """Estimation problem of the cell, without its observations."""
-    state: State
-    observations: Observations
-
-    def solved(self) -> Solution:
-        """Return the joint solution of all images and arms."""
-        return solve(*with_observations(self.problem, self.state, self.observations))
-
-    def with_freed(
-        self,
-        camera: int,
-        combinations: Float[ndarray, "e p"] | None,
-        arm: int | None = None,
-        errors: Float[ndarray, "s b"] | None = None,
-    ) -> "CellImages":
-        """Return the cell with additional free parameters of one camera, and additional errors of one arm's poses.
-
-        `combinations` (e,p) are p directions in the e parameters of hypotheses.Row. `errors` (s,b) are the errors of
-        the arm's poses (pose by pose: m, then rad; axes of its base) by b confirmed effects of one standard deviation
-        each. None: nothing is added.
-        """
-        problem = self.problem
-        if combinations is not None:
-            mine = np.flatnonzero(self.observations.camera == camera)
-            problem = freed(problem, combinations, mine, len(self.observations.rig), camera)
-        if arm is not None and errors is not None:
-            arms = list(problem.arms)
-            arms[arm] = replace(arms[arm], confirmed_errors=errors)
-            problem = replace(problem, arms=tuple(arms))
-        return replace(self, problem=problem)
-
-
-def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
-    """Return the estimation problem of a cell (world: own recon frame in m): own images, then used ones of `members`."""
     case, hand_eye = rigs.case, rigs.case.hand_eye
     tracks, prior = case.tracks, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
@@ -93,22 +55,10 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
         cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
         mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
     arms, starts = rigs.arm_poses()
-    return CellImages(
-        problem=Problem(
-            arms=tuple(arms),
-            n_rigs=len(rigs.poses),
-            cameras=tuple(cameras),
-            known_rigs=prior,
-            robot_noise_floor=case.options.robot_noise_m_rad,
-        ),
-        state=State(
-            x=np.stack([x for x, _ in starts]),
-            scale=1.0,
-            z=np.stack([z for _, z in starts]),
-            world_from_rig=np.stack(rigs.poses),
-            rig_from_camera=np.stack(mounts),
-            points_in_world=np.concatenate(points),
-        ),
+    problem = Problem(
+        arms=tuple(arms),
+        n_rigs=len(rigs.poses),
+        cameras=tuple(cameras),
         observations=Observations(
             rig=np.array(rig),
             camera=np.array(camera),
@@ -117,7 +67,18 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> CellImages:
             point=np.concatenate(point),
             std_px=np.concatenate(std_px),
         ),
+        known_rigs=prior,
+        robot_noise_floor=case.options.robot_noise_m_rad,
     )
+    state = State(
+        x=np.stack([x for x, _ in starts]),
+        scale=1.0,
+        z=np.stack([z for _, z in starts]),
+        world_from_rig=np.stack(rigs.poses),
+        rig_from_camera=np.stack(mounts),
+        points_in_world=np.concatenate(points),
+    )
+    return problem, state
 
 
 def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6*m 6*m"]]:

@@ -6,6 +6,7 @@ the arms' poses (estimation/). The calibration of the capture's own camera is no
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -20,14 +21,14 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.capture.images import read_image
-from jcr.cell.images import CellImages, cell_images
+from jcr.cell.images import cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
 from jcr.estimation.hypotheses import Adjustment
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.problem import State
-from jcr.estimation.solve import Solution
+from jcr.estimation.problem import Problem, State, freed, with_observations
+from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, step_between
 from jcr.least_squares import one_blas_thread
@@ -99,7 +100,7 @@ def place_cameras(
             mounted.append(replace(views, number=len(mounted) + 1))
     if not mounted:
         return CamerasFile(cameras=[*cameras.values()], arms=[], version=__version__), None, {}
-    solution, faults = _examined(cell_images(rigs, mounted), mounted, hand_eye)
+    solution, faults = _examined(*cell_images(rigs, mounted), mounted, hand_eye)
     for one, shown in zip(mounted, faults, strict=True):
         cameras[one.camera.name] = _placement(one, solution, hand_eye, shown)
     arms = []
@@ -122,7 +123,8 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
     alone = Rigs(rigs.case, rigs.known)
     alone.poses += list(views.places)
     own = len(rigs.known.recon_from_camera)
-    solution = cell_images(alone, [replace(views, rig=own + np.arange(len(views.used)))]).solved()
+    apart = replace(views, rig=own + np.arange(len(views.used)))
+    solution = solve(*with_observations(*cell_images(alone, [apart])))
     cameras = [replace(views, rig=np.array([own + k])) for k in range(len(views.used))]
     places = [one.parent_from_camera(solution.state) for one in cameras]
     derivatives = [solution.derivative(one.parent_from_camera) for one in cameras]
@@ -140,21 +142,19 @@ def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:
 
 
 def _examined(
-    images: CellImages, mounted: Sequence[CameraViews], hand_eye: Calibration
+    problem: Problem, start: State, mounted: Sequence[CameraViews], hand_eye: Calibration
 ) -> tuple[Solution, list[tuple[Finding, ...]]]:
     """Return the joint solution of all images, and for each camera the findings on effects such as a slip.
 
-    `mounted` are the cameras other than the capture's own. Confirmed effects on the camera's parameters are adopted in
-    the solution. Findings are in the order of `mounted`, and empty for a camera with exact intrinsics or one that is
-    known to have moved. Another arm's poses are tested with its camera; those of the capture's own arm were tested in
-    its calibration.
+    `mounted` are the cameras of `problem` other than the capture's own, `start` is the initial state. Confirmed effects
+    on the camera's parameters are adopted in the solution. Findings are in the order of `mounted`, and empty for a
+    camera with exact intrinsics or one that is known to have moved. Another arm's poses are tested with its camera;
+    those of the capture's own arm were tested in its calibration.
     """
-    solution, found = images.solved(), list[tuple[Finding, ...]]()
+    solution, found = solve(*with_observations(problem, start)), list[tuple[Finding, ...]]()
     for one in mounted:
         # Exact intrinsics are not tested, and neither is a camera that is known to have moved.
-        if not len(images.problem.cameras[one.number].std) or any(
-            fault.shift is not None for fault in one.findings
-        ):
+        if not len(problem.cameras[one.number].std) or any(fault.shift is not None for fault in one.findings):
             found.append(())
             continue
         placed = _placement(one, solution, hand_eye)
@@ -162,9 +162,7 @@ def _examined(
         state, faults = effects(
             Adjustment(
                 solution=solution,
-                adjust=lambda combinations, errors, images=images, one=one: images.with_freed(
-                    one.number, combinations, one.arm, errors
-                ).solved(),
+                adjust=partial(_adjusted, problem, start, one),
                 arm=one.arm or None,
                 names=one.names,
                 is_given=one.camera.intrinsics is not None,
@@ -174,11 +172,31 @@ def _examined(
             )
         )
         if (free := state.combinations) is not None:
-            images = images.with_freed(one.number, free)
-            solution = images.solved()
+            problem = freed(problem, free, one.number)
+            solution = _adjusted(problem, start, one)
             faults = tuple(as_adopted(one) if one.kind.row.group == "camera" else one for one in faults)
         found.append(faults)
     return solution, found
+
+
+def _adjusted(
+    problem: Problem,
+    start: State,
+    views: CameraViews,
+    combinations: Float[ndarray, "e p"] | None = None,
+    errors: Float[ndarray, "s b"] | None = None,
+) -> Solution:
+    """Return the joint solution with free directions of one camera, and errors of its arm's poses (Adjustment.adjust).
+
+    `problem` has all observations of the cell, `start` is its initial state.
+    """
+    if combinations is not None:
+        problem = freed(problem, combinations, views.number)
+    if views.arm is not None and errors is not None:
+        arms = list(problem.arms)
+        arms[views.arm] = replace(arms[views.arm], confirmed_errors=errors)
+        problem = replace(problem, arms=tuple(arms))
+    return solve(*with_observations(problem, start))
 
 
 def _placement(

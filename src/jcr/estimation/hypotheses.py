@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import parameter_names
@@ -25,7 +25,6 @@ from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
     UNKNOWNS,
-    Problem,
     State,
     columns_of_arm,
     rows_of,
@@ -217,7 +216,7 @@ class Adjustment:
         assert self.camera is not None
         solution, state = self.solution, self.solution.images.state
         problem, likely = solution.problem, solution.most_likely
-        rows, units, weak = _rows_of(problem, self.camera)
+        rows, units, weak = rows_of(problem, self.camera)
         first = problem.columns.cameras.stop
         each = np.zeros((len(problem.directions), len(rows)))
         each[rows] = np.diag(units)
@@ -276,7 +275,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
     assert model.camera is not None
     problem, solution, d = after.solution.problem, after.solution, row.columns.shape[1]
     # The effect is the part of the freed directions along its columns, which no nuisance direction shares.
-    rows, units, _ = _rows_of(problem, model.camera)
+    rows, units, _ = rows_of(problem, model.camera)
     freed = slice(problem.columns.cameras.stop - len(problem.freed_std), problem.columns.cameras.stop)
     along = np.linalg.pinv(row.both)[-d:] @ (problem.directions[rows, freed] / units[:, None])
     unknowns = solution.camera_unknowns(freed)
@@ -518,17 +517,6 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
         yield Row(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
     if len(problem.cameras) == 1:  # all images have the same lens
         yield Row(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
-
-
-def _rows_of(
-    problem: Problem, camera: int
-) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
-    """Return the rows, units and weak prior standard deviations of problem.rows_of for the camera with index `camera`.
-
-    The problem must have observations; all images of the camera are included.
-    """
-    assert problem.observations is not None
-    return rows_of(problem, camera, np.flatnonzero(problem.observations.camera == camera), problem.n_images)
 
 
 def _dispersion(images: ImageEvidence) -> float:

@@ -372,13 +372,15 @@ class Problem:
         return out
 
 
-def with_observations(problem: Problem, state: State, observations: Observations) -> tuple[Problem, State]:
+def with_observations(problem: Problem, state: State) -> tuple[Problem, State]:
     """Return the problem with the observations of all points that have two or more, and its initial state.
 
     `observations.point` are rows of `state.points_in_world`; points that are left out are removed from state and
     boards. Observations are sorted by point and rig. Only the first observation of a point in an image is kept, and
     points are numbered anew. Intrinsics and boards start at the means of their priors.
     """
+    observations, boards = problem.observations, problem.boards
+    assert observations is not None
     rig = observations.rig[observations.image]
     order = np.lexsort((observations.image, rig, observations.point))
     point, image = observations.point[order], observations.image[order]
@@ -386,7 +388,6 @@ def with_observations(problem: Problem, state: State, observations: Observations
     count = np.bincount(observations.point[order], minlength=len(state.points_in_world))
     order = order[count[observations.point[order]] >= 2]
     kept, point = np.unique(observations.point[order], return_inverse=True)
-    boards = problem.boards
     if boards is not None:
         corners = np.flatnonzero(np.isin(boards.point, kept))
         boards = replace(
@@ -396,18 +397,15 @@ def with_observations(problem: Problem, state: State, observations: Observations
             x_in_body=boards.x_in_body[corners],
             by_shape=boards.by_shape[corners],
         )
-    problem = replace(
-        problem,
-        boards=boards,
-        observations=replace(
-            observations,
-            image=observations.image[order],
-            x_px=observations.x_px[order],
-            point=point,
-            std_px=observations.std_px[order],
-            point_rows=kept,
-        ),
+    observations = replace(
+        observations,
+        image=observations.image[order],
+        x_px=observations.x_px[order],
+        point=point,
+        std_px=observations.std_px[order],
+        point_rows=kept,
     )
+    problem = replace(problem, boards=boards, observations=observations)
     state = replace(
         state,
         points_in_world=state.points_in_world[kept],
@@ -424,45 +422,35 @@ WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
 
 
 def rows_of(
-    problem: Problem, camera: int, images: Int[ndarray, " m"], n_images: int
+    problem: Problem, camera: int
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
     """Return three vectors for the e parameters of a camera, its m images and the prism: rows, units, weak prior std.
 
     Rows are those of `Problem.directions`: q intrinsics; focal lengths, shears, x and y offsets of the m images; s1 to
     s4. Units are fx and fy for the focal lengths, the image width for the principal point, else 1. The standard
-    deviations are in these units. `images` are the indices of the camera's images among all `n_images`.
+    deviations are in these units. `camera` is the camera's index; the problem must have observations.
     """
-    intrinsics, own, end = (
-        problem.cameras[camera].intrinsics,
-        problem.parameters_of[camera],
-        problem.parameters_of[-1].stop,
-    )
-    more, m = own.stop - own.start - 4, len(images)
-    of_images = (n_images * np.arange(OF_IMAGE)[:, None] + images).ravel()
-    rows = np.r_[own, end + of_images, end + OF_IMAGE * n_images + np.arange(PRISM)]
+    assert problem.observations is not None
+    intrinsics, own, n = problem.cameras[camera].intrinsics, problem.parameters_of[camera], problem.n_images
+    images, end = np.flatnonzero(problem.observations.camera == camera), problem.parameters_of[-1].stop
+    of_images = (n * np.arange(OF_IMAGE)[:, None] + images).ravel()
+    rows = np.r_[own, end + of_images, end + OF_IMAGE * n + np.arange(PRISM)]
     units = np.ones(len(rows))
     units[:4] = intrinsics.fx, intrinsics.fy, intrinsics.width, intrinsics.width
-    of_each = np.repeat(WEAK_OF_IMAGE, m)
+    of_each, more = np.repeat(WEAK_OF_IMAGE, len(images)), own.stop - own.start - 4
     return rows, units, np.r_[WEAK, np.full(more, WEAK_DISTORTION), of_each, np.full(PRISM, WEAK_PRISM)]
 
 
-def freed(
-    problem: Problem,
-    combinations: Float[ndarray, "e p"],
-    images: Int[ndarray, " m"],
-    n_images: int,
-    camera: int = 0,
-) -> Problem:
+def freed(problem: Problem, combinations: Float[ndarray, "e p"], camera: int = 0) -> Problem:
     """Return the problem with additional free directions, in the parameters of one camera and of its images.
 
     `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. The intrinsics part
-    and the rest of the columns are freed independently, with the weak prior of `rows_of`. `images` are the indices of
-    the camera's m images among all `n_images`.
+    and the rest of the columns are freed independently, with the weak prior of `rows_of`.
     """
-    rows, units, weak = rows_of(problem, camera, images, n_images)
+    rows, units, weak = rows_of(problem, camera)
     q = len(problem.cameras[camera].directions)
     free = np.asarray(block_diag(spanned(combinations[:q]), spanned(combinations[q:])))
-    directions = np.zeros((problem.parameters_of[-1].stop + OF_IMAGE * n_images + PRISM, free.shape[1]))
+    directions = np.zeros((len(problem.directions), free.shape[1]))
     directions[rows] = units[:, None] * free
     before = problem.freed if problem.freed.size else directions[:, :0]
     return replace(
@@ -657,8 +645,21 @@ def wrist_problem(
     twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
     bodies = None if arm is None else tracks.boards
     boards, world_from_board = shapes_of(bodies, points_in_world, twice, n)
+    each = np.arange(n)
     problem = Problem(
-        arms=arms, n_rigs=n + len(world_from_board), cameras=(camera,), boards=boards, robot_noise_floor=noise
+        arms=arms,
+        n_rigs=n + len(world_from_board),
+        cameras=(camera,),
+        observations=Observations(
+            rig=each,
+            camera=np.zeros_like(each),
+            image=tracks.image,
+            x_px=tracks.x_px,
+            point=tracks.point,
+            std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
+        ),
+        boards=boards,
+        robot_noise_floor=noise,
     )
     state = State(
         x=x[None][: len(arms)],
@@ -667,15 +668,4 @@ def wrist_problem(
         world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
         points_in_world=points_in_world,
     )
-    each = np.arange(n)
-    if combinations is not None:
-        problem = freed(problem, combinations, each, n)
-    observations = Observations(
-        rig=each,
-        camera=np.zeros_like(each),
-        image=tracks.image,
-        x_px=tracks.x_px,
-        point=tracks.point,
-        std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
-    )
-    return with_observations(problem, state, observations)
+    return with_observations(problem if combinations is None else freed(problem, combinations), state)
