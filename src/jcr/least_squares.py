@@ -18,8 +18,8 @@ one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 nothing there; with the other core busy, `solve_hand_eye` of 15 images took 60 times as long."""
 
 Unknowns = TypeVar("Unknowns")
-Loss = Literal["linear", "soft_l1", "cauchy"]
-"""Loss of a squared length s: s, 2(√(1 + s) − 1) or log(1 + s), as in scipy.optimize.least_squares."""
+Loss = Literal["linear", "cauchy"]
+"""Loss of a squared length s: s or log(1 + s), as in scipy.optimize.least_squares."""
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e12
 """Initial, smallest and largest damping, as a share of each diagonal element of the normal equations."""
 TINY = 1e-300
@@ -136,21 +136,15 @@ def minimise(
 def loss_weight(loss: Loss, squared: Float[ndarray, "*batch"]) -> Float[ndarray, "*batch"]:
     """Return the weights ρ'(s) of residuals: derivatives of the loss ρ at their squared lengths s (`squared`).
 
-    The loss ρ(s) is s for "linear", 2(√(1 + s) − 1) for "soft_l1" and log(1 + s) for "cauchy".
+    The loss ρ(s) is s for "linear" and log(1 + s) for "cauchy".
     """
-    if loss == "linear":
-        return np.ones_like(squared)
-    return 1 / np.sqrt(1 + squared) if loss == "soft_l1" else 1 / (1 + squared)
+    return np.ones_like(squared) if loss == "linear" else 1 / (1 + squared)
 
 
 def _cost(loss: Loss, residual: Float[ndarray, "*b k m"]) -> Any:
     """Return ½ Σ ρ(|r|²) over the k residuals r (m components each) of each problem b; ρ is the loss."""
     squared = (residual**2).sum(-1)
-    if loss == "soft_l1":
-        squared = 2 * (np.sqrt(1 + squared) - 1)
-    elif loss == "cauchy":
-        squared = np.log1p(squared)
-    return 0.5 * squared.sum(-1)
+    return 0.5 * (squared if loss == "linear" else np.log1p(squared)).sum(-1)
 
 
 def _equations(

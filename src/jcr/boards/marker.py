@@ -124,7 +124,7 @@ def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     x = sighting.x_in_body
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
         return None
-    found = absolute_pose(sighting.x_px, x, intrinsics, gate_px=GATE_PX, planar=True, loss="linear")
+    found = absolute_pose(sighting.x_px, x, intrinsics, gate_px=GATE_PX, planar=True)
     if found is None or found.rival is not None:
         return None
     pose = inverse(found.a_from_camera)

@@ -14,7 +14,7 @@ from jcr.calibration.hand_eye import image_verdicts, judged, leave_one_out
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.intrinsics_prior import decentring, joint_covariance
+from jcr.estimation.intrinsics_prior import decentring
 from jcr.estimation.pose_equations import (
     paper_residuals,
     pose_by_pose,
@@ -35,7 +35,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
-from jcr.records import PaperResiduals
+from jcr.records import COVARIANCE_ORDER, JointCovariance, PaperResiduals
 
 FEWEST = 6
 """Fewest observations of an image; with fewer, the camera's motion due to wrong intrinsics is not computed."""
@@ -65,7 +65,10 @@ def with_adjusted_images(case: Case) -> Case:
         by_camera[3:6, names.index("cy")] = -x[:3, 0] / camera.intrinsics.fy
         moved = by_camera @ root
         uncertainty = hand_eye.uncertainty.with_error(moved @ moved.T, "intrinsics")
-        joint = joint_covariance(uncertainty.covariance, moved @ root.T, root @ root.T, camera.intrinsics)
+        half = np.concatenate([moved, root])
+        together = half @ half.T
+        together[:7, :7] = uncertainty.covariance
+        joint = JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *names))
         return replace(case, hand_eye=judged(hand_eye.with_uncertainty(replace(uncertainty, joint=joint))))
     if not case.is_adjustable:
         made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps

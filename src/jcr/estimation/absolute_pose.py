@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.camera import by_point, project, unproject
+from jcr.camera import by_point, project, unproject, zoomed
 from jcr.geometry import apply, inverse, retract, rotation_angle, rotation_exp, skew, step_between, transform
-from jcr.least_squares import Loss, minimise
+from jcr.least_squares import minimise
 from jcr.records import Intrinsics
 
+FEWEST = {False: 6, True: 4}
+"""Smallest number of points that agree with a pose, for general and for planar points."""
 FOCAL_FACTORS = np.geomspace(0.4, 2.5, 14)
 """Factors on the given focal length that are tried as initial values of a free focal length."""
 LOSS_SCALE = 2.0
@@ -64,23 +66,22 @@ def absolute_pose(
     gate_px: float = 2.0,
     focal: Literal["given", "free"] = "given",
     planar: bool = False,
-    loss: Loss = "cauchy",
 ) -> CameraPose | None:
     """Return the camera pose in the frame of k points from their pixels; None if fewer than six (planar: four) agree.
 
     `x_px` are pixels of the distorted image. The pose has the most points with a reprojection error below `gate_px`.
-    `planar`: the points lie in a plane; both possible poses are refined, and the one with the smaller reprojection
-    error is returned. `point_covariance` is in the frame of the points; None: exact points; pixel noise is estimated in
-    any case. `focal` "free": the focal length is estimated; `camera` has its initial value. `loss` "linear" is for
-    detected corners, which have no wrong matches.
+    `planar`: the points are detected corners in a plane, without wrong matches; both possible poses are refined by
+    linear least squares, and the one with the smaller reprojection error is returned. `point_covariance` is in the
+    frame of the points; None: exact points; pixel noise is estimated in any case. `focal` "free": the focal length is
+    estimated; `camera` has its initial value.
     """
-    least, p = 4 if planar else 6, 7 if focal == "free" else 6
+    p = 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
-    if len(points) < least:
+    if len(points) < FEWEST[planar]:
         return None
     starts = list[_Start]()
     for factor in FOCAL_FACTORS if focal == "free" else (1.0,):
-        scaled = _scaled(camera, factor)
+        scaled = zoomed(camera, factor)
         ideal_px = scaled.fx * unproject(scaled, x_px)[:, :2]
         if planar:
             # Both poses of the plane, with all points.
@@ -94,8 +95,8 @@ def absolute_pose(
         elif (agreed := ransac_pose(ideal_px, points, scaled.fx, gate_px)) is not None:
             starts.append((agreed[0], scaled, agreed[1]))
     most = max((int(inlier.sum()) for _, _, inlier in starts), default=0)
-    starts = [start for start in starts if start[2].sum() == most >= least]
-    refined = (_refined(x_px, points, spread, start, gate_px, p, least, loss) for start in starts)
+    starts = [start for start in starts if start[2].sum() == most >= FEWEST[planar]]
+    refined = (_refined(x_px, points, spread, start, gate_px, p, planar) for start in starts)
     best, *others = sorted(filter(None, refined), key=lambda one: one.rms_px) or (None,)
     for other in others:
         assert best is not None
@@ -107,11 +108,6 @@ def absolute_pose(
 
 _Start = tuple[Float[ndarray, "4 4"], Intrinsics, Bool[ndarray, " k"]]
 """Initial estimate: pose a_from_camera, intrinsics, and mask of the points that agree."""
-
-
-def _scaled(camera: Intrinsics, factor: float) -> Intrinsics:
-    """Return the intrinsics with the focal lengths times a factor."""
-    return replace(camera, fx=float(factor * camera.fx), fy=float(factor * camera.fy))
 
 
 def ransac_pose(
@@ -139,16 +135,15 @@ def _refined(
     start: _Start,
     gate_px: float,
     p: int,
-    least: int,
-    loss: Loss,
+    planar: bool,
 ) -> CameraPose | None:
     """Return the pose with the least robust reprojection error, by iteration from `start`; None if it has few inliers.
 
     Pixel noise and inliers are estimated anew in each round. Inliers have whitened residuals times pixel noise below
-    `gate_px`. `spread` is the covariance of each point, `p` the number of unknowns (6, or 7 with the focal length),
-    `least` the smallest number of inliers.
+    `gate_px`. `spread` is the covariance of each point, `p` the number of unknowns (6, or 7 with the focal length).
+    `planar` is that of `absolute_pose`.
     """
-    scale, inefficiency = (LOSS_SCALE, INEFFICIENCY) if loss == "cauchy" else (1.0, 1.0)
+    loss, scale, inefficiency = ("linear", 1.0, 1.0) if planar else ("cauchy", LOSS_SCALE, INEFFICIENCY)
     (pose, camera, inlier), found = start, None
     for _ in range(ROUNDS):
         residual, jacobian = _reprojection(x_px, points, pose, camera, p)
@@ -157,7 +152,7 @@ def _refined(
         std_px = _noise(residual[inlier], added[inlier], p)
         root = np.linalg.inv(np.linalg.cholesky(std_px**2 * np.eye(2) + added))
         agreed, inlier = inlier, std_px * np.linalg.norm(root @ residual[..., None], axis=(1, 2)) < gate_px
-        if inlier.sum() < max(least, (p + 1) // 2):
+        if inlier.sum() < FEWEST[planar]:
             return None
         white, seen = root[inlier], (x_px[inlier], points[inlier])
 
@@ -168,7 +163,7 @@ def _refined(
             return (white @ residual[..., None])[..., 0] / scale, white @ jacobian / scale
 
         def moved(state: tuple[ndarray, Intrinsics], step: ndarray) -> tuple[ndarray, Intrinsics]:
-            return retract(state[0], step[:6]), _scaled(state[1], np.exp(step[6:].sum()))
+            return retract(state[0], step[:6]), zoomed(state[1], float(np.exp(step[6:].sum())))
 
         before = pose
         pose, camera = minimise(whitened, (pose, camera), moved, loss).unknowns

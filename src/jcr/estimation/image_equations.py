@@ -97,7 +97,7 @@ def adjust_images(problem: Problem, state: State) -> State:
     world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
     for _ in range(ROUNDS):
         state = with_pixel_noise(problem, state, view_of(problem, state))
-        state = adjusted_images(problem, state, [world])
+        state = adjusted_images(problem, state, world)
     return state
 
 
@@ -133,14 +133,14 @@ def weights_of(problem: Problem, state: State, view: ProjectedObservations) -> F
     return state.pixel_noise.weights(view.residual_px, view.depth, problem.layout)
 
 
-def adjusted_images(problem: Problem, state: State, known: Sequence[RigInformation]) -> State:
+def adjusted_images(problem: Problem, state: State, guide: RigInformation) -> State:
     """Return the state after bundle adjustment with constant weights, those of the observations at the initial `state`.
 
-    The arms' X, scale and Z stay. `known` is information about the rigs in addition to that of the images and
+    The arms' X, scale and Z stay. `guide` is information about the rigs in addition to that of the images and
     `problem.known_rigs`.
     """
     view = view_of(problem, state)
-    weight, known = weights_of(problem, state, view), [*_known_rigs(problem), *known]
+    weight, known = weights_of(problem, state, view), [*_known_rigs(problem), guide]
 
     def step(
         now: tuple[State, ProjectedObservations], _: None, damping: float

@@ -10,7 +10,7 @@ from numpy.polynomial.legendre import legvander2d
 
 from jcr.camera import by_parameters, parameter_names, unproject
 from jcr.geometry import Transform
-from jcr.records import COVARIANCE_ORDER, Intrinsics, JointCovariance, ModelError
+from jcr.records import Intrinsics, ModelError
 
 MEASURED = {
     "f": 5e-3,
@@ -155,18 +155,19 @@ WORTH = 2.0
 """Weight of the weak prior on the remaining distortion's size, as a number of polynomials."""
 
 
-def displacements(
+def unmodelled(
     camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
-) -> Float[ndarray, "k 2 e"]:
-    """Return the displacement (px) of k observations by each of e polynomials of the distortion outside the model.
+) -> tuple[Float[ndarray, "k 2 e"], Float[ndarray, "q e"]]:
+    """Return what e polynomials of distortion displace beyond the camera model, and the part that intrinsics express.
 
-    The polynomials (POLYNOMIALS, Legendre) have a coefficient of one image width. The part that a change of the q
-    intrinsics along `directions` (columns) can produce is removed: the least-squares fit at the pixels `x_px`.
+    The polynomials (POLYNOMIALS, Legendre) have a coefficient of one image width. The second result is the change of
+    the q intrinsics (camera.parameters) along `directions` (columns) that fits each polynomial best at the pixels
+    `x_px` (least squares). The first is the remaining displacement (px) of the k pixels.
     """
-    by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
-    basis = np.linalg.qr(by_prior.reshape(2 * len(x_px), -1))[0]
-    flat = _polynomials(x_px, camera).reshape(2 * len(x_px), -1)
-    return (flat - basis @ (basis.T @ flat)).reshape(len(x_px), 2, -1)
+    by_prior = (by_parameters(camera, unproject(camera, x_px)) @ directions).reshape(2 * len(x_px), -1)
+    polynomials = _polynomials(x_px, camera)
+    fit = np.linalg.lstsq(by_prior, polynomials.reshape(len(by_prior), -1), rcond=None)[0]
+    return polynomials - (by_prior @ fit).reshape(polynomials.shape), directions @ fit
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
@@ -189,21 +190,6 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
         if abs(np.log(variance / before)) < SETTLED:
             break
     return float(np.sqrt(variance))
-
-
-def expressed(
-    camera: Intrinsics, directions: Float[ndarray, "q c"], x_px: Float[ndarray, "k 2"]
-) -> Float[ndarray, "q e"]:
-    """Return the change of q intrinsics along `directions` that best fits each of e polynomials at the pixels `x_px`.
-
-    The polynomials describe distortion outside the camera model and have a coefficient of one image width. The q rows
-    are in the order of camera.parameters. Best is the least sum of squares.
-    """
-    by_prior = by_parameters(camera, unproject(camera, x_px)) @ directions
-    rows, polynomials = 2 * len(x_px), _polynomials(x_px, camera)
-    return (
-        directions @ np.linalg.lstsq(by_prior.reshape(rows, -1), polynomials.reshape(rows, -1), rcond=None)[0]
-    )
 
 
 def second_moment_px2(
@@ -232,18 +218,3 @@ def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarr
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     kept = every[:, i, j]
     return np.kron(camera.width * np.eye(2), kept[:, None]).reshape(len(kept), 2, -1)
-
-
-def joint_covariance(
-    covariance: Float[ndarray, "7 7"],
-    cross: Float[ndarray, "7 q"],
-    of_camera: Float[ndarray, "q q"],
-    camera: Intrinsics,
-) -> JointCovariance:
-    """Return the joint covariance of gripper_from_camera, scale and the q intrinsics from its blocks.
-
-    `covariance` is that of transform and log scale (COVARIANCE_ORDER), `of_camera` that of the intrinsics
-    (camera.parameters), `cross` their cross-covariance. `camera` gives the names of the intrinsics.
-    """
-    together = np.block([[covariance, cross], [cross.T, of_camera]])
-    return JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *parameter_names(camera)))

@@ -21,7 +21,7 @@ from jcr.camera import parameters, unproject, with_parameters
 from jcr.distributions import chi2
 from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.elimination import Sightings
-from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, displacements
+from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, unmodelled
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import Poses, Transform, retract, scale_translation, skew, step_between
@@ -290,7 +290,7 @@ class Problem:
         for camera, own, count, rows in each:
             columns.append(np.zeros((len(x_px), 2, count)))
             if count:
-                columns[-1][rows] = displacements(camera.intrinsics, self.directions[own], x_px[rows])
+                columns[-1][rows] = unmodelled(camera.intrinsics, self.directions[own], x_px[rows])[0]
         return np.concatenate(columns, axis=2)
 
     @cached_property
@@ -509,12 +509,15 @@ def stepped(
     state: State,
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
+    points: Float[ndarray, " q"] | None = None,
+    log_sizes: Float[ndarray, " c"] | None = None,
 ) -> State:
-    """Return the state after a step `arms` of the arms' u unknowns and a step `columns` of cameras, boards and rigs.
+    """Return the state after steps of the arms' unknowns, of cameras, boards and rigs, of points and of model errors.
 
     `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
     arms; `columns` (d,) has the order of `Problem.columns`. Six numbers of a transform are translation, then rotation
-    (rad), as in geometry.retract. None: no step. Points do not move.
+    (rad), as in geometry.retract. `points` has three numbers for each point. `log_sizes` are steps of log
+    `model_error_std`. None: no step.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -527,6 +530,10 @@ def stepped(
             rig_from_camera=mounts,
             camera_steps=state.camera_steps + columns[: of.boards.stop],
         )
+    if points is not None:
+        state = replace(state, points_in_world=state.points_in_world + points.reshape(-1, 3))
+    if log_sizes is not None:
+        state = replace(state, model_error_std=state.model_error_std * np.exp(log_sizes))
     if arms is None:
         return state
     own = np.stack([arms[columns_of_arm(arm)] for arm in range(len(state.x))])
@@ -544,10 +551,8 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
     return stepped(problem, state, step[:arms], columns if columns.any() else None)
 
 
-def step_to(
-    problem: Problem, state: State, other: State
-) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"]]:
-    """Return steps of the arms' unknowns and of `Problem.columns` by which `stepped` turns `state` into `other`."""
+def step_to(problem: Problem, state: State, other: State) -> Float[ndarray, " n"]:
+    """Return the steps by which `stepped` turns `state` into `other`: arms, columns, points, then log sizes."""
     own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
     arms = np.zeros(problem.arm_unknowns)
     arms[SCALE] = np.log(other.scale / state.scale)
@@ -559,7 +564,8 @@ def step_to(
         if of_mount is not None:
             columns[of_mount] = step_between(state.rig_from_camera[c], other.rig_from_camera[c])
     columns[problem.columns.first_rig :] = step_between(state.world_from_rig, other.world_from_rig).ravel()
-    return arms, columns
+    points = (other.points_in_world - state.points_in_world).ravel()
+    return np.concatenate([arms, columns, points, np.log(other.model_error_std / state.model_error_std)])
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.camera import parameter_names
 from jcr.estimation.covariance import posterior
 from jcr.estimation.elimination import cholesky, inverse_of, lower, over
 from jcr.estimation.image_equations import (
@@ -28,7 +29,7 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, expressed, joint_covariance
+from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, unmodelled
 from jcr.estimation.pose_equations import (
     PoseEquations,
     pose_by_pose,
@@ -65,7 +66,16 @@ from jcr.estimation.robot_noise import (
 )
 from jcr.geometry import Poses, Transform, apply, fit_similarity, step_between
 from jcr.least_squares import one_blas_thread
-from jcr.records import Budget, Intrinsics, ModelError, RobotNoise, Tracks, Uncertainty
+from jcr.records import (
+    COVARIANCE_ORDER,
+    Budget,
+    Intrinsics,
+    JointCovariance,
+    ModelError,
+    RobotNoise,
+    Tracks,
+    Uncertainty,
+)
 
 START_NOISE = (1e-3, float(np.radians(0.2)))
 """Assumed random errors of gripper poses before their first estimate (m, rad)."""
@@ -226,7 +236,7 @@ def solve(
         state = with_pixel_noise(problem, start, view_of(problem, start))
         noise = np.repeat(problem.robot_noise_floor or start_noise, 3)
         white = np.tile(noise, sum(len(arm.rigs) for arm in problem.arms))
-        start = adjusted_images(problem, state, [_rig_information(problem, state, np.diag(white))])
+        start = adjusted_images(problem, state, _rig_information(problem, state, np.diag(white)))
     state, images, settled, rounds, last_step = _rounds(problem, start)
     found = with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
@@ -276,11 +286,21 @@ def uncertainty_of(found: Solution) -> Uncertainty:
         model_error = ModelError(
             likeliest=found.state.camera_steps[own],
             covariance=found.covariance[unknowns, unknowns],
-            expressed=expressed(middle, directions, x_px),
+            expressed=unmodelled(middle, directions, x_px)[1],
         )
-    covariance, cross = found.covariance[:7, :7], found.covariance[:7, cameras] @ directions.T
-    joint = joint_covariance(covariance, cross, found.intrinsics_covariance(0), known)
-    return Uncertainty(covariance=covariance, budget=found.budget, joint=joint, model_error=model_error)
+    by_unknown = np.eye(7 + len(directions), len(found.covariance))
+    by_unknown[7:] = 0.0
+    by_unknown[7:, cameras] = directions
+    together, order = (
+        by_unknown @ found.covariance @ by_unknown.T,
+        (*COVARIANCE_ORDER, *parameter_names(known)),
+    )
+    return Uncertainty(
+        covariance=together[:7, :7],
+        budget=found.budget,
+        joint=JointCovariance(covariance=together, order=order),
+        model_error=model_error,
+    )
 
 
 def recon_frame(solution: Solution, tracks: Tracks) -> tuple[float, Transform]:
@@ -324,11 +344,13 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
     state, log_sizes, last_step = start, start.robot_log_sizes, np.inf
     ends, steps = list[ndarray](), list[ndarray]()
     robots = problem.arm_unknowns
+    judged = np.r_[:robots, robots + problem.free]
+    parts = np.cumsum([robots, problem.columns.count, start.points_in_world.size])
     for count in range(1, ROUNDS + 1):
-        before, view = state.pixel_noise, view_of(problem, state)
+        before, view = state, view_of(problem, state)
         state = with_pixel_noise(problem, state, view)
         images, normal = linearised(problem, state, view)
-        unresized, (images, resized) = state, with_model_error_of(images)
+        images, resized = with_model_error_of(images)
         state, known_sizes = images.state, log_sizes
         equations = pose_equations(problem, state, images).equations
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
@@ -336,10 +358,9 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         change = np.inf if known_sizes is None else float(np.abs(log_sizes - known_sizes).max())
         arms, columns, std = _joint_step(images, equations, log_sizes)
         last_step = float(np.abs(arms / std[:robots]).max())
-        assert before is not None and state.pixel_noise is not None
-        change = max(
-            change, resized, float(np.abs(np.log(state.pixel_noise.sigma_px / before.sigma_px)).max())
-        )
+        assert before.pixel_noise is not None and state.pixel_noise is not None
+        growth = np.log(state.pixel_noise.sigma_px / before.pixel_noise.sigma_px)
+        change = max(change, resized, float(np.abs(growth).max()))
         if change < SIZES_SETTLED and last_step < STEP_SETTLED:
             return state, images, True, count, last_step
         share = share_within_limits(arms)
@@ -354,13 +375,13 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         )
         # The acceleration needs full steps; a shortened step means a poor initial estimate.
         if share == 1 and moved_cost <= cost * (1 + ROUNDING):
-            begin, end = _coordinates(problem, start, unresized), _coordinates(problem, start, moved)
+            begin, end = step_to(problem, start, before), step_to(problem, start, moved)
             ends, steps = [*ends[-ROUNDS_BEFORE:], end], [*steps[-ROUNDS_BEFORE:], end - begin]
-            judged = np.r_[:robots, robots + problem.free]
-            state = _state_at(problem, start, moved, _accelerated(ends, steps, judged, std))
+            next_start = stepped(problem, start, *np.split(_accelerated(ends, steps, judged, std), parts))
+            sizes = {"pixel_noise": moved.pixel_noise, "robot_log_sizes": moved.robot_log_sizes}
+            state = replace(next_start, **sizes)
         else:
-            information = _rig_information(problem, state, root)
-            state = adjusted_images(problem, state, [information])
+            state = adjusted_images(problem, state, _rig_information(problem, state, root))
             state = _most_likely_arms(problem, state, image_evidence(problem, state), STEP_SETTLED**2)
             ends, steps = [], []
     state = replace(state, robot_log_sizes=log_sizes)
@@ -393,9 +414,9 @@ def _accelerated(
 ) -> Float[ndarray, " n"]:
     """Return the coordinates at which the next round starts, by Anderson acceleration of the last rounds.
 
-    `ends` and `steps` hold for each round the n coordinates (`_coordinates`) at its end, and its step. The combination
-    of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`. All n
-    coordinates are combined by the same factors.
+    `ends` and `steps` hold for each round the n steps (`step_to`) from the initial state to its end, and its step. The
+    combination of rounds minimises the step of the p coordinates `judged` (their indices), in units of their `std`. All
+    n coordinates are combined by the same factors.
     """
     if len(steps) == 1:
         return ends[-1]
@@ -510,25 +531,3 @@ def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]
     now = state.world_from_rig
     of_all += information_along(similarities_of_rigs(now), float(of_all.diagonal().mean()))
     return RigInformation(now, of_all, gradient)
-
-
-def _coordinates(problem: Problem, start: State, state: State) -> Float[ndarray, " n"]:
-    """Return n numbers: steps from `start` to `state` of arms, `Problem.columns`, points; then log `model_error_std`.
-
-    Steps are those of `step_to`.
-    """
-    points = (state.points_in_world - start.points_in_world).ravel()
-    return np.concatenate([*step_to(problem, start, state), points, np.log(state.model_error_std)])
-
-
-def _state_at(problem: Problem, start: State, like: State, coordinates: Float[ndarray, " n"]) -> State:
-    """Return the state at `coordinates`, the inverse of `_coordinates`, with the error sizes of the state `like`."""
-    ends = np.cumsum([problem.arm_unknowns, problem.columns.count, start.points_in_world.size])
-    arms, columns, points, sizes = np.split(coordinates, ends)
-    return replace(
-        stepped(problem, start, arms, columns),
-        points_in_world=start.points_in_world + points.reshape(-1, 3),
-        model_error_std=np.exp(sizes),
-        pixel_noise=like.pixel_noise,
-        robot_log_sizes=like.robot_log_sizes,
-    )
