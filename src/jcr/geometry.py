@@ -140,10 +140,7 @@ def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
 
     Steps of a_from_b are in the axes of frame a, those of b_from_a in the axes of frame b: translation, then rotation.
     """
-    rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    out = -step_axes(rotation_t)
-    out[..., :3, 3:] = -rotation_t @ skew(a_from_b[..., :3, 3])
-    return out
+    return -step_axes(np.swapaxes(a_from_b[..., :3, :3], -1, -2)) @ twist_from_step(a_from_b)
 
 
 def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:

@@ -192,18 +192,18 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     return float(np.sqrt(variance))
 
 
-def second_moment_px2(
+def unexpressed(
     left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
-) -> Float[ndarray, "*points 2 2"]:
-    """Return the second moment (px²) at pixels of the distortion `left` that the model cannot express.
+) -> tuple[Float[ndarray, "*points 2 e"], Float[ndarray, "e e"]]:
+    """Return displacements (px) of pixels by the e coefficients of the distortion `left`, and their second moment.
 
-    This squared mean plus covariance is the expected squared error of a projection that uses the intrinsics alone; rows
-    and columns are x, y.
+    The displacement is that of a projection by the intrinsics alone. The second moment, squared mean plus covariance of
+    the coefficients, is that of the errors of such a projection.
     """
     flat = x_px.reshape(-1, 2)
     by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
     moment = left.covariance + np.outer(left.likeliest, left.likeliest)
-    return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
+    return by.reshape(*x_px.shape, -1), moment
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:

@@ -9,11 +9,12 @@ propagated (Kogan, mrcal, "Projection uncertainty").
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.linalg import block_diag
 
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, over, point_blocks
-from jcr.estimation.intrinsics_prior import second_moment_px2
+from jcr.estimation.intrinsics_prior import unexpressed
 from jcr.estimation.pose_equations import pose_by_pose, reported_poses
 from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
@@ -49,7 +50,8 @@ def point_covariance(
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
     of the distorted image, `distance_m` (...) distances (m) along the ray; their relative error is that of the scale.
     """
-    return _covariance(uncertainty, *_derivatives(x, uncertainty, intrinsics, x_px, distance_m))
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    return by @ covariance @ np.swapaxes(by, -1, -2)
 
 
 def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a gripper pose)
@@ -94,13 +96,13 @@ def bounds_at(
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
-    by_unknown, by_pixel, of_pixel = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
-    by_unknown, by_pixel = axes @ by_unknown, axes @ by_pixel
-    moved = _covariance(uncertainty, by_unknown, by_pixel, of_pixel)
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    by = axes @ by
+    moved = by @ covariance @ by.T
     # A translation does not change the direction. The third row becomes the rotation about the ray.
-    by_unknown[:, :3] = by_unknown[2] = 0.0
-    by_unknown[2, 3:6] = distance_m * axes[2] @ x[:3, :3].T
-    rotated = _covariance(uncertainty, by_unknown, by_pixel, of_pixel) / distance_m**2
+    by[:, :3] = by[2] = 0.0
+    by[2, 3:6] = distance_m * axes[2] @ x[:3, :3].T
+    rotated = by @ covariance @ by.T / distance_m**2
     return PointUncertainty(
         distance_mm=1e3 * distance_m,
         within_95_mm=1e3 * within_95(moved),
@@ -170,7 +172,7 @@ def with_given_intrinsics(
     moved = np.r_[step, off]
     pair = uncertainty.with_error(np.outer(moved, moved))
     x_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    apart = _derivatives(x, uncertainty, camera, x_px, distance_m)[0] @ moved
+    apart = _derivatives(x, uncertainty, camera, x_px, distance_m)[0][:, : len(moved)] @ moved
     return GivenIntrinsicsResult(
         gripper_from_camera=retract(x, step[:6]),
         covariance=pair.covariance,
@@ -256,32 +258,15 @@ def scene_points(solution: Solution) -> ScenePoints:
     return in_base_axes + likely.z[0][:3, 3], together.reshape(count, 3, count, 3), triangulated
 
 
-def _covariance(
-    uncertainty: Uncertainty,
-    by_unknown: Float[ndarray, "*points 3 j"],
-    by_pixel: Float[ndarray, "*points 3 2"],
-    of_pixel: Float[ndarray, "*points 2 2"],
-) -> Covariances:
-    """Return the covariance (m²) of points: the part by j unknowns plus the part by errors of the pixels.
-
-    `by_unknown` and `by_pixel` are derivatives of the points (m) by the unknowns of `uncertainty.whole`, in the same
-    order, and by the pixels; `of_pixel` is the covariance of each pixel (px²). The axes are those of the derivatives.
-    """
-    of_unknowns = by_unknown @ uncertainty.whole @ np.swapaxes(by_unknown, -1, -2)
-    return of_unknowns + by_pixel @ of_pixel @ np.swapaxes(by_pixel, -1, -2)
-
-
 def _derivatives(
     x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
-) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "*points 3 2"], Float[ndarray, "*points 2 2"]]:
-    """Return derivatives of points relative to the gripper, in camera axes, by j unknowns and by pixels; a covariance.
+) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "j j"]]:
+    """Return derivatives of points relative to the gripper, in camera axes, by j unknowns, and their covariance.
 
-    The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale and the intrinsics, if
-    estimated. The covariance (px²) is that of the pixels by the distortion that the model cannot express. `distance_m`
-    is along the ray.
+    The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale, the intrinsics if
+    estimated, and the coefficients of the distortion that the model cannot express. `distance_m` is along the ray.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
-    of_pixel = np.zeros((*x_px.shape, 2)) if left is None else second_moment_px2(left, intrinsics, x_px)
     ray = unproject(intrinsics, x_px)
     length = np.linalg.norm(ray, axis=-1)[..., None, None]
     unit, distance = ray / length[..., 0], np.asarray(distance_m)[..., None]
@@ -292,8 +277,12 @@ def _derivatives(
     by_unknown = by_similarity(distance * unit)
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
-    if uncertainty.joint is None:
-        return by_unknown, by_pixel, of_pixel
-    # For a fixed pixel the ray compensates the change of the projection by the intrinsics.
-    by_intrinsics = -by_pixel @ by_parameters(intrinsics, ray)
-    return np.concatenate([by_unknown, by_intrinsics], axis=-1), by_pixel, of_pixel
+    columns, covariance = [by_unknown], uncertainty.whole
+    if uncertainty.joint is not None:
+        # For a fixed pixel the ray compensates the change of the projection by the intrinsics.
+        columns.append(-by_pixel @ by_parameters(intrinsics, ray))
+    if left is not None:
+        by_coefficient, moment = unexpressed(left, intrinsics, x_px)
+        columns.append(by_pixel @ by_coefficient)
+        covariance = block_diag(covariance, moment)
+    return np.concatenate(columns, axis=-1), np.asarray(covariance)
