@@ -113,13 +113,6 @@ class BoardShapes:
             residual=residual.reshape(-1, 2),
         )
 
-    def bend(self, shape: Float[ndarray, " s"]) -> Float[ndarray, " c"]:
-        """Return the height (z) of each corner over its body's plane, in the unit of `x_in_body`.
-
-        `shape` are the s shape parameters, as in `residual`.
-        """
-        return self.by_shape[:, 2] @ shape
-
 
 def shapes_of(
     boards: Boards | None, points_in_world: Float[ndarray, "p 3"], seen: Bool[ndarray, " p"], first_rig: int

@@ -18,7 +18,7 @@ from jcr.estimation.boards import CORNER_STD_M
 from jcr.estimation.elimination import Normal, cholesky, inverse_of, over, with_fixed_points, without_points
 from jcr.estimation.intrinsics_prior import size_of
 from jcr.estimation.pixel_noise import pixel_noise, refined_noise
-from jcr.estimation.problem import Problem, State, similarities_of_rigs, stepped
+from jcr.estimation.problem import SCALE, Problem, State, similarities_of_rigs, stepped
 from jcr.estimation.projection import ProjectedObservations, by_points, derivatives, view_of
 from jcr.geometry import step_between
 from jcr.least_squares import damped_gauss_newton, one_blas_thread
@@ -190,7 +190,7 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
         by_similarity[rigs] = similarities_of_rigs(state.world_from_rig)[: rigs.stop - first]
         for mount, columns in zip(state.rig_from_camera, problem.columns.mounts, strict=True):
             if columns is not None:
-                by_similarity[columns.start : columns.start + 3, 0] = mount[:3, 3]
+                by_similarity[columns.start : columns.start + 3, SCALE] = mount[:3, 3, None]
         information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
     found = ImageEvidence(
         problem=problem, state=state, view=view, information=information, gradient=-normal.right

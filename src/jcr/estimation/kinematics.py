@@ -89,7 +89,7 @@ def kinematic_jacobian(arm: Arm, joints: Joints) -> tuple[Poses, Float[ndarray, 
     `joints` (n,dof) are the joint angles in rad.
     """
     frames, gripper = joint_frames(arm, joints)
-    return gripper, np.swapaxes(axis_twists(arm, frames, gripper), 1, 2)
+    return gripper, np.swapaxes(twists(frames, gripper, arm.axes), 1, 2)
 
 
 def error_std(arm: Arm, joint_offset: float, link: float) -> Float[ndarray, " p"]:
@@ -108,30 +108,23 @@ def error_jacobian(arm: Arm, joints: Joints) -> Float[ndarray, "n 6 p"]:
     (rad), then for each joint two translations (m) and two rotations (rad) of its axis, perpendicular to the axis.
     """
     frames, gripper = joint_frames(arm, joints)
-    sideways = frames[..., :3, :3] @ perpendicular(arm.axes)
-    links = np.zeros((*joints.shape, LINK_ERRORS, 6))
-    links[..., :2, :3] = np.swapaxes(sideways, -1, -2)
+    sideways, links = perpendicular(arm.axes), np.zeros((*joints.shape, LINK_ERRORS, 6))
+    links[..., :2, :3] = np.swapaxes(frames[..., :3, :3] @ sideways, -1, -2)
     for k in range(2):
-        links[..., 2 + k, :] = _twist(frames, gripper, sideways[..., k])
-    about = axis_twists(arm, frames, gripper)
+        links[..., 2 + k, :] = twists(frames, gripper, sideways[..., k])
+    about = twists(frames, gripper, arm.axes)
     return np.swapaxes(np.concatenate([about, links.reshape(len(joints), -1, 6)], axis=1), 1, 2)
 
 
-def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -> Float[ndarray, "n dof 6"]:
-    """Return the gripper's velocity (of its origin, then ω; base axes) per rad of each joint.
-
-    `frames` and `gripper` are base_from_joint and base_from_gripper, the results of `joint_frames`.
-    """
-    return _twist(frames, gripper, (frames[..., :3, :3] @ arm.axes[..., None])[..., 0])
-
-
-def _twist(
-    frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axis_in_base: Float[ndarray, "n dof 3"]
+def twists(
+    frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axes: Float[ndarray, "dof 3"]
 ) -> Float[ndarray, "n dof 6"]:
     """Return the gripper's velocity (of its origin, then ω; base axes) per rad of rotation about an axis of each joint.
 
-    The axes pass through the origins of the joint `frames`; their directions are `axis_in_base`.
+    The axes, in the joint frames, pass through their origins. `frames` and `gripper` are base_from_joint and
+    base_from_gripper, the results of `joint_frames`.
     """
+    axis_in_base = (frames[..., :3, :3] @ axes[..., None])[..., 0]
     lever = gripper[:, None, :3, 3] - frames[..., :3, 3]
     return np.concatenate([np.cross(axis_in_base, lever), axis_in_base], axis=-1)
 

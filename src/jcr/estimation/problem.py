@@ -24,7 +24,7 @@ from jcr.estimation.elimination import Sightings
 from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, unmodelled
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
-from jcr.geometry import Poses, Transform, retract, scale_translation, skew, step_between
+from jcr.geometry import Poses, Transform, by_similarity, retract, scale_translation, step_between
 from jcr.records import Intrinsics, Tracks
 
 TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
@@ -569,15 +569,14 @@ def step_to(problem: Problem, state: State, other: State) -> Float[ndarray, " n"
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
-    """Return the derivative of rig steps (r = 6m) by a similarity of the world: log scale, translation, rotation.
+    """Return the derivative of rig steps (r = 6m) by a similarity of the world (geometry.by_similarity).
 
-    The seven columns are 1, 3 and 3 numbers; scale and rotation are about the world's origin. The rows of each rig are
+    The seven columns are translation, rotation about the world's origin, log scale. The rows of each rig are
     translation, then rotation (geometry.retract).
     """
-    position = world_from_rig[:, :3, 3]
-    rigs = np.zeros((len(position), 6, 7))
-    rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
-    rigs[:, :3, 4:], rigs[:, 3:, 4:] = -skew(position), np.eye(3)
+    rigs = np.zeros((len(world_from_rig), 6, 7))
+    rigs[:, :3] = by_similarity(world_from_rig[:, :3, 3])
+    rigs[:, 3:, ROTATION] = np.eye(3)
     return rigs.reshape(-1, 7)
 
 

@@ -35,8 +35,8 @@ class ProjectedObservations:
     """Point in the frame of its camera."""
     from_centre_px: Float[ndarray, "k 2"]
     """Pixel predicted by the intrinsics alone, minus the principal point."""
-    own_map: Float[ndarray, "k 2"] | None
-    """Focal factor e^l and shear a (px/px) of each observation's image; None if no parameters of images are free."""
+    own_map: Float[ndarray, "k 2"]
+    """Focal factor e^l and shear a (px/px) of each observation's image."""
     residual_px: Float[ndarray, "k 2"]
     """Predicted minus observed pixel."""
 
@@ -62,15 +62,13 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
         in_camera[rows] = from_camera[rows] @ mount[:3, :3]
         centre[rows] = camera.cx, camera.cy
         from_centre[rows] = project(camera, in_camera[rows]) - centre[rows]
-    projected, own_map = centre + from_centre, None
-    if problem.directions[problem.parameters_of[-1].stop :].any():
-        off = problem.displacement(state)[problem.parameters_of[-1].stop :]
-        of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
-        per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
-        width = _of_camera(problem, [camera.width for camera in cameras])
-        own_map = np.stack([np.exp(of_images[0]), of_images[1] * per_height], axis=1)
-        projected = centre + _mapped(own_map, from_centre[..., None])[..., 0] + (width * of_images[2:]).T
-        projected += problem.prism @ off[-PRISM:]
+    off = problem.displacement(state)[problem.parameters_of[-1].stop :]
+    of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
+    per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
+    width = _of_camera(problem, [camera.width for camera in cameras])
+    own_map = np.stack([np.exp(of_images[0]), of_images[1] * per_height], axis=1)
+    projected = centre + _mapped(own_map, from_centre[..., None])[..., 0] + (width * of_images[2:]).T
+    projected += problem.prism @ off[-PRISM:]
     columns = problem.columns
     projected += problem.displacements @ state.camera_steps[columns.cameras.stop : columns.boards.start]
     return ProjectedObservations(
@@ -140,7 +138,7 @@ def _by_rig(problem: Problem, state: State, view: ProjectedObservations) -> Floa
     out = np.empty((len(view.in_camera), 2, 3))
     for camera, mount, rows in zip(view.cameras, state.rig_from_camera, problem.camera_rows, strict=True):
         out[rows] = _rotated(by_point(camera, view.in_camera[rows]), mount[:3, :3])
-    return out if view.own_map is None else _mapped(view.own_map, out)
+    return _mapped(view.own_map, out)
 
 
 def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> Float[ndarray, "k 2 l"]:
@@ -151,21 +149,17 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
         columns = _slice(directions[own])
         along = directions[own, columns]
         by_camera = by_parameters(camera, view.in_camera[rows]) @ along
-        if own_map is not None:
-            by_camera = _mapped(own_map[rows], by_camera - along[CENTRE]) + along[CENTRE]
-            # The shear is a multiple of the focal length, so it changes with fx.
-            by_camera[:, 0] += (own_map[rows, 1] * view.from_centre_px[rows, 1] / camera.fx)[:, None] * along[
-                0
-            ]
+        by_camera = _mapped(own_map[rows], by_camera - along[CENTRE]) + along[CENTRE]
+        # The shear is a multiple of the focal length, so it changes with fx.
+        sheared_px = own_map[rows, 1] * view.from_centre_px[rows, 1]
+        by_camera[:, 0] += (sheared_px / camera.fx)[:, None] * along[0]
         out[rows, :, columns] = by_camera
-    if own_map is None:
-        return out
     assert problem.observations is not None
     first, image = problem.parameters_of[-1].stop, problem.observations.image
     # No column frees parameters of images together with intrinsics, so that these columns are contiguous.
     columns = _slice(directions[first:])
     about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
-    focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, -1, of_images.shape[1])
+    focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, problem.n_images, -1)
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
     width = _of_camera(problem, [camera.width for camera in view.cameras])
     # Each parameter is added in turn: with hundreds of images one term takes hundreds of megabytes.

@@ -184,7 +184,7 @@ def board_estimate(adjusted: Solution, boards: Boards) -> BoardEstimate:
     std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
     of_corners = np.isin(problem.observations.point, shapes.point)
     shape = state.camera_steps[problem.columns.boards]
-    height_mm = 1e3 * state.scale * np.exp(shape[0]) * shapes.bend(shape)
+    height_mm = 1e3 * state.scale * np.exp(shape[0]) * (shapes.by_shape[:, 2] @ shape)
     numbers = np.unique(shapes.body)
     rigs = state.world_from_rig[shapes.first_rig + numbers]
     normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
