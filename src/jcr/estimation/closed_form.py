@@ -14,8 +14,6 @@ from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transf
 Poses = Float[ndarray, "*#batch n 4 4"]
 ROUNDS = 5
 """Largest number of alternating refinements of the two rotations; a likelihood fit follows."""
-NEAR_HALF_ROTATION = -0.73
-"""Trace of a rotation by 150°; for larger angles the sine is small and determines the axis badly."""
 RELATIVE_CUT = 1e-10
 """Relative singular value below which a direction counts as unobservable."""
 
@@ -82,47 +80,20 @@ def rotations(
     """Return R_X and R_Z, the rotations of gripper_from_camera and base_from_recon, from R_G · R_X = R_Z · R_C.
 
     R_G is `gripper` (rotations of base_from_gripper), R_C is `camera` (rotations of recon_from_camera). The method is
-    Park and Martin's sum over pairs (1994), with sine-weighted axes instead of logarithms. If a motion is near 180°,
-    the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, is tried too. The better fit is
-    returned.
+    the linear solution of Shah (2013), by the leading singular pair of Σ R_C ⊗ R_G, then `rounds` of alternating least
+    squares.
     """
-    *batch, n = gripper.shape[:-2]
-    gripper, camera = gripper.reshape(-1, n, 3, 3), camera.reshape(-1, n, 3, 3)
-    a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
-    of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))
-    rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) @ of_b)
-    rotation, base, gap = _polished(rotation, gripper, camera, rounds)
-
-    near = (np.trace(a, axis1=-2, axis2=-1) < NEAR_HALF_ROTATION).any((1, 2))
-    if near.any():
-        some = gripper[near], camera[near]
-        kron = np.einsum("hnij,hnkl->hikjl", *some).reshape(-1, 9, 9)
-        leading = np.linalg.svd(kron)[2][:, 0].reshape(-1, 3, 3)
-        sign = np.where(np.linalg.det(leading) < 0, -1.0, 1.0)
-        rival = _polished(nearest_rotation(sign[:, None, None] * leading), *some, rounds)
-        better = rival[2] < gap[near]
-        rows = np.flatnonzero(near)[better]
-        rotation[rows], base[rows] = rival[0][better], rival[1][better]
-    return rotation.reshape(*batch, 3, 3), base.reshape(*batch, 3, 3)
-
-
-def _polished(
-    rotation: Float[ndarray, "h 3 3"],
-    gripper: Float[ndarray, "h n 3 3"],
-    camera: Float[ndarray, "h n 3 3"],
-    rounds: int,
-) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
-    """Refine rotations R_X from h initial values by alternating least squares of R_gripper R_X = R_Z R_camera.
-
-    Return R_X (gripper_from_camera), R_Z (base_from_recon) and the sum of squared residuals of each.
-    """
-    from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
-    base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
+    kron = np.einsum("...nij,...nkl->...ikjl", gripper, camera)
+    leading = np.linalg.svd(kron.reshape(*kron.shape[:-4], 9, 9))[2][..., 0, :].reshape(
+        *kron.shape[:-4], 3, 3
+    )
+    rotation = nearest_rotation(np.where(np.linalg.det(leading) < 0, -1.0, 1.0)[..., None, None] * leading)
+    from_camera = np.swapaxes(camera, -1, -2)
+    base = nearest_rotation((gripper @ rotation[..., None, :, :] @ from_camera).sum(-3))
     for _ in range(rounds):
         before = rotation
-        rotation = nearest_rotation((from_gripper @ base[:, None] @ camera).sum(1))
-        base = nearest_rotation((gripper @ rotation[:, None] @ from_camera).sum(1))
+        rotation = nearest_rotation((np.swapaxes(gripper, -1, -2) @ base[..., None, :, :] @ camera).sum(-3))
+        base = nearest_rotation((gripper @ rotation[..., None, :, :] @ from_camera).sum(-3))
         if np.abs(rotation - before).max() < 1e-13:
             break
-    gap = gripper @ rotation[:, None] - base[:, None] @ camera
-    return rotation, base, (gap**2).sum((-1, -2, -3))
+    return rotation, base
