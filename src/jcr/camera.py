@@ -1,9 +1,9 @@
 """Camera models of OpenCV: projection with derivatives, unprojection, resizing, cropping, undistortion of images.
 
 Models: pinhole with five distortion coefficients, rational with eight, rational with thin prism with twelve ("Camera
-Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_distorted` and, for
-the fisheye, `_fisheye_rays` depend on the model. Derivatives are exact: the imaginary part of the distortion after a
-tiny imaginary step (Squire and Trapp, SIAM Review 40, 1998).
+Calibration and 3D Reconstruction"), and fisheye with four (Kannala and Brandt, TPAMI 2006). Only `_distorted` depends
+on the model. Derivatives are exact: the imaginary part of the distortion after a tiny imaginary step (Squire and Trapp,
+SIAM Review 40, 1998).
 Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
 precision: float32 points give float32 pixels.
 """
@@ -32,7 +32,6 @@ STEP = 1e-20
 """Length of the imaginary step, whose square is below all rounding."""
 _WIDEST_TANGENT = 10.0
 """Tangent of the largest angle of a ray to the optical axis that the models describe, 84°."""
-_WIDEST_ANGLE = float(np.arctan(_WIDEST_TANGENT))
 _NEAR_AXIS = 1e-8
 """Lower bound of x² + y² in the formulas of a fisheye, which divide by it; the error is below 1e-8."""
 _WIDEST_PINHOLE = 1.7
@@ -89,16 +88,16 @@ def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[nda
     They are exact for pixels nearer to the principal point than `fold_distance_px`, or for all pixels of the image if
     it is None. Rays of other pixels are not valid.
     """
-    target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    if camera.model == "fisheye":
-        return _fisheye_rays(camera, target)
-    found = target
+    found = target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     for _ in range(30 if is_distorted(camera) else 0):
         x, y = found[..., 0], found[..., 1]
         error = np.stack(_distorted(camera.model, camera.distortion, x, y), axis=-1) - target
-        if np.abs(error).max(initial=0.0) < 1e-13:
+        before, found = found, found - np.linalg.solve(_slopes(camera, x, y), error[..., None])[..., 0]
+        # Pixels beyond the widest angle have no ray in front of the camera; they get the nearest one.
+        radius = np.linalg.norm(found, axis=-1, keepdims=True)
+        found = found / np.maximum(radius / _WIDEST_TANGENT, 1.0)
+        if np.abs(found - before).max(initial=0.0) < 1e-13:
             break
-        found = found - np.linalg.solve(_slopes(camera, x, y), error[..., None])[..., 0]
     return np.concatenate([found, np.ones_like(found[..., :1])], axis=-1)
 
 
@@ -172,27 +171,6 @@ def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> Float[ndarray, 
         x_out, y_out = _distorted(camera.model, camera.distortion, *moved)
         out[..., 0, column], out[..., 1, column] = x_out.imag / STEP, y_out.imag / STEP
     return out
-
-
-def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
-    """Return the rays with z = 1 whose distorted coordinates in a fisheye are `target`, by Newton's method.
-
-    The unknown of Newton's method is the angle between ray and optical axis. Coordinates whose angle exceeds 84° get a
-    ray at 84°.
-    """
-    k = camera.distortion
-    bent = np.linalg.norm(target, axis=-1)
-    angle = np.minimum(bent, _WIDEST_ANGLE)
-    for _ in range(30):
-        a2 = angle * angle
-        error = angle * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))) - bent
-        if np.abs(error).max(initial=0.0) < 1e-14:
-            break
-        slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])))
-        # Pixels beyond the widest angle have no ray in front of the camera; they get the nearest one.
-        angle = np.clip(angle - error / np.maximum(slope, 0.1), 0.0, _WIDEST_ANGLE)
-    stretch = np.where(bent < 1e-12, 1.0, np.tan(angle) / np.maximum(bent, 1e-12))
-    return np.concatenate([target * stretch[..., None], np.ones_like(target[..., :1])], axis=-1)
 
 
 @lru_cache(maxsize=64)  # called many times for the same camera
