@@ -112,12 +112,7 @@ class Scores:
         The gain is gᵀS⁻¹g with S = AᵀPA and g = Aᵀ·gradient, A being `free` and P the information. The second result is
         the rank of S.
         """
-        information, right = free.T @ self.information @ free, free.T @ self.gradient
-        scale = 1 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
-        values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
-        kept = values > 1e-9 * values.max(initial=1e-300)
-        whitened = vectors[:, kept].T @ (scale * right) / np.sqrt(values[kept])
-        return float(whitened @ whitened), int(kept.sum())
+        return squared_length(free.T @ self.gradient, free.T @ self.information @ free)
 
     def log_p(self, row: Row) -> float:
         """Return the natural log p-value of the score test of an effect: the chance of its gain without the effect.
@@ -283,7 +278,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
     covariance = along @ solution.covariance[unknowns, unknowns] @ along.T
     # As in the score test, the dispersion is that of the residuals without the effect.
     scores = model.camera_scores
-    ratio = mean_square(estimate, covariance) / scores.dispersion
+    ratio = squared_length(estimate, covariance)[0] / d / scores.dispersion
     step = step_between(model.place(model.solution.state), model.place(solution.state))
     growth = np.log(solution.state.scale / model.solution.state.scale)
     return Test(
@@ -297,11 +292,13 @@ def confirm(model: Adjustment, row: Row) -> Test:
     )
 
 
-def mean_square(estimate: Float[ndarray, " d"], covariance: Float[ndarray, "d d"]) -> float:
-    """Return Wald's statistic eᵀC⁻¹e / d of d parameters e with covariance C (pseudo-inverse if C is singular)."""
-    size = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    inverse = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-9)
-    return float((estimate / size) @ inverse @ (estimate / size)) / len(estimate)
+def squared_length(vector: Float[ndarray, " d"], covariance: Float[ndarray, "d d"]) -> tuple[float, int]:
+    """Return vᵀC⁺v of a vector v with covariance C, C⁺ being the pseudo-inverse, and the rank of C."""
+    scale = 1 / np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    values, vectors = np.linalg.eigh(scale[:, None] * covariance * scale)
+    kept = values > 1e-9 * values.max(initial=1e-300)
+    whitened = vectors[:, kept].T @ (scale * vector) / np.sqrt(values[kept])
+    return float(whitened @ whitened), int(kept.sum())
 
 
 def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None) -> Test:

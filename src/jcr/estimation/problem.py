@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, orth
 
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.distributions import chi2
@@ -449,7 +449,7 @@ def freed(problem: Problem, combinations: Float[ndarray, "e p"], camera: int = 0
     """
     rows, units, weak = rows_of(problem, camera)
     q = len(problem.cameras[camera].directions)
-    free = np.asarray(block_diag(spanned(combinations[:q]), spanned(combinations[q:])))
+    free = np.asarray(block_diag(*(orth(part, rcond=1e-9) for part in (combinations[:q], combinations[q:]))))
     directions = np.zeros((len(problem.directions), free.shape[1]))
     directions[rows] = units[:, None] * free
     before = problem.freed if problem.freed.size else directions[:, :0]
@@ -458,12 +458,6 @@ def freed(problem: Problem, combinations: Float[ndarray, "e p"], camera: int = 0
         freed=np.concatenate([before, directions], axis=1),
         freed_std=np.r_[problem.freed_std, 1 / np.sqrt(((free / weak[:, None]) ** 2).sum(0))],
     )
-
-
-def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
-    """Return an orthonormal basis (e,r) of the column space of a matrix (e,p) of rank r."""
-    u, size, _ = np.linalg.svd(combinations, full_matrices=False)
-    return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
 
 OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacements", "camera_rows", "prism")

@@ -30,9 +30,9 @@ from jcr.estimation.hypotheses import (
     camera_rows,
     confirm,
     explains_by_order,
-    mean_square,
     pose_rows,
     rank,
+    squared_length,
     tested_intrinsics,
 )
 from jcr.estimation.pose_equations import Region
@@ -332,7 +332,7 @@ def log_p_of_given(model: Adjustment) -> float:
     by = (parameters(model.intrinsics) - parameters(given))[:4]
     if not model.is_given or (np.abs(by) <= given.fx * np.array(OFF)).all():
         return 0.0
-    ratio = mean_square(by, model.solution.intrinsics_covariance(model.camera)[:4, :4])
+    ratio = squared_length(by, model.solution.intrinsics_covariance(model.camera)[:4, :4])[0] / len(by)
     return float(f_distribution.logsf(ratio, 4, model.pose_scores.freedom))
 
 
