@@ -10,7 +10,7 @@ from numpy.polynomial.legendre import legvander2d
 
 from jcr.camera import by_parameters, parameter_names, unproject
 from jcr.geometry import Transform
-from jcr.records import Intrinsics, ModelError
+from jcr.records import Intrinsics
 
 MEASURED = {
     "f": 5e-3,
@@ -165,9 +165,9 @@ def unmodelled(
     `x_px` (least squares). The first is the remaining displacement (px) of the k pixels.
     """
     by_prior = (by_parameters(camera, unproject(camera, x_px)) @ directions).reshape(2 * len(x_px), -1)
-    polynomials = _polynomials(x_px, camera)
-    fit = np.linalg.lstsq(by_prior, polynomials.reshape(len(by_prior), -1), rcond=None)[0]
-    return polynomials - (by_prior @ fit).reshape(polynomials.shape), directions @ fit
+    every = polynomials(x_px, camera)
+    fit = np.linalg.lstsq(by_prior, every.reshape(len(by_prior), -1), rcond=None)[0]
+    return every - (by_prior @ fit).reshape(every.shape), directions @ fit
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:
@@ -192,21 +192,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     return float(np.sqrt(variance))
 
 
-def unexpressed(
-    left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
-) -> tuple[Float[ndarray, "*points 2 e"], Float[ndarray, "e e"]]:
-    """Return displacements (px) of pixels by the e coefficients of the distortion `left`, and their second moment.
-
-    The displacement is that of a projection by the intrinsics alone. The second moment, squared mean plus covariance of
-    the coefficients, is that of the errors of such a projection.
-    """
-    flat = x_px.reshape(-1, 2)
-    by = _polynomials(flat, camera) - by_parameters(camera, unproject(camera, flat)) @ left.expressed
-    moment = left.covariance + np.outer(left.likeliest, left.likeliest)
-    return by.reshape(*x_px.shape, -1), moment
-
-
-def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
+def polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
     """Return the displacements (px) of k pixels by e polynomials with a coefficient of one image width.
 
     The polynomials are products of Legendre polynomials in both pixel coordinates, of total degree ≤ DEGREE. The

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, over, point_blocks
-from jcr.estimation.intrinsics_prior import unexpressed
+from jcr.estimation.intrinsics_prior import polynomials
 from jcr.estimation.pose_equations import pose_by_pose, reported_poses
 from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
@@ -277,12 +277,14 @@ def _derivatives(
     by_unknown = by_similarity(distance * unit)
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
-    columns, covariance = [by_unknown], uncertainty.whole
+    columns, covariance, by_intrinsics = [by_unknown], uncertainty.whole, by_parameters(intrinsics, ray)
     if uncertainty.joint is not None:
         # For a fixed pixel the ray compensates the change of the projection by the intrinsics.
-        columns.append(-by_pixel @ by_parameters(intrinsics, ray))
+        columns.append(-by_pixel @ by_intrinsics)
     if left is not None:
-        by_coefficient, moment = unexpressed(left, intrinsics, x_px)
-        columns.append(by_pixel @ by_coefficient)
+        by_coefficient = polynomials(x_px.reshape(-1, 2), intrinsics).reshape(*x_px.shape, -1)
+        columns.append(by_pixel @ (by_coefficient - by_intrinsics @ left.expressed))
+        # The squared mean is part of the error of a projection by the intrinsics alone.
+        moment = left.covariance + np.outer(left.likeliest, left.likeliest)
         covariance = block_diag(covariance, moment)
     return np.concatenate(columns, axis=-1), np.asarray(covariance)
