@@ -19,7 +19,7 @@ from jcr.estimation.pose_equations import pose_by_pose, reported_poses
 from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
-from jcr.geometry import apply, by_similarity, retract, skew
+from jcr.geometry import across_lines, apply, by_similarity, retract, skew
 from jcr.records import (
     GivenIntrinsicsResult,
     Intrinsics,
@@ -248,10 +248,7 @@ def scene_points(solution: Solution) -> ScenePoints:
     by_unknown[by_arm, robots:] -= follow
     j = by_column @ by_unknown
     in_base_axes = scale * images.state.points_in_world[some] @ base_from_world.T
-    by_frame = by_similarity(in_base_axes)
-    j[:, :, BASE_TRANSLATION] += by_frame[:, :, :3]
-    j[:, :, BASE_ROTATION] += by_frame[:, :, 3:6]
-    j[:, :, SCALE] += by_frame[:, :, 6:]
+    j[:, :, np.r_[BASE_TRANSLATION, BASE_ROTATION, SCALE]] += by_similarity(in_base_axes)
     j, by_rig = j.reshape(3 * count, -1), by_column[:, :, by_arm].reshape(3 * count, -1)
     together = j @ solution.covariance @ j.T + by_rig @ (rig_covariance - gain @ shown) @ by_rig.T
     triangulated = scale**2 * base_from_world @ np.linalg.inv(blocks) @ base_from_world.T
@@ -270,9 +267,8 @@ def _derivatives(
     ray = unproject(intrinsics, x_px)
     length = np.linalg.norm(ray, axis=-1)[..., None, None]
     unit, distance = ray / length[..., 0], np.asarray(distance_m)[..., None]
-    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
     by_ray = np.linalg.inv(by_point(intrinsics, ray)[..., :2])
-    by_pixel = distance[..., None] * across[..., :2] @ by_ray / length
+    by_pixel = distance[..., None] * across_lines(unit)[..., :2] @ by_ray / length
     camera_from_gripper_axes = x[:3, :3].T
     by_unknown = by_similarity(distance * unit)
     by_unknown[..., :3] = camera_from_gripper_axes
