@@ -130,8 +130,8 @@ def by_parameters(
     for k, along in enumerate(1j * STEP * np.eye(len(camera.distortion))):
         x_out, y_out = _distorted(camera.model, (camera.distortion + along).tolist(), x, y)
         out[..., 0, 4 + k], out[..., 1, 4 + k] = (
-            camera.fx * x_out.imag / STEP,
-            camera.fy * y_out.imag / STEP,
+            camera.fx * np.imag(x_out) / STEP,
+            camera.fy * np.imag(y_out) / STEP,
         )
     return out
 
@@ -169,7 +169,7 @@ def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> Float[ndarray, 
     out = np.empty((*x.shape, 2, 2), x.dtype)
     for column, moved in enumerate(((x + 1j * STEP, y), (x, y + 1j * STEP))):
         x_out, y_out = _distorted(camera.model, camera.distortion, *moved)
-        out[..., 0, column], out[..., 1, column] = x_out.imag / STEP, y_out.imag / STEP
+        out[..., 0, column], out[..., 1, column] = np.imag(x_out) / STEP, np.imag(y_out) / STEP
     return out
 
 
