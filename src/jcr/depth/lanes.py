@@ -28,12 +28,12 @@ class Lanes:
         return cls(builder, builder.insert_element(empty, number, INT(0))).at([0] * count)
 
     @classmethod
-    def read(cls, builder: Any, start: Any, place: Any, count: int, kind: Any = FLOAT) -> "Lanes":
-        """Load `count` consecutive numbers from memory, beginning at element `place` of the array `start`.
+    def read(cls, builder: Any, start: Any, place: Any, count: int) -> "Lanes":
+        """Load `count` consecutive floats from memory, beginning at element `place` of the array `start`.
 
-        `builder` is the IR builder, `start` an LLVM pointer, `place` an LLVM integer, `kind` an LLVM type.
+        `builder` is the IR builder, `start` an LLVM pointer, `place` an LLVM integer.
         """
-        there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(kind, count).as_pointer())
+        there = builder.bitcast(builder.gep(start, [place]), ir.VectorType(FLOAT, count).as_pointer())
         return cls(builder, builder.load(there, align=4))
 
     def gathered(self, start: Any) -> "Lanes":

@@ -9,15 +9,13 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.depth.patch_match import UNKNOWN, best_neighbours, peaks, random_planes, spread_planes
+from jcr.depth.patch_match import UNKNOWN, peaks, random_planes, spread_planes
 from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
 COMPARED = 5
-"""Number of neighbours that an image is matched with at half resolution: the first ones of its list."""
-ASKED = 3
-"""Number of neighbours matched with at full resolution: those of highest correlation at half resolution."""
+"""Number of neighbours that an image is matched with: the first ones of its list."""
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
 """Passes of PatchMatch at half (`_COARSE`) and full resolution: relative change of inverse depth, and trials."""
@@ -117,18 +115,14 @@ def match_depth(
 
         views = half.views(i, others, recon_from_camera)
         found = random_planes(family, span, views[-1], h, blocks_of(w), i)
-        asked = np.empty((len(others), *found.shape[1:]), np.uint8)
-        asked[:] = np.arange(len(others))[:, None, None]
         for n, (size, tries) in enumerate(_COARSE):
-            spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
-        asked = best_neighbours(found, asked, *views, ASKED)
-        found, asked = full.enlarged(found), full.enlarged(asked)
-
+            spread_planes(found, *views, (*span, size, tries, n == 0), seed + n)
+        found = full.enlarged(found)
         views = full.views(i, others, recon_from_camera)
         found[3] = UNKNOWN
         for n, (size, tries) in enumerate(_FINE):
-            spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
-        depth = peaks(found, asked, *views, np.float32(_PEAK))
+            spread_planes(found, *views, (*span, size, tries, n == 0), seed + n)
+        depth = peaks(found, *views, np.float32(_PEAK))
         return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])[..., : pinhole.width]
 
     results = []

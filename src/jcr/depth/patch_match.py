@@ -5,14 +5,13 @@ plane is a vector p in the camera frame with p·x = 1 for its points x. So p·ra
 ray has z = 1, and the homography to a neighbour is K (R + t pᵀ) K⁻¹. Planes propagate from row to row, for 16 pixels
 of a row at once.
 
-Arguments of the loops: `found` (4,h,w) is each pixel's plane and score, and `asked` (a,h,w) the indices of the
-neighbours that it is matched with; both have whole blocks of `window.LANES` columns. `windows` is the result of
-`window.windows` for the image, and `packed` (n,y,x) that of `window.quads` for its neighbours, padded by `PAD` pixels.
-`motions` (n,12) are the rows of K R and K t to each neighbour; k is fx, fy, cx, cy. For one block of pixels, `near`
-(a,12,lanes) and `starts` (a,lanes) describe the neighbours asked, as `window.correlate` reads them, and `each` (a,lanes)
-are the correlations with them. `tried` (7,lanes) holds a plane in rows 0 to 2, input of `correlate` in rows 3 to 5, and
-the score. Arrays are plain arguments, because numba counts references of an array taken out of a tuple, which takes
-longer than a window.
+Arguments of the loops: `found` (4,h,w) is each pixel's plane and score, with whole blocks of `window.LANES` columns.
+`windows` is the result of `window.windows` for the image, and `packed` (n,y,x) that of `window.quads` for its
+neighbours, padded by `PAD` pixels. `motions` (n,12) are the rows of K R and K t to each neighbour; k is fx, fy, cx, cy.
+For one block of pixels, `near` (n,12,lanes) describes the neighbours, as `window.correlate` reads them, and `each`
+(n,lanes) are the correlations with them. `tried` (7,lanes) holds a plane in rows 0 to 2, input of `correlate` in rows 3
+to 5, and the score. Arrays are plain arguments, because numba counts references of an array taken out of a tuple, which
+takes longer than a window.
 """
 
 from typing import no_type_check
@@ -42,39 +41,35 @@ def _ray(v, u, k):
 
 @inlined
 @no_type_check
-def _look(v, u, asked, packed, motions, k, near, starts):
-    """Write the projections of 16 pixels of row v, from column u on, into their neighbours to `near` and `starts`.
+def _look(v, u, motions, k, near):
+    """Write the projections of 16 pixels of row v, from column u on, into the neighbour images to `near`.
 
-    `asked` (a,h,w) are the indices of each pixel's neighbour images. `motions` (n,12) has the rows of K R, and K t, for
-    each neighbour; `k` is fx, fy, cx, cy. K are the intrinsics, and R and t transform points of this camera to the
-    neighbour's. `near` (a,12,16) holds four vectors of three numbers. The first two are K R times the change of a ray
-    by one window sample in u, and in v. The others are K R times the ray, and K t. `starts` (a,16) are the indices at
-    which the neighbour images begin in the flattened `packed` (n,y,x).
+    `motions` (n,12) has the rows of K R, and K t, for each neighbour; `k` is fx, fy, cx, cy. K are the intrinsics, and R
+    and t transform points of this camera to the neighbour's. `near` (n,12,16) holds four vectors of three numbers. The
+    first two are K R times the change of a ray by one window sample in u, and in v. The others are K R times the ray,
+    and K t.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
-    size = packed.shape[1] * packed.shape[2]
-    for slot in range(asked.shape[0]):
+    for n in range(len(motions)):
         for lane in range(LANES):
             rx, ry = _ray(v, u + lane, k)
-            n = asked[slot, v, u + lane]
-            starts[slot, lane] = n * size
             for row in range(3):
                 a, b, c = motions[n, 3 * row], motions[n, 3 * row + 1], motions[n, 3 * row + 2]
-                near[slot, row, lane] = a * su
-                near[slot, 3 + row, lane] = b * sv
-                near[slot, 6 + row, lane] = a * rx + b * ry + c
-                near[slot, 9 + row, lane] = motions[n, 9 + row]
+                near[n, row, lane] = a * su
+                near[n, 3 + row, lane] = b * sv
+                near[n, 6 + row, lane] = a * rx + b * ry + c
+                near[n, 9 + row, lane] = motions[n, 9 + row]
 
 
 @inlined
 @no_type_check
-def _score(v, u, tried, packed, windows, k, near, starts, each):
+def _score(v, u, tried, packed, windows, k, near, each):
     """Write to row 6 of `tried` the scores of 16 planes: the mean of the BEST highest correlations with neighbours.
 
     The pixels are those of row v from column u on. Rows 0 to 2 of `tried` (7,16) are their planes p, with p·x = 1 in
     the camera frame. Rows 3 to 5 are overwritten with the input of `correlate`. The correlations are written to `each`
-    (a,16), one row per neighbour. `packed` (n,y,x) are the neighbours' greys from `quads`, and `near` and `starts` come
-    from `_look`. `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy.
+    (n,16), one row per neighbour. `packed` (n,y,x) are the neighbours' greys from `quads`, and `near` comes from
+    `_look`. `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
@@ -83,7 +78,7 @@ def _score(v, u, tried, packed, windows, k, near, starts, each):
         tried[5, lane] = tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane]
     slots = len(each)
     for slot in range(slots):
-        correlate(each, slot, packed, starts, near, windows, (v, u // LANES), tried)
+        correlate(each, slot, packed, near, windows, (v, u // LANES), tried)
     for lane in range(LANES):
         first, second = each[0, lane], np.float32(-1)
         for slot in range(1, slots):
@@ -186,10 +181,10 @@ def random_planes(family, span, k, h, w, seed):
 
 @compiled
 @no_type_check
-def spread_planes(found, asked, packed, motions, windows, k, search, seed):
+def spread_planes(found, packed, motions, windows, k, search, seed):
     """Update the planes of all pixels in `found` once by planes of the row before or random changes that score higher.
 
-    `found` (4,h,w), plane and score, is changed in place; `asked` (a,h,w) are the indices of each pixel's neighbours.
+    `found` (4,h,w), plane and score, is changed in place.
     `packed` (n,y,x) are the neighbours' greys from `quads`, and `motions` (n,12) the rows of K R, and K t, to them.
     `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy. Rows are visited downwards
     for even and upwards for odd seeds (Bleyer et al. 2011, section 3.2). `search` is (lowest inverse depth, highest
@@ -197,15 +192,15 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
     normal halves from try to try.
     """
     state = random_state(seed)
-    slots, h, w = asked.shape
-    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
-    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
+    _, h, w = found.shape
+    near, each = np.empty((len(motions), 12, LANES), np.float32), np.empty((len(motions), LANES), np.float32)
+    tried = np.empty((7, LANES), np.float32)
     tries, fresh = search[3:]
     backward = seed % 2 == 1
     for row in range(h):
         v, before = (h - 1 - row, h - row) if backward else (row, row - 1)
         for u in range(0, w, LANES):
-            _look(v, u, asked, packed, motions, k, near, starts)
+            _look(v, u, motions, k, near)
             for option in range(-1 if fresh else 0, _PASSED + tries):
                 if option < 0:
                     _try_passed(found, v, u, 0, tried)
@@ -215,61 +210,32 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
                     _try_passed(found, before, u, option - 1, tried)
                 else:
                     continue
-                _score(v, u, tried, packed, windows, k, near, starts, each)
+                _score(v, u, tried, packed, windows, k, near, each)
                 _keep_better(found, v, u, k, tried)
 
 
 @compiled
 @no_type_check
-def best_neighbours(found, asked, packed, motions, windows, k, count):
-    """Return for each pixel the indices (count,h,w) of the neighbours with which its plane correlates best, best first.
-
-    `found` (4,h,w) are the planes, and `asked` (a,h,w) the indices of the neighbours to compare. If `count` is larger
-    than a, the result is (a,h,w). The other arguments are as in `spread_planes`.
-    """
-    slots, h, w = asked.shape
-    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
-    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
-    best = np.empty((min(count, slots), h, w), np.uint8)
-    for v in range(h):
-        for u in range(0, w, LANES):
-            _look(v, u, asked, packed, motions, k, near, starts)
-            _try_passed(found, v, u, 0, tried)
-            _score(v, u, tried, packed, windows, k, near, starts, each)
-            for lane in range(LANES):
-                for rank in range(len(best)):
-                    first = 0
-                    for slot in range(1, slots):
-                        if each[slot, lane] > each[first, lane]:
-                            first = slot
-                    best[rank, v, u + lane] = asked[first, v, u + lane]
-                    each[first, lane] = UNKNOWN
-    return best
-
-
-@compiled
-@no_type_check
-def peaks(found, asked, packed, motions, windows, k, step):
+def peaks(found, packed, motions, windows, k, step):
     """Return the inverse depth (h,w) of best score for each pixel, at the peak of a parabola through three scores.
 
     The scores are those of the pixel's plane in `found` (4,h,w) with inverse depth times 1 - step, 1 and 1 + step. The
-    peak is limited to this interval. `asked` (a,h,w) are the indices of each pixel's neighbours; the other arguments
-    are as in `spread_planes`.
+    peak is limited to this interval. The other arguments are as in `spread_planes`.
     """
-    slots, h, w = asked.shape
-    near, starts = np.empty((slots, 12, LANES), np.float32), np.empty((slots, LANES), np.int32)
-    each, tried = np.empty((slots, LANES), np.float32), np.empty((7, LANES), np.float32)
+    _, h, w = found.shape
+    near, each = np.empty((len(motions), 12, LANES), np.float32), np.empty((len(motions), LANES), np.float32)
+    tried = np.empty((7, LANES), np.float32)
     beside, out = np.empty((2, LANES), np.float32), np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(0, w, LANES):
-            _look(v, u, asked, packed, motions, k, near, starts)
+            _look(v, u, motions, k, near)
             for side in range(2):
                 _try_passed(found, v, u, 0, tried)
                 for lane in range(LANES):
                     rx, ry = _ray(v, u + lane, k)
                     here = tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane]
                     tried[2, lane] += np.float32(2 * side - 1) * step * here
-                _score(v, u, tried, packed, windows, k, near, starts, each)
+                _score(v, u, tried, packed, windows, k, near, each)
                 for lane in range(LANES):
                     beside[side, lane] = tried[6, lane]
             for lane in range(LANES):

@@ -112,36 +112,36 @@ def _write_windows(typing, rows, image, v, block):
 
 @intrinsic
 @no_type_check
-def correlate(typing, out, slot, packed, starts, motions, windows, place, tried):
+def correlate(typing, out, slot, packed, motions, windows, place, tried):
     """Write to out[slot] the correlation of each of 16 pixels' windows with another image; -1 where it lies outside.
 
-    `out` is (a,16) for a slots, and `typing` is numba's typing context, which is not used. `windows` is the result of
-    `windows` for this image; `place` is the row v and the block of 16 columns in it. The 16 numbers starts[slot] are
-    the indices at which the other images begin in `packed` (n,y,x; made by `quads`, padded by `PAD`). Rows 3 and 4 of
+    `out` is (n,16) for n other images, of which the one with index `slot` is compared; `typing` is numba's typing
+    context, which is not used. `windows` is the result of `windows` for this image; `place` is the row v and the block
+    of 16 columns in it. `packed` (n,y,x) are the other images (made by `quads`, padded by `PAD`). Rows 3 and 4 of
     `tried` (7,16) are the changes of inverse depth from one window sample to the next, in u and v. Row 5 is the inverse
     depth. The array motions[slot] (12,16) has the projections into the other images (`near` of patch_match.py).
     """
-    sums = signature(types.void, out, types.int64, packed, starts, motions, windows, place, tried)
+    sums = signature(types.void, out, types.int64, packed, motions, windows, place, tried)
 
     def generate(context: Any, builder: Any, sums: Any, given: Any) -> Any:
         def array(k: int) -> Any:
             return context.make_array(sums.args[k])(context, builder, given[k])
 
-        def lanes(k: int, first: Any, count: int, **kind: Any) -> list[Lanes]:
+        def lanes(k: int, first: Any, count: int) -> list[Lanes]:
             places = (builder.add(first, LONG(n * LANES)) for n in range(count))
-            return [Lanes.read(builder, array(k).data, at, LANES, **kind) for at in places]
+            return [Lanes.read(builder, array(k).data, at, LANES) for at in places]
 
         _, height, width = cgutils.unpack_tuple(builder, array(2).shape, 3)
         slot = given[1]
-        (start,) = lanes(3, builder.mul(slot, LONG(LANES)), 1, kind=INT)
-        motion = lanes(4, builder.mul(slot, LONG(12 * LANES)), 12)
+        image = builder.gep(array(2).data, [builder.mul(slot, builder.mul(height, width))])
+        motion = lanes(3, builder.mul(slot, LONG(12 * LANES)), 12)
         size = [Lanes.repeated(builder, builder.trunc(n, INT), LANES) for n in (width, height)]
-        window, inside = _window_there(motion, lanes(7, LONG(3 * LANES), 3), size)
-        v, block = cgutils.unpack_tuple(builder, given[6], 2)
-        blocks = cgutils.unpack_tuple(builder, array(5).shape, 5)[1]
+        window, inside = _window_there(motion, lanes(6, LONG(3 * LANES), 3), size)
+        v, block = cgutils.unpack_tuple(builder, given[5], 2)
+        blocks = cgutils.unpack_tuple(builder, array(4).shape, 5)[1]
         first = builder.mul(builder.add(builder.mul(v, blocks), block), LONG(TAPS * 2 * LANES))
-        weights = lanes(5, first, 2 * TAPS)
-        score = inside.choose(_correlation(array(2).data, start, size[0], window, weights), -1.0)
+        weights = lanes(4, first, 2 * TAPS)
+        score = inside.choose(_correlation(image, size[0], window, weights), -1.0)
         score.write(array(0).data, builder.mul(slot, LONG(LANES)))
         return context.get_dummy_value()
 
@@ -173,24 +173,23 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
     return centre + [inside.choose(n, 0.0) for n in (xu, yu, xv, yv)], inside
 
 
-def _correlation(image: Any, start: Lanes, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
+def _correlation(image: Any, width: Lanes, window: list[Lanes], weights: list[Lanes]) -> Lanes:
     """Return Σ c·g / std(g) per lane: g are the greys at a window's sampled pixels in `image`, c those of this image.
 
-    `image` is the LLVM pointer to the packed other images, with `width` columns and the lane's image from index `start`
-    on. The greys g are interpolated bilinearly at the places `window` (px), the result of `_window_there`. `weights`
-    has weight and weighted grey c of each sample, by turns, from `windows`. The standard deviation std(g) is weighted
-    and includes the pixel noise.
+    `image` is the LLVM pointer to the packed other image, with `width` columns. The greys g are interpolated bilinearly
+    at the places `window` (px), the result of `_window_there`. `weights` has weight and weighted grey c of each sample,
+    by turns, from `windows`. The standard deviation std(g) is weighted and includes the pixel noise.
     """
     center_x, center_y, xu, yu, xv, yv = window
     steps = [float(n) for n in range(-REACH, REACH + 1)]
     along = [(xu * n, yu * n) for n in steps]
-    mean = square = product = start.as_floats() * 0.0
+    mean = square = product = center_x * 0.0
     for i, down in enumerate((xv * n, yv * n) for n in steps):
         px, py = center_x + down[0], center_y + down[1]
         for j, (dx, dy) in enumerate(along):
             tap, x, y = weights[2 * (i * len(steps) + j) :], px + dx, py + dy
             left, top = x.as_ints(), y.as_ints()
-            upper, lower = (top * width + left + start).gathered(image).as_pairs()
+            upper, lower = (top * width + left).gathered(image).as_pairs()
             fx, fy = x - left.as_floats(), y - top.as_floats()
             here, right = (upper & 65535).as_floats(), (upper >> 16).as_floats()
             below, both = (lower & 65535).as_floats(), (lower >> 16).as_floats()
