@@ -11,7 +11,7 @@ from jcr.calibration.cues import surface_at
 from jcr.capture.plain_files import read_lines, split_cells
 from jcr.distributions import chi2
 from jcr.errors import InputError
-from jcr.geometry import apply, inverse, skew
+from jcr.geometry import apply, by_similarity, inverse
 from jcr.result import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
@@ -73,7 +73,7 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
         in_camera = apply(inverse(reconstruction.recon_from_camera[row]), found)
         arm = x[:3, :3] @ (base_from_recon.scale * in_camera)
         rotation = capture.base_from_gripper[reconstruction.image_index[row], :3, :3]
-        jacobian[k] = rotation @ np.column_stack([np.eye(3), -skew(arm), arm])
+        jacobian[k] = rotation @ by_similarity(arm)
     touch_variance = calibration.robot_noise.together[0] ** 2
     stacked = jacobian.reshape(-1, 7)
     covariance = stacked @ calibration.covariance @ stacked.T + touch_variance * np.eye(len(stacked))

@@ -15,7 +15,6 @@ from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
-from jcr.cell.added import read_added_cameras
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
@@ -236,7 +235,7 @@ def _fixed_cameras(
 
     _, capture, reconstruction = run.of_wrist_camera()
     calibrate_options = run.state.options.calibrate
-    others = {one.name: one for one in (*capture.others, *read_added_cameras(run.out, capture))}
+    others = {one.name: one for one in run.others}
     placed = {
         one.name: one.intrinsics
         for one in ([] if run.cameras is None else run.cameras.cameras)
