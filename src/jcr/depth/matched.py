@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.depth.patch_match import UNKNOWN, peaks, random_planes, spread_planes
+from jcr.depth.patch_match import UNKNOWN, random_planes, spread_planes
 from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
@@ -19,8 +19,6 @@ COMPARED = 5
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
 """Passes of PatchMatch at half (`_COARSE`) and full resolution: relative change of inverse depth, and trials."""
-_PEAK = 0.003
-"""Relative change of inverse depth, to either side, at which the parabola of the last refinement is sampled."""
 LEAST = 0.25
 """Least inverse depth of the search, as a share of the largest inverse depth of the search planes."""
 
@@ -105,7 +103,7 @@ def match_depth(
     """
     half = _Level(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level(colors, pinhole)
-    (h, w), ray = half.greys[0].shape, rays(half.pinhole)
+    (h, w), ray, full_ray = half.greys[0].shape, rays(half.pinhole), rays(pinhole).astype(np.float32)
 
     def match(i: int) -> Float[ndarray, "2 h w"]:
         others, seed = neighbours[i][:COMPARED], 100 * i
@@ -122,8 +120,9 @@ def match_depth(
         found[3] = UNKNOWN
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, *views, (*span, size, tries, n == 0), seed + n)
-        depth = peaks(found, *views, np.float32(_PEAK))
-        return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])[..., : pinhole.width]
+        found = found[..., : pinhole.width]
+        depth = np.einsum("chw,hwc->hw", found[:3], full_ray)
+        return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])
 
     results = []
     with ThreadPoolExecutor(threads) as pool:

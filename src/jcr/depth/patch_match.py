@@ -212,35 +212,3 @@ def spread_planes(found, packed, motions, windows, k, search, seed):
                     continue
                 _score(v, u, tried, packed, windows, k, near, each)
                 _keep_better(found, v, u, k, tried)
-
-
-@compiled
-@no_type_check
-def peaks(found, packed, motions, windows, k, step):
-    """Return the inverse depth (h,w) of best score for each pixel, at the peak of a parabola through three scores.
-
-    The scores are those of the pixel's plane in `found` (4,h,w) with inverse depth times 1 - step, 1 and 1 + step. The
-    peak is limited to this interval. The other arguments are as in `spread_planes`.
-    """
-    _, h, w = found.shape
-    near, each = np.empty((len(motions), 12, LANES), np.float32), np.empty((len(motions), LANES), np.float32)
-    tried = np.empty((7, LANES), np.float32)
-    beside, out = np.empty((2, LANES), np.float32), np.empty((h, w), np.float32)
-    for v in range(h):
-        for u in range(0, w, LANES):
-            _look(v, u, motions, k, near)
-            for side in range(2):
-                _try_passed(found, v, u, 0, tried)
-                for lane in range(LANES):
-                    rx, ry = _ray(v, u + lane, k)
-                    here = tried[0, lane] * rx + tried[1, lane] * ry + tried[2, lane]
-                    tried[2, lane] += np.float32(2 * side - 1) * step * here
-                _score(v, u, tried, packed, windows, k, near, each)
-                for lane in range(LANES):
-                    beside[side, lane] = tried[6, lane]
-            for lane in range(LANES):
-                low, high = beside[0, lane], beside[1, lane]
-                curvature = min(low - 2 * found[3, v, u + lane] + high, np.float32(-1e-6))
-                shift = min(max((low - high) / (2 * curvature), np.float32(-1)), np.float32(1))
-                out[v, u + lane] = tried[5, lane] / (1 + step) * (1 + shift * step)
-    return out
