@@ -114,12 +114,12 @@ def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None)
 
 
 def test_memory_that_ends_in_a_worker_thread_ends_the_stage(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    """The buffers of the threads are fewer than the images: one that is not returned blocks the stage for ever."""
+    """The threads are fewer than the images: one that waits for another would block the stage for ever."""
 
     def exhausted(*arguments: object) -> None:
         raise MemoryError("Unable to allocate 5.62 MiB")
 
-    monkeypatch.setattr("jcr.depth.matched.peaks", exhausted)
+    monkeypatch.setattr("jcr.depth.matched.spread_planes", exhausted)
     monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", 2)
     with pytest.raises(MemoryError, match="Unable to allocate"):
         _dense(scene, scene.recon_from_camera, scene.tracks)
