@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
 import analytic_scene
-from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
+from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance, warmth
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
 from jcr.records import MATCHED, PRIOR, PointCloud
@@ -41,10 +42,10 @@ def cloud() -> PointCloud:
 
 @pytest.fixture(scope="module")
 def scene(cloud: PointCloud) -> "SceneMap":
-    """The map of the analytic scene."""
+    """The map of the analytic scene with one more property."""
     from jcr.scene.build import build_scene
 
-    return build_scene(cloud, OPTIONS)
+    return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
 
 
 def uniform(count: int, seed: int = 0) -> np.ndarray:
@@ -130,11 +131,12 @@ def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):
     assert both.tolist() == [True, False]
 
 
-def test_colours_and_labels_are_learnt(scene: "SceneMap", cloud: PointCloud):
+def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: PointCloud):
     x = cloud.points_in_base
     sample = scene.query(x)
     assert np.abs(sample.color - analytic_scene.true_color(x)).mean() < 0.03
     assert (sample.label == cloud.label).mean() > 0.99
+    assert np.abs(sample.values["warmth"] - warmth(cloud)).mean() < 0.3
     assert scene.label_names == analytic_scene.LABELS
 
 
@@ -142,13 +144,10 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     import torch
 
     from jcr.scene.build import build_scene
-    from jcr.scene.fields import Field
-    from jcr.scene.paper import train_paper
-    from jcr.scene.train import workspace_box
+    from jcr.scene.paper import PaperField, train_paper
 
     box = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
-    draw = torch.Generator().manual_seed(1)
-    field, x = Field({"color": 3}, 256, box, frequencies=10, generator=draw), torch.rand(50, 3)
+    field, x = PaperField(box, "color", 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
     # The longest side spans [-1, 1].
     angle = torch.cat([(x - box.mean(0)).T * np.pi * 2.0**k for k in range(10)])
     plain = torch.nn.Sequential(field.hidden, torch.nn.ReLU(), field.heads["color"])
@@ -157,7 +156,7 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     )
     assert field.hidden.weight.shape == (256, 60)
 
-    fields = train_paper(cloud, workspace_box(cloud, None), steps=250)
+    fields = train_paper(cloud, steps=250)
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
     points = uniform(100_000)
     free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
@@ -166,8 +165,13 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     color = analytic_scene.true_color(cloud.points_in_base[:20_000])
     assert np.abs(fields["color"](surface)["color"].numpy() - color).mean() < 0.12
     assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
+    doubted = replace(cloud, confidence=np.where(np.arange(len(cloud.label)) < 100, 1.0, 1e-3))
+    one, other = (train_paper(of, True, 2)["color"](surface)["color"] for of in (doubted, cloud))
+    assert not torch.equal(one, other)
     untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
-    assert [one.about["frequencies"] for one in build_scene(cloud, untrained).fields.of] == 3 * [10]
+    assert [type(one) for one in build_scene(cloud, untrained).fields.of] == 3 * [PaperField]
+    with pytest.raises(InputError, match="leave the values out"):
+        build_scene(cloud, untrained, values={"warmth": warmth(cloud)})
 
 
 def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
@@ -177,12 +181,15 @@ def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
 
     cloud, coarse = analytic_scene.cloud(5000), replace(OPTIONS, cell=0.03)
     threads, state, x = torch.get_num_threads(), torch.get_rng_state(), uniform(20_000)
-    one = build_scene(cloud, coarse)
+    one = build_scene(cloud, coarse, values={"warmth": warmth(cloud)})
     assert torch.get_num_threads() == threads and (torch.get_rng_state() == state).all()
     torch.rand(7)
-    first, again = one.query(x), build_scene(cloud, coarse).query(x)
-    for name in ("occupancy", "unknown", "color", "label"):
-        assert np.array_equal(getattr(first, name), getattr(again, name), equal_nan=name == "color")
+    raw, again = one.field(x), build_scene(cloud, coarse, values={"warmth": warmth(cloud)}).field(x)
+    outputs = {"occupancy": 1, "color": 3, "label": len(analytic_scene.LABELS), "warmth": 2}
+    assert {name: value.shape[1] for name, value in raw.items()} == outputs
+    assert all(np.array_equal(again[name], value) for name, value in raw.items())
+    seen = ~one.query(x).unknown
+    np.testing.assert_allclose(expit(raw["occupancy"][seen, 0]), one.query(x).occupancy[seen], atol=1e-6)
     untrained = [build_scene(cloud, replace(coarse, map_seed=k, max_seconds=0.0)) for k in (0, 1)]
     assert not np.array_equal(untrained[0].query(x).color, untrained[1].query(x).color)
 
@@ -223,7 +230,7 @@ def test_a_loaded_map_gives_eight_threads_the_answers_of_the_saved_one(scene: "S
 
     def answers(of: "SceneMap", at: "np.ndarray | torch.Tensor") -> list[np.ndarray]:
         sample = of.query(at)
-        values = [getattr(sample, name) for name in names]
+        values = [*(getattr(sample, name) for name in names), sample.values["warmth"]]
         return [np.asarray(value) for value in values] + [of.check_spheres(x, 0.02)]
 
     expected = answers(scene, x)
@@ -259,13 +266,14 @@ def test_questions_and_clouds_that_make_no_sense_are_refused(scene: "SceneMap", 
         scene.check_segments(np.zeros((1, 3)), np.full((1, 3), np.inf), 0.1)
     nan = np.full((len(cloud.points_in_base), 1), np.nan)
     inverted, far = (0.4, -0.4, 0.0, -0.4, 0.4, 0.6), (3.0, 3.0, 3.0, 4.0, 4.0, 4.0)
-    for words, points, options in (
-        ("not finite", replace(cloud, points_in_base=cloud.points_in_base + nan), OPTIONS),
-        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far)),
-        ("minimum below", cloud, replace(OPTIONS, workspace=inverted)),
+    for words, points, options, values in (
+        ("not finite", replace(cloud, points_in_base=cloud.points_in_base + nan), OPTIONS, None),
+        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far), None),
+        ("minimum below", cloud, replace(OPTIONS, workspace=inverted), None),
+        ("one finite row per point", cloud, OPTIONS, {"warmth": nan}),
     ):
         with pytest.raises(InputError, match=words):
-            build_scene(points, options)
+            build_scene(points, options, values=values)
 
 
 def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Path):
@@ -470,7 +478,7 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
 def test_manual_of_maps_runs(scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     page = (ROOT / "docs" / "how-to" / "map.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     scene.save(tmp_path / "out" / "table" / "map.safetensors")
     write_cloud(tmp_path / "out" / "table" / "cloud.ply", analytic_scene.cloud())
     for file in urdf.parent.iterdir():
@@ -480,3 +488,4 @@ def test_manual_of_maps_runs(scene: "SceneMap", urdf: Path, tmp_path: Path, monk
     for block in blocks:
         exec(block, names)
     assert names["sample"].unknown.tolist() == [False, True, True]
+    assert "warmth" in names["warm"].properties

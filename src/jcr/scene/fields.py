@@ -134,7 +134,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.L
 
 
 class Field(nn.Module):
-    """Neural network from a position (m, base frame) to properties: logits of occupancy and label, colours."""
+    """Neural network from a position (m, base frame) to properties: logits of occupancy and label, values of others."""
 
     frequency: Tensor
     center: Tensor
@@ -170,7 +170,7 @@ class Field(nn.Module):
         self._dense: list[Tensor] | None = None
         self.hidden = linear(sum((n for _, n in grids), 6 * frequencies), hidden, generator)
         self.heads = nn.ModuleDict({name: linear(hidden, n, generator) for name, n in heads.items()})
-        # The head of colours learns them standardised by these means and deviations.
+        # Heads of plain values, whose unit is arbitrary, learn them standardised by these means and deviations.
         self.standard = nn.ParameterDict(
             {
                 name: nn.Parameter(torch.tensor([[0.0], [1.0]]).repeat(1, n), requires_grad=False)
@@ -181,7 +181,10 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set offset and scale of the colour outputs, if any, to mean and std of `targets["color"]` (n,3)."""
+        """Set offset and scale of all outputs but occupancy and label to mean and std of the property's `targets`.
+
+        `targets` has an array (n, outputs) for each property, such as the colours of n points.
+        """
         for name, standard in self.standard.items():
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
@@ -219,7 +222,7 @@ class Field(nn.Module):
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Return the network's outputs (n, outputs) at points (n,3) m of the base frame, by name of the property.
 
-        Occupancy and label are logits; colours are plain values.
+        Occupancy and label are logits; other properties are plain values.
         """
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
@@ -246,7 +249,7 @@ class Fields(nn.Module):
     def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
         """Return the networks' outputs (n, outputs) at points (n,3) m, base frame, for each property in `names`.
 
-        Occupancy and label are logits; colours are plain values.
+        Occupancy and label are logits; other properties are plain values.
         """
         out: dict[str, Tensor] = {}
         for field in self.of:

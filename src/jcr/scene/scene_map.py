@@ -93,6 +93,13 @@ class Sample:
         return self._answers(label)[0]
 
     @cached_property
+    def values(self) -> dict[str, Any]:
+        """Other properties (n,d) that the map was trained with, by name; NaN outside of the workspace."""
+        further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
+        fields = self._map.fields
+        return {name: self._inside(lambda x, name=name: fields(x, (name,))[name]) for name in further}
+
+    @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
         """Values of `occupancy` (n,) and `unknown` (n,), which are computed together."""
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
@@ -157,7 +164,7 @@ class SceneMap:
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
         self.properties = tuple(name for field in fields.of for name in field.heads)
-        """Names of the properties: occupancy, color, and label if the map was trained with labels."""
+        """Names of the properties: occupancy, color, and label and other values if the map was trained with them."""
         for field in fields.of:
             if "occupancy" in field.heads and len(field.tables):
                 field.expand()
@@ -181,6 +188,17 @@ class SceneMap:
         """Return a copy of the map on a device, e.g. "cuda", which then computes the queries."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
+
+    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
+        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
+
+        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
+        """
+        x = self._points(x_in_base, "points")
+        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
+        if not isinstance(x_in_base, Tensor):
+            answers = tuple(answer.cpu().numpy() for answer in answers)
+        return dict(zip(self.properties, answers, strict=True))
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
