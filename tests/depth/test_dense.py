@@ -142,6 +142,16 @@ def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: P
         assert (error < 2 * dense.depth_std)[of_reason].mean() > 0.8
 
 
+def test_neighbours_are_first_those_that_see_the_points_from_15_degrees_away() -> None:
+    """The cameras stand on a circle about the only point, at these angles from the first."""
+    angle = np.radians([0.0, 3.0, 15.0, 20.0, 60.0])
+    cameras = transform(np.eye(3), np.stack([np.sin(angle), 0 * angle, -np.cos(angle)], axis=-1))
+    tracks = Tracks(
+        image=np.arange(5), x_px=np.zeros((5, 2)), point=np.zeros(5, int), points_in_recon=np.zeros((1, 3))
+    )
+    assert choose_neighbours(tracks, cameras, 4)[0].tolist() == [2, 3, 1, 4]
+
+
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
     from jcr.depth.consistency import agreement, inverse_depth_evidence
