@@ -21,7 +21,7 @@ from jcr.live.folder import LiveFolder
 from jcr.live.progress import Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
-from jcr.records import Requirement
+from jcr.records import LeaveOneOut, Requirement
 
 REQUIRED = (2.0, 0.3)
 RATE = 10
@@ -92,7 +92,11 @@ class Scripted:
         self.finished += 1
         requirement = a_hand_eye(True).requirement
         blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/000.png", value=5.0)
-        found = SimpleNamespace(requirement=requirement, findings=(blurred,) if self.warns else ())
+        error = LeaveOneOut(
+            translation_mm=0.0123, rotation_deg=0.00456, reprojection_px=0.0789, how="joint adjustment"
+        )
+        findings = (blurred,) if self.warns else ()
+        found = SimpleNamespace(requirement=requirement, findings=findings, held_out=error)
         return SimpleNamespace(
             converged=True, calibration=found, verdict="accepted", out=self.live.folder / "result"
         )

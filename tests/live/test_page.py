@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,13 @@ import pytest
 import jcr
 from chromium import Chromium
 from jcr.capture.images import read_image
-from jcr.live.progress import progress_lines
+from jcr.findings import Finding, FindingKind
+from jcr.live.progress import FIRST_ADVICE, Progress, advice, progress_lines
 from jcr.live.robot import RobotState
 from jcr.live.server import MAX_SAMPLE, LiveServer
 from jcr.live.session import LiveSession
 from places import ROOT
-from scripted_capture import Scripted, a_capture, poses, still_frames, video
+from scripted_capture import Scripted, a_capture, a_hand_eye, poses, still_frames, video
 from waiting import until
 
 
@@ -93,10 +95,20 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         live.finish()
         done = parts(page)["parts"]
         assert "<h2>Accepted</h2>" in done["head"] and "data-press" not in done["head"] + done["images"]
+        assert "0.012 mm, 0.0046°" in done["head"] and "0.079 px" in done["head"]
         assert (
             "± 1.0 mm" in done["head"]
             and str(live.folder.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
         )
+
+
+def test_few_images_forecast_no_failure():
+    """The bound with three images is too uncertain for the advice that more images would not help."""
+    short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects", "none", value=0.008)
+    ten = a_hand_eye(False)
+    state = Progress(images=("a",), findings=(short,), hand_eye=replace(ten, images=ten.images[:3]))
+    assert advice(state) == FIRST_ADVICE
+    assert "would not be enough" in advice(replace(state, hand_eye=ten))
 
 
 def test_the_page_advises_until_the_requirement_is_met(capture: tuple[LiveSession, Scripted], tabletop: Path):
@@ -242,6 +254,16 @@ def test_buttons_take_retake_remove_undo_end_on_a_phone(chromium: Chromium, tmp_
         shows("document.querySelector('.verdict h2')?.innerText === 'Accepted'")
         assert chromium.js("document.querySelector('[data-press]')") is None
         assert chromium.js("document.documentElement.scrollWidth <= innerWidth")
+        for width in (390, 820, 1400):
+            chromium.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=width,
+                height=900,
+                deviceScaleFactor=1,
+                mobile=False,
+            )
+            wide = "[...document.querySelectorAll('.tile')].every(t => t.scrollWidth <= t.clientWidth)"
+            assert chromium.js(wide), width
     assert not [event for event in chromium.events if event["method"] == "Runtime.exceptionThrown"]
 
 

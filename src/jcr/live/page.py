@@ -11,7 +11,6 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.calibration.options import GRASPING
-from jcr.calibration.words import leave_one_out_text
 from jcr.capture.images import encode_jpeg, read_image
 from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import accuracy_line, advice, faults, finding_lines
@@ -118,21 +117,25 @@ def verdict_lines(state: SessionState) -> list[str]:
 def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     """Return tiles of reached and required accuracy, number of registered images, and leave-one-out error.
 
-    The accuracy is that of the final calibration if there is one. `required` are bounds (mm, degrees) on 95 % of the
-    errors of a point at the working distance. There are no tiles without images.
+    Accuracy and error are those of the final calibration if there is one. `required` are bounds (mm, degrees) on 95 %
+    of the errors of a point at the working distance. There are no tiles without images.
     """
     if not state.images:
         return []
-    tiles, reached = list[Tile](), state.progress.reached or ()
-    if state.result is not None and (found := state.result.calibration.requirement) is not None:
-        reached = found.reached_mm, found.reached_deg
+    tiles, reached, error = list[Tile](), state.progress.reached or (), state.progress.leave_one_out
+    if state.result is not None:
+        error = state.result.calibration.held_out
+        if (found := state.result.calibration.requirement) is not None:
+            reached = found.reached_mm, found.reached_deg
     names = ("Point uncertainty", " mm"), ("Direction", "°")
     for (name, unit), value, limit in zip(names, reached, required, strict=False):
         tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
-    if (error := state.progress.leave_one_out) is not None:
-        tiles.append(("Leave-one-out error", leave_one_out_text(error), "", False))
+    if error is not None:
+        size = f"{significant(error.translation_mm)} mm, {significant(error.rotation_deg)}°"
+        px = "" if error.reprojection_px is None else f"{significant(error.reprojection_px)} px"
+        tiles.append(("Leave-one-out error", size, px, False))
     return tiles
 
 

@@ -113,10 +113,15 @@ def finding_lines(state: Progress) -> list[str]:
 
 
 def advice(state: Progress) -> str:
-    """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist."""
+    """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist.
+
+    With fewer than eight used images, a forecast that more images will not help is left out: it is too uncertain.
+    """
     if state.requirement_met:
         return REQUIREMENT_MET
-    short = [remedy(one) for one in state.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
+    few = state.hand_eye is not None and state.hand_eye.images_used < CONFIRMING_IMAGES
+    missed = (one for one in state.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH)
+    short = [remedy(one) for one in missed if one.concerns == "images" or not few]
     return short[0] if short else FIRST_ADVICE
 
 
