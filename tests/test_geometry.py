@@ -100,7 +100,7 @@ def test_angles_near_zero_and_reflections_have_a_rotation():
         (transform(np.eye(3), np.array([1.0, 2.0, 3.0])).T, "transposed"),
         (np.full((4, 4), np.nan), "NaN"),
         (np.eye(4) + 0.1 * np.eye(4)[::-1], "not 0 0 0 1"),
-        (np.eye(4) + 0.2 * np.eye(4)[[1, 2, 0, 3]] * (np.arange(4)[:, None] == 0), "no rotation"),
+        (np.eye(4) + 0.2 * np.eye(4)[[1, 2, 0, 3]] * (np.arange(4)[:, None] == 0), "not a rotation matrix"),
     ],
 )
 def test_what_is_not_rigid_is_named(matrix, words):

@@ -103,4 +103,4 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
             assert status == 3 and not is_shown
             verdict, cause, remedy, *_ = said.out.splitlines()
             assert verdict.startswith("REJECTED (limit 0.5 mm, 0.1° not met). ")
-            assert "0.5 mm and 0.1° are asked for" in cause and remedy.startswith("Remedy ")
+            assert "0.5 mm and 0.1° are required" in cause and remedy.startswith("Remedy ")

@@ -115,13 +115,13 @@ def _check_lines(
                 "Expected",
                 f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
                 f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; "
-                f"errors as {'usual' if fitted is None else 'found in the images'}",
+                f"with {'usual errors' if fitted is None else 'the errors found in these images'}",
                 f"1σ: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
             )
         if fitted is not None:
-            noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(fitted.inliers)} images"
+            noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(capture)} images"
             if len(fitted.inliers) == QUICK < len(capture):
-                looked += f"; distortion and focus show with all {len(capture)}: --thorough"
+                looked += "; --thorough compares all, and tests distortion and focus"
             agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
             lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
         run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]

@@ -19,6 +19,7 @@ from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
 from jcr.files import write_bytes, write_text
 from jcr.progress import progress_bars
+from jcr.rounding import decimals_of
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
@@ -148,7 +149,9 @@ class QueryCommand:
         count = np.bincount(sample.label, minlength=len(scene.label_names))
         labels = [f"{name} {n}" for name, n in zip(scene.label_names[1:], count[1:], strict=False) if n]
         unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(x_in_base) else "none"
-        summary = f"{len(x_in_base)} points, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}"
+        summary = f"points: {len(x_in_base)}, {unseen}{'; by label: ' * bool(labels)}{', '.join(labels)}"
+        if len(x_in_base) and np.isnan(sample.distance).all():
+            summary += "; all are outside of the mapped workspace: give metres in the robot's base frame"
         answers: dict[str, object] = {"label_names": list(scene.label_names)}
         if self.output.json:
             for name, column in zip(_COLUMNS.split(","), columns, strict=True):
@@ -237,7 +240,10 @@ class MeasureCommand:
         lines.append(f"{'object':<{width}}  {columns}" if objects else "nothing stands on it")
         for size in objects:
             sides = zip(1e3 * size.box_size, 1e3 * size.box_std, strict=True)
-            length, across, height = (f"{value:.1f} ± {std:.1f}" for value, std in sides)
+            digits = [max(1, decimals_of(1e3 * std)) for std in size.box_std]
+            length, across, height = (
+                f"{value:.{n}f} ± {std:.{n}f}" for (value, std), n in zip(sides, digits, strict=True)
+            )
             height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
             x, y = size.base_from_box[:2, 3]
             lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")

@@ -294,8 +294,8 @@ def _pairs_to_map(
     if stale:
         listed = ", ".join(names[row] for row in sorted(stale))
         warnings = (
-            f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check its "
-            "pose",
+            f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check the "
+            "pose of each",
         )
     return {key: pair for key, pair in search.pairs.items() if key in believed}, notes, warnings
 

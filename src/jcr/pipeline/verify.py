@@ -177,7 +177,7 @@ def _new_images(
         for old, other in zip(then.images, before, strict=True):
             if np.array_equal(image, other):
                 raise InputError(
-                    f"{name}: is {old}, which the calibration was made from, and cannot test it; take a new image"
+                    f"{name}: equals {old}, an image of the calibration, and cannot test it; take a new image"
                 )
     return before, after
 
