@@ -8,6 +8,8 @@ the kinematics are wrong: a constant error of the last joint turns the gripper's
 
 import sys
 from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,22 +48,16 @@ def run(every: int = 1, seed: int = 0) -> str:
     `seed` is added to the seed of the tier, from which the random numbers of all sequences follow.
     """
     extra("kinhec.benchmark", "dev", "bench kinhec")
-    from kinhec.generator import generate_sequence
-    from kinhec.io import Sequence as Recorded
     from kinhec.plans import build_plan, load_tier
 
     rows, squared, ahead = [], [], 0
-    tier = load_tier("small")
+    tier, pool = load_tier("small"), ProcessPoolExecutor()
     tier["global_seed"] += seed
     for track, whole in build_plan(tier, None).items():
         plan = whole[::every]
         found: dict[str, list[Result]] = defaultdict(list)
-        for config in plan:
-            made = generate_sequence(config)
-            recorded = Recorded(made.manifest, made.robot_table, made.camera_table)
-            effective = _effective_transform(made.robot_table, config.robot, recorded.X)
-            for name, result in _solved(recorded, effective, config.scale["enabled"]).items():
-                found[name].append(result)
+        for name, result in chain.from_iterable(pool.map(_of_sequence, plan)):
+            found[name].append(result)
         medians = {name: np.median([one[:2] for one in some], axis=0) for name, some in found.items()}
         own = medians.pop(OURS)
         best = min(medians, key=lambda name, of=medians: of[name][0])
@@ -86,6 +82,17 @@ def run(every: int = 1, seed: int = 0) -> str:
         "`python -m benchmarks kinhec --seed 1` draws other sequences of the tier, any number still others."
     )
     return "\n".join([claim, "", other_seeds, "", *table(head, rows)]) + "\n"
+
+
+def _of_sequence(config: Any) -> list[tuple[str, Result]]:
+    """Generate the sequence of a configuration of KinHEC; return the name of each solver and its result on it."""
+    from kinhec.generator import generate_sequence
+    from kinhec.io import Sequence as Recorded
+
+    made = generate_sequence(config)
+    recorded = Recorded(made.manifest, made.robot_table, made.camera_table)
+    effective = _effective_transform(made.robot_table, config.robot, recorded.X)
+    return [*_solved(recorded, effective, config.scale["enabled"]).items()]
 
 
 def _effective_transform(robot_table: Any, robot: str, nominal: Transform) -> Transform:

@@ -89,8 +89,6 @@ ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
 """Squared step of the arms' unknowns (in σ²) at which their iteration ends: for a result, for a comparison of fits."""
 ROUNDS_BEFORE = 3
 """Number of earlier rounds that the acceleration uses."""
-FARTHEST_SCALE = float(np.log(5.0))
-"""Largest change of log scale from the start of the iteration of the arms; beyond it there is no solution."""
 PARALLEL = 1e-2
 """Relative cutoff of singular values in the acceleration, against rounds with nearly equal steps."""
 FARTHEST = 5.0
@@ -474,10 +472,9 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
 
     Given camera poses with a covariance move to their likeliest values, too. If they stayed, the scale would be too
     small: the regression on values with errors is attenuated (Fuller, Measurement error models, 1987, section 1.1). The
-    iteration ends when the squared step in units of standard deviations is below `settled`, or when the scale leaves
-    the range FARTHEST_SCALE about its start: large systematic errors then explain any poses, with a scale near 0.
+    iteration ends when the squared step in units of standard deviations is below `settled`.
     """
-    arms, start = problem.arm_unknowns, state
+    arms = problem.arm_unknowns
     for _ in range(STEPS):
         poses = pose_equations(problem, state, images)
         equations = poses.equations
@@ -488,8 +485,7 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         columns = None if images is not None else _rig_step(problem, state, poses, solution)
         columns = None if columns is None else share * columns
         state = replace(stepped(problem, state, step, columns), robot_log_sizes=sizes)
-        is_far = abs(np.log(state.scale / start.scale)) > FARTHEST_SCALE
-        if is_far or float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
+        if float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
             break
     return state
 
