@@ -69,7 +69,7 @@ def run(every: int = 1, seed: int = 0) -> str:
         rows.append([track, len(found[OURS]), *sizes, other, len(accepted), beyond, median])
         squared += accepted
         ahead += own[0] <= medians[best][0]
-        sys.stderr.write(f"{track}: {len(plan)} sequences\n")
+        sys.stderr.write(" | ".join(map(str, rows[-1])) + "\n")
     head = "track | sequences | median mm | ° | best of the others | accepted | beyond 95 % | median χ²"
     which = ["whole" if every == 1 else f"every {every}th sequence of a track"]
     which += [f"drawn with the seed {tier['global_seed']} in place of the published one"] if seed else []
