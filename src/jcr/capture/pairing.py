@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
+from os.path import isfile
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -122,10 +123,11 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
         plain = PureWindowsPath(name).name  # splits at both kinds of slashes
         like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
         places = (name, f"images/{name}", *(like if len(like) == 1 else ()))
-        located.append(next((place for place in places if (folder / place).is_file()), name))
+        # Unlike Path.is_file, isfile is False for a name that is too long.
+        located.append(next((place for place in places if isfile(folder / place)), name))
     here = [name for name in image_names(folder) if name not in set(located)]
     left_out = f"{len(here)} images have no pose in {file.name} and are left out: {first_few(here)}"
-    absent = [name for name in located if not (folder / name).is_file()]
+    absent = [name for name in located if not isfile(folder / name)]
     if len(absent) > tolerated(len(located)):
         raise InputError(
             f"{file}: names {len(absent)} of {len(located)} images that are not in {folder}: {first_few(absent)}; add "
