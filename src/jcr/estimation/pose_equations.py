@@ -28,7 +28,7 @@ from jcr.estimation.problem import (
     State,
     columns_of_arm,
 )
-from jcr.estimation.robot_noise import Equations
+from jcr.estimation.robot_noise import Equations, LinearSolution
 from jcr.geometry import (
     Poses,
     Transform,
@@ -221,6 +221,24 @@ class PoseEquations:
     """Fit of the effective hand-eye transform to the used poses."""
     used: Bool[ndarray, " n"]
     """Mask of the used poses among the reported poses of all arms."""
+    by_rig: Float[ndarray, "n 6 6"]
+    """Derivative of the residual of each pose by a step of its rig."""
+    rigs: tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"] | None]
+    """Distribution of the steps of the rigs without the reported poses, as ImageEvidence.rigs; None: they are exact."""
+
+    def rig_step(self, solution: LinearSolution) -> Float[ndarray, " s"]:
+        """Return the steps of the arms' rigs to their mean given the reported poses too, after the step of `solution`.
+
+        `solution` is that of `equations`. The steps are those of geometry.retract, pose by pose.
+        """
+        follow, to_mean, covariance = self.rigs
+        step = -to_mean - follow @ solution.step[len(solution.step) - follow.shape[1] :]
+        if covariance is None:
+            return step
+        left = np.zeros((len(self.used), 6))
+        left[self.used] = solution.weighed_left.reshape(-1, 6)
+        pull = pose_by_pose(np.swapaxes(self.by_rig, 1, 2), left.reshape(-1, 1))[:, 0]
+        return step - covariance @ pull
 
     @cached_property
     def equations(self) -> Equations:
@@ -279,17 +297,15 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     if images is None:
         assert problem.known_rigs is not None
         given, covariance = problem.known_rigs
-        if covariance is not None:
-            to_given = step_between(state.world_from_rig, given).reshape(-1, 1)
-            residual = residual + pose_by_pose(by_rig, to_given).reshape(n, 6)
+        follow, to_mean = np.zeros((6 * n, 0)), step_between(given, state.world_from_rig).ravel()
     else:
-        follow, step, covariance = images.rigs
+        follow, to_mean, covariance = images.rigs
         coupling = images.information[np.ix_(problem.by_arm, free)]
-        residual = residual - pose_by_pose(by_rig, step[:, None]).reshape(n, 6)
         jacobian = np.concatenate([jacobian, -pose_by_pose(by_rig, follow)], axis=1)
         of_free = images.information[np.ix_(free, free)] - coupling.T @ follow
         information[arms:, arms:] += (of_free + of_free.T) / 2
-        gradient[arms:] += images.gradient[free] - coupling.T @ step
+        gradient[arms:] += images.gradient[free] - coupling.T @ to_mean
+    residual = residual - pose_by_pose(by_rig, to_mean[:, None]).reshape(n, 6)
     shared = None
     if covariance is not None:
         shared = pose_by_pose(by_rig, pose_by_pose(by_rig, covariance).T)
@@ -315,7 +331,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         given=problem.robot_noise_floor,
         confirmed=everywhere.left(columns @ columns.T) if columns.size else None,
     )
-    return PoseEquations(every, region, used)
+    return PoseEquations(every, region, used, by_rig, (follow, to_mean, covariance))
 
 
 class Fit(NamedTuple):

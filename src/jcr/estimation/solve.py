@@ -350,11 +350,12 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         images, normal = linearised(problem, state, view)
         images, resized = with_model_error_of(images)
         state, known_sizes = images.state, log_sizes
-        equations = pose_equations(problem, state, images).equations
+        poses = pose_equations(problem, state, images)
+        equations = poses.equations
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
         state = replace(state, robot_log_sizes=log_sizes)
         change = np.inf if known_sizes is None else float(np.abs(log_sizes - known_sizes).max())
-        arms, columns, std = _joint_step(images, equations, log_sizes)
+        arms, columns, std = _joint_step(problem, poses, log_sizes)
         last_step = float(np.abs(arms / std[:robots]).max())
         assert before.pixel_noise is not None and state.pixel_noise is not None
         growth = np.log(state.pixel_noise.sigma_px / before.pixel_noise.sigma_px)
@@ -387,24 +388,18 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
 
 
 def _joint_step(
-    images: ImageEvidence, equations: Equations, log_sizes: LogSizes
+    problem: Problem, poses: PoseEquations, log_sizes: LogSizes
 ) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
     """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
 
-    `equations` are those of the reported poses about `images.state`, `log_sizes` the log sizes of the robot's errors.
-    The columns (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the
-    columns `Problem.free`.
+    `poses` are the equations of the reported poses, `log_sizes` the log sizes of the robot's errors. The columns
+    (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the columns
+    `Problem.free`.
     """
-    problem, (follow, to_mean, rig_covariance) = images.problem, images.rigs
-    solution, arms = solve_equations(equations, log_sizes), problem.arm_unknowns
-    step = solution.step
-    # Rigs step to the mean of images and reported poses, given the step of the cameras.
-    by_rig = reported_poses(problem, images.state)[2]
-    pull = pose_by_pose(np.swapaxes(by_rig, 1, 2), solution.weighed_left[:, None])[:, 0]
+    solution, arms = solve_equations(poses.equations, log_sizes), problem.arm_unknowns
     columns = np.zeros(problem.columns.count)
-    columns[problem.free] = step[arms:]
-    columns[problem.by_arm] = -to_mean - follow @ step[arms:] - rig_covariance @ pull
-    return step[:arms], columns, np.sqrt(solution.covariance.diagonal())
+    columns[problem.free], columns[problem.by_arm] = solution.step[arms:], poses.rig_step(solution)
+    return solution.step[:arms], columns, np.sqrt(solution.covariance.diagonal())
 
 
 def _accelerated(
@@ -482,30 +477,11 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         solution = solve_equations(equations, sizes)
         share = share_within_limits(solution.step[:arms])
         step = share * solution.step[:arms]
-        columns = None if images is not None else _rig_step(problem, state, poses, solution)
-        columns = None if columns is None else share * columns
+        columns = share * poses.rig_step(solution) if images is None else None
         state = replace(stepped(problem, state, step, columns), robot_log_sizes=sizes)
         if float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
             break
     return state
-
-
-def _rig_step(
-    problem: Problem, state: State, poses: PoseEquations, solution: LinearSolution
-) -> Float[ndarray, " d"] | None:
-    """Return the step of `Problem.columns` that moves given camera poses to their likeliest values; None if exact.
-
-    `poses` are the equations about `state`, `solution` is their solution, which gives the step of the arms.
-    """
-    assert problem.known_rigs is not None
-    given, covariance = problem.known_rigs
-    if covariance is None:
-        return None
-    left = np.zeros((len(poses.used), 6))
-    left[poses.used] = solution.weighed_left.reshape(-1, 6)
-    to_rig = np.swapaxes(reported_poses(problem, state)[2], 1, 2)
-    pull = pose_by_pose(to_rig, left.reshape(-1, 1))[:, 0]
-    return step_between(state.world_from_rig, given).ravel() - covariance @ pull
 
 
 def _rig_information(problem: Problem, state: State, root: Float[ndarray, "s s"]) -> RigInformation:
