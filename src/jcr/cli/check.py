@@ -137,7 +137,7 @@ def _check_lines(
 
 
 def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str, Any]:
-    """Return the result of the check as the content of --json."""
+    """Return what `jcr check --json` prints: verdict, images, motion, expected accuracy, findings and notes."""
     from jcr.calibration.record import as_json, mm_and_deg
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise

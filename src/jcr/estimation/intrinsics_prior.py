@@ -108,7 +108,7 @@ def camera_with_prior(
 def camera_about(
     found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None, distortion_given: bool = True
 ) -> CameraPrior:
-    """Return the prior of a camera with mean `found`.
+    """Return the prior of a camera: the intrinsics `found` as its mean, with standard deviations by their source.
 
     `given`: the user gave the intrinsics, and `std` has their standard deviations (camera.parameters; None: MEASURED).
     Otherwise a reconstruction estimated them, with the standard deviations ESTIMATED. `distortion_given` False: given

@@ -143,7 +143,7 @@ def _posture(
 def _misfit(
     arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
-    """Return columns distance (m) and angle (rad) of the tool at joint angles `joints` (rad) from `base_from_tool`."""
+    """Return how far the tool at joint angles `joints` (rad) is from `base_from_tool`: distance (m) and angle (rad)."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), rotation_angle(off[:, :3, :3])], 1)
 

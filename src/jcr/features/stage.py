@@ -186,8 +186,10 @@ class _Search:
         return self.classify()
 
     def _intrinsics_by_robot(self) -> Intrinsics | None:
-        """Return undistorted intrinsics with the focal length for which camera angles best equal gripper angles.
+        """Return undistorted intrinsics whose focal length makes camera and gripper rotate by the same angles.
 
+        The focal length is the one for which the rotation angles between images, from matches, agree best with those
+        of the gripper poses.
         The image size of the result is the size of matching. Returns None where too few pairs agree on a focal length
         (LEAST_SUPPORT).
         """

@@ -61,7 +61,10 @@ class ImageGrid:
         )
 
     def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
-        """Return the original image's pinhole intrinsics from those of the grid."""
+        """Return the pinhole intrinsics of the original image from the intrinsics of its resized and cropped grid.
+
+        They undo the crop first, then the resizing; distortion is dropped.
+        """
         left, top = self.crop_corner
         whole = cropped(without_distortion(grid), -left, -top, *self.resized_size)
         return resized(whole, *self.original_size)

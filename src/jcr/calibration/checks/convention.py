@@ -116,7 +116,7 @@ def better_reading(
     given, *others = _candidates(base_from_gripper, by_name or {}, rows)
 
     def fit(candidate: _Candidate) -> Calibration:
-        """Return the calibration with the gripper poses in a candidate convention."""
+        """Return the calibration of the images with the gripper poses as a candidate convention reads them."""
         _, _, poses, image = candidate
         if calibrate is not None:
             return calibrate(poses, image)
