@@ -189,9 +189,8 @@ class _Search:
         """Return undistorted intrinsics whose focal length makes camera and gripper rotate by the same angles.
 
         The focal length is the one for which the rotation angles between images, from matches, agree best with those
-        of the gripper poses.
-        The image size of the result is the size of matching. Returns None where too few pairs agree on a focal length
-        (LEAST_SUPPORT).
+        of the gripper poses. The image size of the result is the size of matching. Returns None where too few pairs
+        agree on a focal length (LEAST_SUPPORT).
         """
         size = self.intrinsics.width, self.intrinsics.height
         x_px, angle = self.matcher.features.x_px, np.asarray(rotation_angle(self.motion[..., :3, :3]))
