@@ -9,16 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-import capture_writers as writers
-import jcr
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
-from jcr.cli.check import read_arguments
 from jcr.findings import FindingKind
-from jcr.pipeline.check import read_and_compare, spread_rows
-from jcr.records import Capture, Intrinsics
+from jcr.records import Intrinsics
 from scenes import capture_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 
@@ -69,18 +65,3 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
     of_right = solve_hand_eye(right, problem.recon_from_camera).with_used(np.arange(12) != 4)
     assert not left_out_poses(replace(capture, base_from_gripper=right), made, of_right)
-
-
-@pytest.mark.parametrize("convention", ["ur", "yaskawa"])
-def test_poses_that_are_as_noisy_as_is_assumed_show_their_convention(
-    convention: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """The noise of a rejected fit is the assumed one, so that it does not tell a wrong convention."""
-    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(3e-4, 7e-4))
-    capture = replace(jcr.read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
-    writers.write_table(tmp_path, capture, convention, "image,x,y,z,rx,ry,rz")
-    made = reconstruction_of(problem.recon_from_camera[spread_rows(12)])
-    monkeypatch.setattr("jcr.pipeline.check.reconstruct_colmap", lambda *_: made)
-    found, options = read_and_compare(tmp_path)
-    assert read_arguments(options) == ["--pose-convention", convention]
-    assert isinstance(found, Capture) and f"read with --pose-convention {convention}" in found.notes[-1]

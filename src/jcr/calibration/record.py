@@ -319,11 +319,6 @@ class Calibration(Outcome):
         registered = (one for one in self.images if one.translation_residual_mm is not None)
         return np.array([image.used for image in registered], bool)
 
-    @property
-    def names_used(self) -> tuple[str, ...]:
-        """Names of the used images."""
-        return tuple(one.image for one in self.images if one.used)
-
     def with_used(self, used: Bool[ndarray, " m"]) -> "Calibration":
         """Return the calibration with `used` as mask of the m images; all images must be registered ones."""
         images = tuple(replace(one, used=bool(own)) for one, own in zip(self.images, used, strict=True))

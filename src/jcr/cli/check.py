@@ -55,13 +55,14 @@ class CheckCommand:
     def main(self) -> int:
         """Check the capture and print the result; return the exit status, 3 for the verdict "rejected", else 0."""
         from jcr.calibration.options import CalibrateOptions, check_options
-        from jcr.pipeline.check import check_capture, read_and_compare
+        from jcr.capture.read import read_source
+        from jcr.pipeline.check import check_capture
 
         options = CalibrateOptions(robot_noise=self.robot_noise)
         check_options(options)
         # Frames of a recording are extracted to a temporary folder.
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
-            capture, read = read_and_compare(self.capture, self.read, into=scratch, progress=progress)
+            capture = read_source(self.capture, self.read, into=scratch, progress=progress)
             found = check_capture(
                 capture,
                 not self.poses_only,
@@ -70,7 +71,7 @@ class CheckCommand:
                 progress,
                 self.thorough,
             )
-            self.output.result(_check_lines(self, capture, read, found), _check_facts(capture, found))
+            self.output.result(_check_lines(self, capture, found), _check_facts(capture, found))
         return 3 if found.verdict == "rejected" else 0
 
 
@@ -85,13 +86,8 @@ def read_arguments(read: ReadOptions) -> list[str]:
     return given
 
 
-def _check_lines(
-    command: CheckCommand, capture: Capture | PosePairs, read: ReadOptions, found: "Examination"
-) -> list[str]:
-    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected.
-
-    `read` are the options with which the capture was read, repeated in the next command.
-    """
+def _check_lines(command: CheckCommand, capture: Capture | PosePairs, found: "Examination") -> list[str]:
+    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
     from jcr.pipeline.check import QUICK
 
@@ -125,7 +121,7 @@ def _check_lines(
             agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
             lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
         run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
-        closing = shlex.join([*run, *read_arguments(read)])
+        closing = shlex.join([*run, *read_arguments(command.read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
     if command.output.verbose:
@@ -230,9 +226,9 @@ class VerifyCommand:
     """Test a calibration with new images: has the camera moved on the gripper since?
 
     OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
-    format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table),
-    or with five or more images of another scene. Fixed cameras of the run that CAPTURE names in `cameras` are tested
-    too. The exit status is 3 if something has moved, or if the images cannot decide.
+    format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table).
+    Fixed cameras of the run that CAPTURE names in `cameras` are tested too. The exit status is 3 if something has
+    moved, or if the images cannot decide.
 
     for example:
       jcr verify out/table captures/this-morning
@@ -284,11 +280,11 @@ def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, A
         f"{verdict}: {found.finding}, {drift}",
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
-        *labelled("Images", f"{len(found.images)}, {found.how}; {noticed}"),
+        *labelled("Images", f"{len(found.images)}; {noticed}"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
-    same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes", "how")}
+    same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes")}
     cause = {"cause": found.cause if found.moved else None}
     drifts = {"drift_mm": mm, "drift_deg": deg, "drift_std_mm": mm_std, "drift_std_deg": deg_std}
     return lines, same | cause | drifts | {"detectable_mm": seen_mm, "detectable_deg": seen_deg}

@@ -1,6 +1,5 @@
 """Quick check of a capture before a run: files, motion, features, and the pose convention."""
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,16 +11,14 @@ from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.calibration.hand_eye import SCALE_STD
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
-from jcr.capture.formats.table import OpenConventionError, possible_options
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
-from jcr.capture.options import ReadOptions
-from jcr.capture.read import read_capture, read_source
-from jcr.errors import InputError, RejectedError
+from jcr.capture.read import read_source
+from jcr.errors import RejectedError
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import (
     FEWEST,
@@ -42,14 +39,11 @@ from jcr.findings import (
     strongest_first,
     verdict_of,
 )
-from jcr.geometry import ARM, largest_motion
+from jcr.geometry import largest_motion
 from jcr.progress import Progress
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
-from jcr.rounding import significant
 from jcr.sfm.colmap import reconstruct_colmap
 
-CLEARER = 3.0
-"""Factor by which the poses of one convention must fit the images better than those of any other to be selected."""
 QUICK, QUICK_SIZE_PX = 8, 800
 """Number of images of the quick reconstruction, and their longer side (px), so that it takes seconds."""
 
@@ -112,7 +106,7 @@ def check_capture(
     that of the reconstruction. Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
-        capture = read_and_compare(capture, progress=progress)[0]
+        capture = read_source(capture, progress=progress)
     given = capture.base_from_gripper
     (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes]
     if move_m < 5e-3 and rotation_rad > np.radians(5):
@@ -248,59 +242,6 @@ def assumptions_of_poses(
         noise=hand_eye.robot_noise,
         scale_std=scale_std,
     )
-
-
-def read_and_compare(
-    path: str | Path,
-    options: ReadOptions | None = None,
-    *,
-    into: str | Path | None = None,
-    progress: Progress | None = None,
-) -> tuple[Capture | PosePairs, ReadOptions]:
-    """Read a capture; if its file does not determine the pose convention, select the one that fits the images best.
-
-    Return the capture, with a note on the selected convention, and the options with which it was read. The fit is the
-    median residual between gripper poses and camera poses from a few images of reduced size. Its unit is m: translation
-    plus 0.3 m times rotation (rad). `into` is the new folder to which the images of a recording are extracted. Raises
-    InputError if the images cannot be reconstructed, or the best convention does not fit three times better than the
-    second.
-    """
-    options = options or ReadOptions()
-    with suppress(OpenConventionError):
-        return read_source(path, options, into=into, progress=progress), options
-    read = list[tuple[Capture, ReadOptions]]()
-    for possible in possible_options(options):
-        for one in possible:
-            with suppress(InputError):
-                read.append((read_capture(path, one), one))
-                break
-    fits = list[tuple[float, str, Capture, ReadOptions]]()
-    with suppress(RejectedError):  # the images cannot be reconstructed
-        found = None
-        for capture, one in read:
-            rows = spread_rows(len(capture))
-            found = found or reconstruct_colmap(capture.of_rows(rows), "sift", 0, progress, QUICK_SIZE_PX)
-            gripper = capture.base_from_gripper[rows][found.image_index]
-            fit = solve_hand_eye(gripper, found.recon_from_camera, camera_errors="none")
-            # Residuals are used, because the noise of a rejected fit is an assumption and does not depend on the poses.
-            residuals = [(image.translation_residual_mm, image.rotation_residual_deg) for image in fit.images]
-            mm, deg = np.median(np.array(residuals, dtype=float), axis=0)
-            off = f"{significant(mm)} mm and {significant(deg)}°"
-            fits.append((float(1e-3 * mm + ARM * np.radians(deg)), off, capture, one))
-    fits.sort(key=lambda fit: fit[0])
-    if not fits or (len(fits) > 1 and fits[1][0] < CLEARER * fits[0][0]):
-        raise InputError(
-            f"{path}: columns rx, ry, rz may be a rotation vector or angles, and the images do not tell which; add "
-            "--pose-convention ur or --pose-convention yaskawa"
-        )
-    (_, off, capture, options), *others = fits
-    units = "" if options.pose_units == "auto" else f" --pose-units {options.pose_units}"
-    worse = "".join(f", those of {one.pose_convention} only to {text}" for _, text, _, one in others)
-    note = (
-        f"columns rx, ry, rz are read with --pose-convention {options.pose_convention}{units}: these poses agree with "
-        f"the images to {off} (median){worse}; give these options to jcr run"
-    )
-    return replace(capture, notes=(*capture.notes, note)), options
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:

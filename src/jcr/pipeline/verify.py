@@ -25,15 +25,12 @@ from jcr.geometry import step_between
 from jcr.options import checked_options
 from jcr.pipeline.options import VerifyOptions
 from jcr.progress import Progress, silent
-from jcr.reconstruct import reconstruct
 from jcr.records import Capture, CellCamera
 from jcr.result import RunResult
 from jcr.sfm.register import register
 
 ROUNDING = 1e-9
 """Largest difference (m, or element of a rotation matrix) between two poses that count as copies of each other."""
-MIN_TO_RECALIBRATE = 5
-"""Smallest number of images of another scene; with fewer, a wrong gripper pose cannot be detected by the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +43,6 @@ class Verification(Drift):
     """Names of the new images that were used."""
     notes: tuple[str, ...]
     """Warnings about the new images and the sensitivity of the test."""
-    how: str
-    """Method in words: in the old scene, or by a new calibration in another scene."""
     fixed: str | None = None
     """Name of the camera if it is a fixed one, whose drift is along base axes; None: the camera on the gripper."""
     others: tuple["Verification", ...] = ()
@@ -109,9 +104,9 @@ def verify_run(
 ) -> Verification:
     """Test with the images of `new`, a capture or its path, whether the cameras of the run folder `out` have moved.
 
-    New images of the calibrated scene are located in its reconstruction. Images of another scene are calibrated instead.
-    Raises InputError if the run has no accepted calibration or the images are of another camera. Raises RejectedError if
-    the images share too few features with the old scene and are too few for a new calibration.
+    The new images are located in the reconstruction of the calibrated scene. Raises InputError if the run has no
+    accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
+    with the scene.
     """
     report, options = progress or silent, checked_options(options, VerifyOptions)
     if not 0 < options.alpha < 0.5:
@@ -134,25 +129,13 @@ def verify_run(
             located[row] = place
         else:
             lost.append(f"{new.images[row]} shares {place} points with the calibrated scene")
-    if located:
-        wrist = _in_old_scene(run, new, located, lost, options)
-        return replace(wrist, others=tuple(_fixed_cameras(run, new, options, progress)))
-    if len(new) < MIN_TO_RECALIBRATE:
+    if not located:
         raise RejectedError(
-            f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
-            f"{MIN_TO_RECALIBRATE} or more of another one"
+            f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or calibrate images of "
+            "another one (jcr calibrate) and compare both runs (jcr compare)"
         )
-    # Images of another scene are calibrated, and both calibrations are compared.
-    if calibration.intrinsics is not None:
-        new = replace(new, intrinsics=calibration.intrinsics)
-    then = run.state.options
-    hand_eye = calibrate_reconstruction(new, reconstruct(new, then.reconstruct, progress), then.calibrate)
-    if not hand_eye.converged:
-        raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
-    offset = step_between(calibration.gripper_from_camera, hand_eye.gripper_from_camera)
-    drifted = _of_two(offset, calibration.covariance[:6, :6] + hand_eye.covariance[:6, :6], options)
-    how = "against a calibration of its own in another scene"
-    return _judged(drifted, options, list(hand_eye.names_used), (), how)
+    wrist = _in_old_scene(run, new, located, lost, options)
+    return replace(wrist, others=tuple(_fixed_cameras(run, new, options, progress)))
 
 
 def _new_images(
@@ -220,7 +203,7 @@ def _in_old_scene(
             f"{', '.join(same)}: the gripper pose is to the last digit one of the calibration; give the pose that the "
             "robot measures there now, not a copy or the commanded one",
         ]
-    return _judged(found, options, [new.images[row] for row in rows], notes, "in the old scene")
+    return _judged(found, options, [new.images[row] for row in rows], notes)
 
 
 def _fixed_cameras(
@@ -263,7 +246,7 @@ def _fixed_cameras(
         offset = step_between(before(solution.state), after(solution.state))
         found = _of_two(offset, j @ solution.covariance @ j.T, options)
         notes = [text for one in cell.cameras for text in one.warnings]
-        yield replace(_judged(found, options, now.images, notes, "in the mapped scene"), fixed=own.name)
+        yield replace(_judged(found, options, now.images, notes), fixed=own.name)
 
 
 def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
@@ -279,13 +262,13 @@ def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], opti
 
 
 def _judged(
-    found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str], how: str
+    found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str]
 ) -> Verification:
     """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
 
     The drift is significant if its p-value is below `options.alpha`. The tolerance is exceeded if translation or
-    rotation is larger than in `options.tolerance` (mm, degrees). `notes` are warnings to include, `images` are the new
-    images that were used, and `how` is the method in words.
+    rotation is larger than in `options.tolerance` (mm, degrees). `notes` are warnings to include, and `images` are the
+    new images that were used.
     """
     notes = list(notes)
     if found.is_noisier:
@@ -303,4 +286,4 @@ def _judged(
     degrees = float(np.degrees(np.linalg.norm(found.offset[3:])))
     matters = millimetres > options.tolerance[0] or degrees > options.tolerance[1]
     moved = found.p_value < options.alpha and matters
-    return Verification(**vars(found), moved=moved, images=tuple(images), notes=tuple(notes), how=how)
+    return Verification(**vars(found), moved=moved, images=tuple(images), notes=tuple(notes))

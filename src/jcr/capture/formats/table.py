@@ -44,24 +44,6 @@ _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 
 
-class OpenConventionError(InputError):
-    """Error for poses in columns rx, ry, rz, whose convention is ambiguous."""
-
-
-def possible_options(options: ReadOptions) -> list[list[ReadOptions]]:
-    """Return the options with each convention and units that columns rx, ry, rz may have, to try them all.
-
-    One list per convention ("ur", "yaskawa"), with one entry per pair of units of length and angle.
-    """
-    units = [options.pose_units]
-    if options.pose_units == "auto":
-        units = ["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
-    return [
-        [replace(options, pose_convention=convention, pose_units=unit) for unit in units]
-        for convention in ("ur", "yaskawa")
-    ]
-
-
 def recognises(path: Path) -> bool:
     """Test whether a path is a file of gripper poses or a folder with one."""
     return (file := find_table(path)) is not None and file.suffix.lower() in SUFFIXES
@@ -151,17 +133,14 @@ def pose_table(
 
 
 def _convention_of(names: Collection[str], where: str) -> ConventionName:
-    """Return the pose convention that column names identify; raise InputError, begun with `where`, if they do not.
-
-    For columns rx, ry, rz, which two conventions use, the error is an OpenConventionError.
-    """
+    """Return the pose convention that column names identify; raise InputError, begun with `where`, if they do not."""
     for convention in _SHOWN:
         if set(CONVENTIONS[convention].columns) - set(_LAST_ROW) <= set(names):
             return convention
     if {"rx", "ry", "rz"} <= set(names):
-        raise OpenConventionError(
+        raise InputError(
             f"{where}: columns rx, ry, rz may be a rotation vector (--pose-convention ur) or angles about fixed axes "
-            "(--pose-convention yaskawa); say which, or find out from the images with jcr check"
+            "(--pose-convention yaskawa); say which"
         )
     raise InputError(
         f"{where}: its columns ({', '.join(names)}) contain no pose; name them x, y, z and qx, qy, qz, qw or "
