@@ -300,7 +300,7 @@ def sound_run(out: Path) -> Path:
     (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": intrinsics}))
     write_calibration(out / "calibration.json", read_calibration(out))
     options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
-    options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
+    options["calibrate"] |= {"robot_noise": [0.1, 0.05]}
     state = {"capture": str(out / "capture"), "made": {"reconstruct": "0"}, "options": options}
     state |= {"attempts": [asdict(attempt)]}
     (out / "run.json").write_text(json.dumps(state))

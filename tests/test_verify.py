@@ -236,8 +236,8 @@ def test_images_that_would_not_show_a_drift_that_matters_are_a_warning(std_mm: f
 @pytest.fixture(scope="module")
 def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where images of the bundled run show six points, and where these are by its simulated truth."""
-    from jcr.calibration.cues import surface_at
     from jcr.geometry import apply
+    from jcr.pipeline.touch import surface_at
 
     calibration, capture, reconstruction = RunResult(done).of_wrist_camera()
     rng = np.random.default_rng(0)

@@ -27,7 +27,7 @@ DETAILS: dict[str, float | str] = {
     **dict(translation_mm=5.0, rotation_deg=1.0, asked=0.0, distance_mm=0.0, reached_mm=9.0, reached_deg=0.1),
     **dict(longer="after", count=5.0, camera="overhead", of=12.0, arm="right"),
     **dict(at="camera", source="images", shown="a focal length of 600 px where 610 is given"),
-    **dict(board="chessboard:9x6:SIDE", proposed="aruco:SIDE:DICT_4X4_50", one="board", other="known length"),
+    **dict(board="chessboard:9x6:SIDE", proposed="aruco:SIDE:DICT_4X4_50", one="board", other="depth camera"),
     **dict(
         needed=3.0,
         mount="base",

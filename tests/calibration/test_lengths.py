@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
-from jcr.calibration import stage
-from jcr.calibration.checks import lengths
 from jcr.calibration.checks.lengths import depth_check
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, validated
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.words import details
@@ -23,7 +20,7 @@ from jcr.capture.read import read_capture
 from jcr.depth.measured import with_measured_depth
 from jcr.errors import InputError
 from jcr.files import write_bytes
-from jcr.findings import Finding, FindingKind, sentence
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse, rotation_exp, step_between, transform
 from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
 from scenes import capture_of, maps_of, no_depth, reconstruction_of
@@ -33,15 +30,13 @@ from simulation.faults import Faults, faulty_capture, reconstructed
 pytestmark = pytest.mark.slow
 
 
-def calibrated(
-    sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0, options: CalibrateOptions | None = None
-) -> tuple[Calibration, np.ndarray]:
+def calibrated(sheet: Sheet | None, pose_scale: float = 1.0, seed: int = 0) -> tuple[Calibration, np.ndarray]:
     """12 images, and the true transform."""
     rng = np.random.default_rng([seed, 12])
     bare = faulty_capture(rng, 12, Faults(pose_scale=pose_scale))
     found = bare if sheet is None else with_sheet(bare, rng, sheet)
     capture, reconstruction = reconstructed(bare, estimated=False)
-    hand_eye = calibrate_reconstruction(capture, replace(reconstruction, tracks=found.tracks), options)
+    hand_eye = calibrate_reconstruction(capture, replace(reconstruction, tracks=found.tracks))
     return hand_eye, found.gripper_from_camera
 
 
@@ -49,12 +44,6 @@ def calibrated(
 def calibrated_alone(seed: int) -> Calibration:
     """The calibration of the same 12 images without a board."""
     return calibrated(None, seed=seed)[0]
-
-
-def of_pixels(monkeypatch: pytest.MonkeyPatch, metres_per_unit: float) -> None:
-    """A known length makes the simulated reconstruction, which is in metres, so much larger."""
-    for module in (stage, lengths):
-        monkeypatch.setattr(module, "length_cue", lambda *_: (metres_per_unit, 0.01))
 
 
 def of_kind(hand_eye: Calibration, kind: FindingKind) -> Finding:
@@ -126,26 +115,6 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     assert side.value is not None and side.std is not None
     assert side.value == pytest.approx(1.016 * 0.025, abs=3 * side.std) and side.std < 1e-4
     assert hand_eye.converged and hand_eye.lengths == ()
-
-
-def test_a_known_length_that_contradicts_the_robot_rejects_unless_a_board_agrees_with_the_robot(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    options = CalibrateOptions(known_length=("00.png", 1.0, 2.0, 300.0, 200.0, 100.0))
-    of_pixels(monkeypatch, 1.05)
-    alone, _ = calibrated(None, options=options)
-    named = of_kind(alone, FindingKind.SCALES)
-    assert (named.severity, named.details) == ("rejects", {"one": "robot", "other": "known length"})
-    (line,) = alone.warnings
-    assert "the robot's positions and the known length contradict each other by 4." in line
-    assert line.endswith(" ± 1.0 %; measure both again")
-    both, _ = calibrated(Sheet(), options=options)
-    named = of_kind(both, FindingKind.SCALES)
-    assert both.converged and named.severity == "warns" and named.shift is None
-    assert sentence(named) == (
-        "the size of the board and the known length contradict each other by 4.8 ± 1.0 %; measure both again"
-    )
-    assert [one.name for one in both.lengths] == ["board", "known length"]
 
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)

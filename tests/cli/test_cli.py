@@ -107,23 +107,16 @@ def test_bash_completes(tmp_path: Path):
         assert set(printed.stdout.split()) == offered, (line, printed.stderr)
 
 
-FIRST = "images/00.jpg"
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--board", "chessbord:9x6:0.02"], "no such board; write it as charuco:"),
         (["--board", "chessboard:9x6:-1"], "-1 is no length of a square in metres"),
         (["--backend", "colmap", "--board", "chessboard:9:0.02"], "9 is no size such as 7x5"),
-        (["--known-length", FIRST, "1", "2", "3", "4", "0"], "a positive length in millimetres"),
         (["--require", "-1", "2"], "--require -1 2: give two positive numbers"),
         (["--robot-noise", "0.5", "nan"], "--robot-noise 0.5 nan: give two positive numbers"),
         (["--scale", "0"], "--scale 0: give a positive number"),
         (["--robot", "ur99"], "robot ur99: not known"),
-        (["--known-length", FIRST, "1", "2", "1", "2", "50"], "both ends are one pixel; give two"),
-        (["--known-length", "99.jpg", "1", "2", "3", "4", "50"], "no image 99.jpg; it has images/00.jpg"),
-        (["--known-length", FIRST, "1", "2", "3", "4000", "50"], "pixel (3, 4000) is outside images/00.jpg"),
     ],
 )
 def test_options_that_cannot_be_are_refused_before_any_work(
@@ -273,7 +266,6 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
         (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
         (["export", "a", "octomapp"], "did you mean octomap?"),
         (["run", "a", "b", "--require", "2"], "--require takes MM DEG, not '2' (jcr run --help)"),
-        (["run", "a", "b", "--known-length", "0.jpg", "1"], "takes IMAGE X1 Y1 X2 Y2 MM, not '0.jpg', '1'"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),

@@ -76,7 +76,7 @@ def with_adjusted_images(case: Case) -> Case:
             return case
         return replace(case, hand_eye=judged(with_intrinsics_considered(case)))
     try:
-        found = adjust_case(case, combinations=case.free_focus if case.shows_camera else None)
+        found = adjust_case(case)
     except np.linalg.LinAlgError:
         return case
     case = replace(case, adjusted=found)

@@ -13,7 +13,6 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
 from jcr.camera import usable_intrinsics
-from jcr.estimation.hypotheses import focal_lengths
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -125,17 +124,6 @@ class Case:
             return self.chosen_tracks
         found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
         return found if len(found.image) <= MOST_OBSERVATIONS else some_points(found, MOST_OBSERVATIONS)
-
-    @property
-    def free_focus(self) -> Float[ndarray, "e p"] | None:
-        """Additional parameters that give each used image its own focal length; None if the option `focus` is "fixed".
-
-        Matrix (e,p): each of the p columns, one per used image, is a direction in the e parameters of the camera
-        (hypotheses.Row). The first column changes all focal lengths alike; the others are differences between images.
-        """
-        if self.options.focus == "fixed":
-            return None
-        return focal_lengths(self.reconstruction.intrinsics, len(self.used))
 
     @property
     def scene_distance_m(self) -> float | None:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf, isfinite, radians
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -12,8 +12,6 @@ from jcr.findings.requirement import Where
 GRASPING = (5.0, 1.0)
 """Default of the required accuracy (mm, degrees): a parallel gripper that opens 10 mm wider than its object has 5 mm to
 either side, and one degree moves the tip of a 100 mm finger by 2 mm."""
-LengthInImage = tuple[str, float, float, float, float, float]
-"""Image name, x and y of two pixels in it, and the distance (mm) between the two points that the pixels show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +34,6 @@ class CalibrateOptions:
     the capture, if any."""
     known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
     """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""
-    known_length: Annotated[LengthInImage | None, tyro.conf.arg(metavar="IMAGE X1 Y1 X2 Y2 MM")] = None
-    """A known length, for a scale that the motion does not determine: two pixels of one image, and their distance."""
-    focus: Literal["fixed", "varies"] = "fixed"
-    """varies: estimate a focal length for each image, for a camera whose focus changed during the capture."""
 
     @property
     def robot_noise_m_rad(self) -> tuple[float, float] | None:
@@ -58,12 +52,5 @@ def check_options(options: CalibrateOptions) -> None:
         raise InputError(f"--scale {options.scale:g}: give a positive number, metres per unit")
     if options.known_height is not None and not isfinite(options.known_height):
         raise InputError(f"--known-height {options.known_height:g}: give millimetres")
-    if options.known_length is not None:
-        image, *ends, length_mm = options.known_length
-        given = f"--known-length {image} {' '.join(f'{x:g}' for x in (*ends, length_mm))}"
-        if not (0 < length_mm < inf and all(map(isfinite, ends))):
-            raise InputError(f"{given}: give two pixels and a positive length in millimetres")
-        if ends[:2] == ends[2:]:
-            raise InputError(f"{given}: both ends are one pixel; give two")
     if options.robot is not None:
         arm_named(options.robot)

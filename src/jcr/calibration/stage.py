@@ -4,6 +4,8 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case, with_findings
@@ -14,7 +16,6 @@ from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot
-from jcr.calibration.cues import CONTRADICTED, height_cue, length_cue
 from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
@@ -25,6 +26,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.point_uncertainty import with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
+from jcr.geometry import Poses, rotation_angle
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, PosePairs, Reconstruction
 
@@ -46,6 +48,13 @@ CHECKS = (
 The pose convention of a rejected calibration is tested early, because poses of another convention make all later checks
 meaningless. Rejected calibrations are also tested for effects on camera and robot, which may explain the rejection.
 """
+HEIGHT_STD = 1e-3
+"""Standard deviation (m) of a height measured with a ruler."""
+ONE_AXIS = np.radians(6)
+"""Largest rms deviation of the rotation axis (rad) for which a motion is planar, and smallest rotation it needs."""
+CONTRADICTED = (4.0, 0.02)
+"""Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
+fraction of the scale; both limits are exceeded."""
 METRIC_STD = 0.005
 """Difference of the log scale of metric poses from 0 up to which the scale counts as 1 (size of a printed marker)."""
 
@@ -107,10 +116,10 @@ def checked_case(
 def fit_poses(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Fit the hand-eye transform to camera poses; known scale, length and height are priors of the fit.
+    """Fit the hand-eye transform to camera poses; known scale and height are priors of the fit.
 
-    A known length is a prior only if a height is given too, or if the fit without the length is rejected. `robot` is
-    the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two registered images.
+    `robot` is the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two
+    registered images.
     """
     evidence, rows = reconstruction.evidence, reconstruction.image_index
     if len(rows) < 2:
@@ -132,11 +141,7 @@ def fit_poses(
         camera_errors="none",
         names=[capture.images[row] for row in rows],
     )
-    if options.known_length is not None:
-        scale = length_cue(capture, reconstruction, options.known_length)
-        # If the motions determine the scale, the length is no prior; checks/lengths.py compares both.
-        scale = None if offset is None and solve().converged else scale
-    if scale is offset is None and metric_std is not None:
+    if offset is None and metric_std is not None:
         free, scale = solve(), (1.0, metric_std)
         off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
         sigmas, share = CONTRADICTED
@@ -154,6 +159,28 @@ def fit_poses(
         priors=priors if offset is None else (*priors, offset_prior(*offset)),
         hand_eye=replace(hand_eye, intrinsics=reconstruction.intrinsics.with_std(None)),
     )
+
+
+def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
+    """Return the axis that all rotations of a planar motion share, the camera's coordinate along it, and its std.
+
+    The axis is a unit vector in the gripper frame, with its sign such that it points up in the base frame. The
+    coordinate (m) counts from the gripper's origin; the third number is its standard deviation (m). `height` (m) is the
+    measured height of the camera above the gripper's origin, which is returned as the coordinate.
+
+    Raises InputError if the gripper does not rotate about one common axis.
+    """
+    u, _, vt = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
+    up = np.sign(u[2, 0]) or 1.0
+    axis_in_base, axis_in_gripper = up * u[:, 0], up * vt[0]
+    wander = np.linalg.norm(base_from_gripper[:, :3, :3] @ axis_in_gripper - axis_in_base, axis=1)
+    rotation = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
+    if np.sqrt((wander**2).mean()) > ONE_AXIS or rotation.max() < ONE_AXIS:
+        raise InputError(
+            "--known-height: the gripper does not rotate about one common axis, along which a height could be "
+            "known; leave the option out"
+        )
+    return axis_in_gripper, height, HEIGHT_STD
 
 
 def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> Calibration:
@@ -176,11 +203,8 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrorPrior) -> Calibration:
     """Return the fit to given camera poses, with findings about a wrong scale or a wrong pose convention.
 
-    `robot` is the error prior of the gripper poses of `pairs`. Raises InputError for the option `known_length`, which
-    needs images.
+    `robot` is the error prior of the gripper poses of `pairs`.
     """
-    if options.known_length is not None:
-        raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     gripper, camera, height = pairs.base_from_gripper, pairs.recon_from_camera, options.known_height
     solve = partial(
         solve_hand_eye,

@@ -529,19 +529,6 @@ def _dispersion(images: ImageEvidence) -> float:
     return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected
 
 
-def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
-    """Return directions (columns) in the e parameters of a camera (`Row`) that give each of p images a focal length.
-
-    The first column changes fx and fy by the same factor. The others change the logarithms of the images' focal lengths
-    by the columns of `differences`. `images` is p.
-    """
-    q = len(parameter_names(camera))
-    out = np.zeros((q + OF_IMAGE * images + PRISM, images))
-    out[:2, 0] = 1.0
-    out[q : q + images, 1:] = differences(images)
-    return out
-
-
 def differences(count: int) -> Float[ndarray, "n d"]:
     """Return an orthonormal basis (columns) of the vectors of length n = `count` whose sum is 0; d = n − 1."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]

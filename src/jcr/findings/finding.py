@@ -68,7 +68,6 @@ class Finding:
 LENGTHS = {
     "robot": "the robot's positions",
     "board": "the size of the board",
-    "known length": "the known length",
     "depth camera": "the depth camera",
     "network": "the network's metre",
 }

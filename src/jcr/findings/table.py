@@ -156,13 +156,13 @@ class FindingKind(StrEnum):
         help="more images; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
         "the focal length {value:grows|shrinks} by {percent:!.1f} ± {std_percent:~} % from the nearest "
-        "view to the farthest", "lock the focus, or --focus varies", explains=MISFIT)
+        "view to the farthest", "lock the focus", explains=MISFIT)
     FOCUS_BY_IMAGE = "focal length differs between images", KindRow("camera",
         "the focal length differs between images by {percent:~} % (rms, each ± {std_percent:~} %)",
-        "lock the focus and take the images again, or --focus varies", explains=MISFIT)
+        "lock the focus and take the images again", explains=MISFIT)
     ZOOM = "focal length changed once", KindRow("camera",
         "the focal length changes by {percent:+.1f} ± {std_percent:~} % after {images[0]}: the "
-        "zoom or focus was moved", "calibrate the images before or after it, or --focus varies", explains=MISFIT)
+        "zoom or focus was moved", "calibrate the images before or after it", explains=MISFIT)
     ROLLING_SHUTTER = "images sheared alike", KindRow("camera",
         "the images are sheared by {value:.1f} ± {std:~} px from top to bottom, as by the rolling "
         "shutter of a moving camera", "take the images at rest", explains=MISFIT)
@@ -221,8 +221,8 @@ class FindingKind(StrEnum):
     SCALES = "lengths contradict each other", KindRow("lengths",
         "{one} and {other} contradict each other by {percent:!.1f} ± {std_percent:~} %",
         "measure both again", explains=MISFIT,
-        means="two of what the scale is known from (`details.one`, `details.other`: robot, board, known "
-        "length, depth camera, network) differ by more than they may")
+        means="two of what the scale is known from (`details.one`, `details.other`: robot, board, "
+        "depth camera, network) differ by more than they may")
     BOARD_SIDE = "side of a board", KindRow("lengths",
         "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm:.2f} mm",
         "measure one, and give it in --board: the scale is then known twice")
@@ -249,7 +249,7 @@ class FindingKind(StrEnum):
         help="other motions")
     SCALE_FROM_ROBOT = "scale from the robot alone", KindRow("lengths",
         "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no "
-        "image shows it, and ± does not include it", "the size of a board or --known-length would show it")
+        "image shows it, and ± does not include it", "the size of a board would show it")
     IMAGES_ROTATED = "images rotated", KindRow("reconstruction",
         "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and "
         "gripper_from_camera and the intrinsics are of the camera that would see them so",

@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from jcr.calibration.cues import check_known_length
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.capture.added import with_added_images
@@ -75,7 +74,6 @@ def run(
     if not isinstance(capture, Capture):
         with locked(out):
             capture = read_capture(capture, into=out / CAPTURE)
-    check_known_length(capture, options.calibrate.known_length)
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
     options, missing = _possible(replace(options, reconstruct=with_cameras_of(capture, own)), capture)
     with locked(out):
@@ -107,7 +105,7 @@ def calibrate(
 ) -> RunResult:
     """Calibrate a capture without a map; write calibration and report to the folder `out`; raises as `run` does.
 
-    Dense depth is estimated only if a known length needs it; `build_map` estimates it later for a map.
+    `build_map` adds a map later.
     """
     options = replace(checked_options(options, RunOptions), map=None)
     return run(capture, out, options, backend=backend, progress=progress)

@@ -11,7 +11,6 @@ from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.words import leave_one_out_text
-from jcr.depth.densify import densify
 from jcr.errors import InputError, RejectedError
 from jcr.findings import (
     Concerns,
@@ -254,8 +253,7 @@ def _try(
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
     `source` is the options of the back end, or a reconstruction made before. `keep` receives the reconstruction before
-    the calibration. Dense depth is estimated first if a known length needs it. An InputError of the calibration is
-    raised, because it would occur with every back end.
+    the calibration. An InputError of the calibration is raised, because it would occur with every back end.
     """
     start, report = time.perf_counter(), progress or silent
     own = source if isinstance(source, ReconstructOptions) else None
@@ -267,8 +265,6 @@ def _try(
     give_back()  # return the memory of the back end to the system
     if made is not None and keep is not None:
         keep(made)
-    if made is not None and options.calibrate.known_length is not None:
-        made = densify(capture, made, options.depth, progress)
     calibrating = time.perf_counter()
     if made is not None:
         report("calibrate", 0.0)

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.cues import surface_at
+from jcr.camera import project, unproject
 from jcr.capture.plain_files import read_lines, split_cells
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, by_similarity, inverse
+from jcr.records import Capture, Reconstruction
 from jcr.result import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
@@ -80,6 +81,31 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
     std = np.sqrt(np.diag(covariance)).reshape(-1, 3)
     return TouchTest(tuple(images), error, std, float(chi2.sf(squared, error.size)))
+
+
+def surface_at(
+    capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
+) -> Float[ndarray, "3"]:
+    """Return the surface point (recon frame and unit) at the pixel `x_px` of an image, from the pointmaps.
+
+    `image` is a name of the capture, `x_px` a pixel (x, y) of its distorted image; the nearest pixel of the pointmap is
+    read. Raises InputError if the image is not registered or the pixel has no depth. The message begins with
+    `asked_by`, the file that states the pixel.
+    """
+    rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
+    if not rows:
+        raise InputError(f"{asked_by}: {image} is not among the registered images; choose another")
+    if (dense := reconstruction.pointmaps) is None:
+        raise InputError(
+            f"{asked_by}: there is no dense depth to read a surface from; make it with `jcr map`"
+        )
+    x_px = project(dense.intrinsics, unproject(reconstruction.intrinsics, x_px))
+    column, row = np.round(x_px).astype(int)
+    height, width = dense.confidence.shape[1:]
+    inside = 0 <= column < width and 0 <= row < height
+    if not inside or not dense.confidence[rows[0], row, column] > 0:
+        raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
+    return dense.points_in_recon[rows[0], row, column].astype(np.float64)
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:

@@ -429,7 +429,7 @@ class PaperResiduals:
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
 
-LengthName = Literal["board", "known length", "depth camera", "network"]
+LengthName = Literal["board", "depth camera", "network"]
 """Sources of known lengths that are compared with the robot."""
 
 

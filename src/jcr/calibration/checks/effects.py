@@ -164,10 +164,10 @@ def of_case(case: Case) -> Adjustment:
     a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
     """
     tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
-    free, is_many = case.free_focus, len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
+    is_many = len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
     if len(case.used) >= MIN_IMAGES and is_many:
         case = replace(case, chosen_tracks=some_points(tracks, most, MOST_POINTS))
-        case = replace(case, adjusted=adjust_case(case, combinations=free))
+        case = replace(case, adjusted=adjust_case(case))
     assert case.adjusted is not None
     return Adjustment(
         solution=case.adjusted,
@@ -177,7 +177,6 @@ def of_case(case: Case) -> Adjustment:
         names=[case.names[row] for row in case.used],
         std=np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged,
         is_given=case.capture.intrinsics is not None,
-        rows=() if free is None else (Row(kind=FindingKind.FOCUS_BY_IMAGE, columns=free),),
     )
 
 

@@ -1,4 +1,4 @@
-"""Checks of known lengths (board, known length, depth camera, network) against the robot, and of a network's focal.
+"""Checks of known lengths (board, depth camera, network) against the robot, and of a network's focal length.
 
 Lengths that agree with the robot become priors of the scale. If two lengths contradict each other, the scale stays that
 of the robot, and a finding names both. Depth cameras have scale errors of a few percent, and noise that grows with the
@@ -7,7 +7,7 @@ square of the distance (Khoshelham and Elberink, Sensors 2012).
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +15,6 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import refined_by
 from jcr.calibration.case import Case
-from jcr.calibration.cues import CONTRADICTED, length_cue
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_depth_images
@@ -74,9 +73,9 @@ class Length:
 def check_lengths(case: Case) -> Case:
     """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
 
-    A known length comes from a board, the option known_length, a depth camera or a network; the robot's positions count
-    as another length. Two of them contradict if they differ by more than SIGMAS standard deviations and by more than
-    LEAST. The comparison is recorded in `Calibration.lengths`.
+    A known length comes from a board, a depth camera or a network; the robot's positions count as another length. Two
+    of them contradict if they differ by more than SIGMAS standard deviations and by more than LEAST. The comparison is
+    recorded in `Calibration.lengths`.
     """
     hand_eye, lengths = _measured(case)
     converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
@@ -109,7 +108,7 @@ def check_lengths(case: Case) -> Case:
     alone = not compared and case.reconstruction.metric_std is None
     findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
     if pair is not None:
-        return case.after((_contradiction(*pair, lengths, hand_eye), *findings), hand_eye)
+        return case.after((_contradiction(*pair, hand_eye), *findings), hand_eye)
     # The difference of the most exact length from the robot, as far as it exceeds their uncertainties, is a fault.
     best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
     beyond = best.off**2 - best.std**2 - robot.std**2
@@ -137,9 +136,6 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
         of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
         found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), size_std))))
-    if case.options.known_length is not None and not case.priors:
-        scale, std = length_cue(case.capture, case.reconstruction, case.options.known_length)
-        found.append(Length("known length", float(np.log(hand_eye.scale / scale)), std))
     if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
         of_depth = max((depth.std_percent / 100) ** 2 - variance, 0.0)
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
@@ -152,31 +148,26 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
     return hand_eye, found
 
 
-def _contradiction(one: Length, other: Length, lengths: list[Length], hand_eye: Calibration) -> Finding:
-    """Return the finding that two of the `lengths` contradict each other; a length by the robot must be `one`.
+def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
+    """Return the finding that two lengths contradict each other; a length by the robot must be `one`.
 
-    The finding rejects only if both lengths are exact (EXACT) and one is the robot's. A board that contradicts the
-    robot by up to MISPRINTED, with no other length near the board's, was printed or stated at a wrong size. The finding
-    then warns, because the result is that of the robot alone.
+    A board that contradicts the robot by up to MISPRINTED was printed or stated at a wrong size. The finding then
+    warns, because the result is that of the robot alone. At a larger difference the finding rejects if both lengths are
+    exact (EXACT).
     """
-    off, std, of_robot = other.off - one.off, float(np.hypot(one.std, other.std)), one.name == "robot"
-    if of_robot and other.name == "network":
+    off, std = other.off - one.off, float(np.hypot(one.std, other.std))
+    size: dict[str, Any] = {"value": float(np.expm1(off)), "std": std}
+    if one.name == "robot" and other.name == "network":
         size = {"value": float(np.expm1(-off)), "std": one.std / hand_eye.scale}
         return Finding.of(FindingKind.NETWORK_SCALE, "warns", "poses", **size)
-    exact = of_robot and max(one.std, other.std) < EXACT and abs(off) >= CONTRADICTED[1]
-    kind = FindingKind.BOARD_SIZE if of_robot and other.name == "board" else FindingKind.SCALES
-    support = (third for third in lengths if third is not other and third.std < EXACT)
-    if (
-        kind is FindingKind.BOARD_SIZE
-        and abs(off) <= MISPRINTED
-        and all(
-            abs(third.off - other.off) > AGREES * float(np.hypot(third.std, other.std)) for third in support
-        )
-    ):
-        return Finding.of(kind, "warns", "none", value=float(np.expm1(off)), std=std)
-    shift = tuple(_shift(off, hand_eye).tolist()) if of_robot and other.std < EXACT else None
-    size = {"value": float(np.expm1(off)), "std": std, "shift": shift, "one": one.name, "other": other.name}
-    return Finding.of(kind, "rejects" if exact else "warns", "poses", **size)
+    if one.name != "robot" or other.name != "board":
+        return Finding.of(FindingKind.SCALES, "warns", "poses", **size, one=one.name, other=other.name)
+    if abs(off) <= MISPRINTED:
+        return Finding.of(FindingKind.BOARD_SIZE, "warns", "none", **size)
+    if other.std < EXACT:
+        size["shift"] = tuple(_shift(off, hand_eye).tolist())
+    severity = "rejects" if max(one.std, other.std) < EXACT else "warns"
+    return Finding.of(FindingKind.BOARD_SIZE, severity, "poses", **size)
 
 
 def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
