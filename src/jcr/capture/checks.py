@@ -10,17 +10,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.controllers import far_faults, tolerated
-from jcr.capture.images import read_oriented
+from jcr.capture.images import read_image
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import contained, first_few
 from jcr.errors import InputError
-from jcr.findings import Finding, FindingKind
 from jcr.geometry import step_between
 from jcr.records import Capture
 from jcr.records.capture_json import other_size
 
-ROTATED = {3: "rotated by 180°", 6: "rotated by 90° clockwise", 8: "rotated by 90° counter-clockwise"}
-"""Rotation that shows an image upright, by its EXIF orientation (EXIF 2.32, tag 274); the others mirror it."""
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """Position (m) and rotation (rad) within which two gripper poses count as equal."""
 
@@ -44,22 +41,22 @@ def checked_capture(
         contained(folder, name, f"{where}: frame {k}")
     names = [f"{where}: the pose of {name}" for name in images]
     found = {**(faults or {}), **far_faults(base_from_gripper[:, :3, 3], where, names)}
-    decoded, digests = dict[int, tuple[tuple[int, int], int]](), dict[bytes, int]()
+    sizes, digests = dict[int, tuple[int, int]](), dict[bytes, int]()
     for k in sorted(set(range(len(images))) - found.keys()):
         try:
-            pixels, orientation = read_oriented(folder / images[k])
+            pixels = read_image(folder / images[k])
         except InputError as error:
             found[k] = str(error)
             continue
-        decoded[k] = (pixels.shape[1], pixels.shape[0]), orientation
+        sizes[k] = pixels.shape[1], pixels.shape[0]
         same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), k)
         if same != k:
             text = f"the same image as {images[same]}; drop one of the frames or take it again"
             found[k] = f"{folder / images[k]}: {text}"
-    usual = Counter(size for size, _ in decoded.values()).most_common(1)
-    for k, (size, _) in decoded.items():
+    usual = Counter(sizes.values()).most_common(1)
+    for k, size in sizes.items():
         if size != usual[0][0]:
-            like = images[next(j for j in decoded if decoded[j][0] == usual[0][0])]
+            like = images[next(j for j in sizes if sizes[j] == usual[0][0])]
             found[k] = str(other_size(f"{folder / images[k]}: image", size, usual[0][0], like))
     rows = [k for k in range(len(images)) if k not in found]
     if found and (len(found) > tolerated(len(images)) or len(rows) < min(MIN_FRAMES, len(images))):
@@ -70,8 +67,7 @@ def checked_capture(
         folder=folder,
         images=tuple(images[k] for k in rows),
         base_from_gripper=base_from_gripper[rows],
-        image_size=decoded[rows[0]][0],
-        orientation=_common_orientation(folder, {images[k]: decoded[k][1] for k in rows}),
+        image_size=sizes[rows[0]],
         notes=tuple(f"left out: {found[k]}" for k in sorted(found)),
     )
     return capture, rows
@@ -98,30 +94,3 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
             f"{where}: all {len(base_from_gripper)} gripper poses are the same ({within}); read the pose again for each "
             "image"
         )
-
-
-def _common_orientation(folder: Path, orientation_of: Mapping[str, int]) -> int:
-    """Return the EXIF orientation (1 to 8) that all images share; `orientation_of` has it by the name of each image.
-
-    Raises InputError if the orientations differ or mirror the images.
-    """
-    (first, orientation), *others = orientation_of.items()
-    remedy = "remove the tag from all images (exiftool -Orientation= FILES)"
-    if orientation not in (1, *ROTATED):
-        raise InputError(
-            f"{folder / first}: EXIF orientation {orientation} mirrors the image, as no camera does; {remedy}"
-        )
-    if other := [one for one in others if one[1] != orientation]:
-        raise InputError(
-            f"{folder / other[0][0]}: EXIF orientation {other[0][1]}, but {first} has {orientation}: rotated to be "
-            f"shown, their cameras' axes differ; {remedy}"
-        )
-    return orientation
-
-
-def how_rotated(capture: Capture) -> Finding | None:
-    """Return the finding that the images were rotated by their EXIF tag; None if no image was rotated."""
-    if capture.orientation == 1:
-        return None
-    tag, rotated = float(capture.orientation), ROTATED[capture.orientation]
-    return Finding.of(FindingKind.IMAGES_ROTATED, "warns", "none", value=tag, rotated=rotated)

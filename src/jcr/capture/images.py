@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
-from PIL import Image, ImageOps
+from PIL import Image
 
 from jcr.errors import InputError
 from jcr.files import require_file
@@ -21,8 +21,6 @@ BLURRED = 0.25
 """Sharpness below which a frame is blurred, as a share of the median sharpness of the frames."""
 ORIENTATION = 0x0112
 """EXIF tag that holds an image's orientation."""
-DEFECTIVE = 10_000
-"""Number of pixels of which one may be defective; a defective pixel may have any value."""
 BLURRED_EDGE = 1 / 80
 """Largest `edge_width` of a sharp image; images of eleven real arms have 1/300 to 1/98."""
 EDGES_AT = 640
@@ -45,12 +43,10 @@ DARK, BRIGHT = 12, 243
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read an image as RGB, rotated upright by its EXIF tag; raise InputError if the file is not a readable image."""
-    return read_oriented(path)[0]
+    """Read an image as RGB; raise InputError if the file is not an image of 8 bits a channel, as the sensor sees it.
 
-
-def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
-    """Return an image as RGB, rotated upright, and the EXIF orientation of its file: 1 if the image was not rotated."""
+    An image with an EXIF tag of rotation is refused, because viewers and other readers would turn its axes.
+    """
     require_file(path)
     try:
         with warnings.catch_warnings():
@@ -64,14 +60,13 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
                 if opened.format != "MPO" and count > 1:
                     raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
                 # Pillow reads coloured 16-bit images with a mode of 8 bits; only the tile names the 16 bits.
-                is_deep = ";16" in str(opened.tile) or opened.mode[0] in "IF"
-                opened.load()
+                if ";16" in str(opened.tile) or opened.mode[0] in "IF":
+                    raise InputError(f"{path}: pixels of more than 8 bits a channel; save it with 8 bits")
                 orientation = opened.getexif().get(ORIENTATION, 1)
-                if is_deep:
-                    shown = Image.fromarray(_eight_bits(path))
-                    shown.getexif()[ORIENTATION] = orientation
-                    opened = shown
-                pixels = np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
+                if orientation in range(2, 9):
+                    text = f"EXIF orientation {orientation}, by which viewers turn the image"
+                    raise InputError(f"{path}: {text}; remove the tag (exiftool -Orientation= FILES)")
+                return np.asarray(opened.convert("RGB"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such image; correct its name or add the file") from None
     except InputError:
@@ -80,24 +75,6 @@ def read_oriented(path: Path) -> tuple[UInt8[ndarray, "h w 3"], int]:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
     except Exception as error:  # decoders raise errors of many types for a damaged file
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
-    return pixels, orientation if orientation in range(1, 9) else 1
-
-
-def _eight_bits(path: Path) -> UInt8[ndarray, "h w *rgb"]:
-    """Read a 16-bit image, grey (h,w) or RGB (h,w,3), and return the upper eight of the bits that its pixel values use.
-
-    The image is not rotated by its EXIF tag. Sensors of 8, 10, 12 or 14 bits fill only the lower bits of a 16-bit file.
-    Single defective pixels, which may have any value, are ignored. Raises InputError for pixels that are fractions or
-    have more than 16 bits, because such a file does not state its black and white level.
-    """
-    deep = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    if deep is None or deep.dtype != np.uint16:
-        raise InputError(f"{path}: pixels are fractions or of more than 16 bits; save it with 8 or 16 bits")
-    rank = -2 - deep.size // DEFECTIVE
-    largest = int(np.partition(deep, rank, axis=None)[rank])
-    bits = next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
-    eight = np.minimum(np.right_shift(deep, bits - 8), 255).astype(np.uint8)
-    return np.ascontiguousarray(eight[..., ::-1] if eight.ndim == 3 else eight)
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:

@@ -7,12 +7,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from jcr.capture.checks import how_rotated, require_frames, require_motion
+from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.formats import bag, capture_json, colmap, lerobot, samples, table
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pairing import image_names
 from jcr.errors import InputError
-from jcr.findings import sentence
 from jcr.geometry import inverse
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
@@ -88,8 +87,6 @@ def read_source(
         return replace(capture_json.read(folder), notes=found.notes)
     require_frames(len(found), str(path), at_least)
     require_motion(found.base_from_gripper, str(path))
-    if isinstance(found, Capture) and (rotated := how_rotated(found)) is not None:
-        return replace(found, notes=(*found.notes, sentence(rotated)))
     return found
 
 

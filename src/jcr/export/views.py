@@ -12,10 +12,9 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 from numpy import ndarray
-from PIL import Image
 
 from jcr.camera import is_distorted, pinhole_inside, project, undistortion, unproject
-from jcr.capture.images import ORIENTATION, encode_png, read_image
+from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
 from jcr.geometry import inverse
@@ -126,7 +125,7 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:
     """Copy, link or undistort the images into a new folder; return their file names in it and their intrinsics.
 
-    `options.undistort` and `options.link_images` choose. Images with an EXIF rotation are written upright as PNG.
+    `options.undistort` and `options.link_images` choose.
     """
     folder.mkdir()
     names = [Path(image).name for image in views.images]
@@ -139,14 +138,9 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
         for image, name in zip(views.images, names, strict=True):
             (folder / name).write_bytes(encode_png(undistort(read_image(views.folder / image))))
         return names, pinhole
-    for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
+    for image, name in zip(views.images, names, strict=True):
         source = (views.folder / image).resolve()
-        with Image.open(source) as opened:
-            is_rotated = opened.getexif().get(ORIENTATION, 1) != 1
-        if is_rotated:  # some readers ignore the tag
-            names[k] = f"{Path(name).stem}.png"
-            (folder / names[k]).write_bytes(encode_png(read_image(source)))
-        elif options.link_images:
+        if options.link_images:
             (folder / name).symlink_to(source)
         else:
             shutil.copyfile(source, folder / name)

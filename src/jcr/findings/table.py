@@ -250,11 +250,6 @@ class FindingKind(StrEnum):
     SCALE_FROM_ROBOT = "scale from the robot alone", KindRow("lengths",
         "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no "
         "image shows it, and ± does not include it", "the size of a board would show it")
-    IMAGES_ROTATED = "images rotated", KindRow("reconstruction",
-        "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and "
-        "gripper_from_camera and the intrinsics are of the camera that would see them so",
-        "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and "
-        "calibrate again")
     BOARD_IN_VIEW = "board in view", KindRow("reconstruction", "a calibration board is in view",
         "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
         "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")

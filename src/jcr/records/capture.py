@@ -118,7 +118,7 @@ class Capture:
     """Paths relative to `folder`, which are also the names of the images in all later records."""
     base_from_gripper: Float[ndarray, "n 4 4"]
     image_size: tuple[int, int]
-    """Width and height of all images (px), after the EXIF rotation."""
+    """Width and height of all images (px)."""
     intrinsics: Intrinsics | None = None
     """Given intrinsics; None: unknown, to be estimated."""
     intrinsics_std: Float[ndarray, " q"] | None = None
@@ -135,9 +135,6 @@ class Capture:
     """Name of the arm, one of jcr.estimation.arms.ROBOT_NAMES; None: unknown."""
     urdf: Path | None = None
     """Path of the arm's URDF file, not relative to `folder`; None: none was given."""
-    orientation: int = 1
-    """EXIF orientation of all images. 1: as read from the sensor; otherwise the images were rotated upright, and the
-    camera frame is that of the rotated images."""
     depths: tuple[str | None, ...] | None = None
     """Depth image of each image, or None for an image without one: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"

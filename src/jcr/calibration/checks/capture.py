@@ -8,7 +8,6 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
-from jcr.capture.checks import how_rotated
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.observability import observability
@@ -98,14 +97,13 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Return the case with findings on an arm model that does not fit, images rotated on reading, and back-end warnings.
+    """Return the case with findings on an arm model that does not fit, and on the warnings of the back end.
 
     An arm model that the gripper poses do not fit is not used (`RobotErrorPrior.unused`).
     """
-    first = (case.robot.unused, how_rotated(case.capture))
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
-    return case.after((*filter(None, first), *warnings))
+    return case.after((*filter(None, [case.robot.unused]), *warnings))
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
