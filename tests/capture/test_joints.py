@@ -1,4 +1,4 @@
-"""Joint angles of recordings: interpolation across ±π, mimic joints, and the forward kinematics of yourdfpy."""
+"""Joint angles of recordings: interpolation across ±π, and the forward kinematics of a URDF's chain."""
 
 from pathlib import Path
 
@@ -69,21 +69,6 @@ def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, uni
     assert gap.tolist() == [10_000_000]
 
 
-def test_a_joint_that_mimics_another_follows_it(tmp_path: Path):
-    arm = arm_of(tmp_path, MIMIC)
-    assert arm.joints == ("pan", "lift")
-    pan, lift = np.array([[0.3], [-0.2]]), np.array([[0.5], [0.1]])
-    expected = arm_poses(np.hstack([pan, lift, 2 * lift + 0.1]))
-    np.testing.assert_allclose(arm.poses(np.hstack([pan, lift])), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("leader", ["roll", "nose"])
-def test_mimics_that_lead_nowhere_are_refused(tmp_path: Path, leader: str):
-    text = MIMIC.replace('mimic joint="lift"', f'mimic joint="{leader}"')
-    with pytest.raises(jcr.InputError, match=f"mimics {leader}, which is not an independent joint"):
-        arm_of(tmp_path, text)
-
-
 @pytest.mark.parametrize(
     ("text", "dof", "words"),
     [
@@ -96,3 +81,8 @@ def test_joints_that_are_no_chain_of_the_urdf_are_refused(tmp_path: Path, text: 
     (tmp_path / "arm.urdf").write_text(text)
     with pytest.raises(jcr.InputError, match=rf"arm\.urdf: {words}"):
         read_chain(tmp_path / "arm.urdf", dof)
+
+
+def test_recorded_joints_that_do_not_rotate_by_themselves_are_refused(tmp_path: Path):
+    with pytest.raises(jcr.InputError, match="joint roll is coupled to another"):
+        arm_of(tmp_path, MIMIC)

@@ -1,4 +1,4 @@
-"""Arms in URDF files: their kinematic chain as an `Arm`, and gripper poses from recorded joint positions."""
+"""Arms in URDF files: their kinematic chain as an `Arm`, and gripper poses from recorded joint angles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import chosen_name, read_text
 from jcr.capture.pose_track import Stamps, bracket
 from jcr.errors import InputError
-from jcr.estimation.kinematics import Arm
+from jcr.estimation.kinematics import Arm, forward_kinematics
 from jcr.geometry import require_rigid
 
 if TYPE_CHECKING:
@@ -73,7 +73,14 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
     if len(chains) != 1:
         found = f"chains to {', '.join(chain[-1].child for chain in chains)}" if chains else "no chain"
         raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
-    (chain,) = chains
+    return _arm_of(chains[0], where)
+
+
+def _arm_of(chain: "Sequence[yourdfpy.Joint]", where: object) -> Arm:
+    """Return the arm of a URDF's joints, from the base to the gripper, fixed ones too.
+
+    Raises InputError, begun with `where`, if a moving joint does not rotate, or follows another one.
+    """
     frames, frame, moving = [], np.eye(4), [joint for joint in chain if joint.type != "fixed"]
     for joint in chain:
         frame = frame @ (np.eye(4) if joint.origin is None else joint.origin)
@@ -107,17 +114,15 @@ def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedArm:
-    """Arm of a URDF with its base and gripper links, and the units of its recorded joint positions."""
+    """Arm of a URDF from its base link to its gripper link, with the names and the unit of its recorded joint angles."""
 
+    arm: Arm
     urdf: "yourdfpy.URDF"
-    base: str
     gripper: str
     joints: tuple[str, ...]
-    """Names of the joints that move the gripper, in the order of the chain."""
-    unit: Float[ndarray, " j"]
-    """Factor from each joint's recorded unit to radians or, for a sliding joint, metres."""
-    turn: Float[ndarray, " j"]
-    """Full turn of each joint in recorded units; 0 for a sliding joint."""
+    """Names of the joints, in the order of the chain."""
+    unit: float
+    """Factor from recorded angles to radians."""
 
     def columns(self, names: Sequence[str], where: str) -> list[int]:
         """Return the indices in `names` (recorded joints) of the arm's joints; raise InputError if one is missing."""
@@ -130,9 +135,9 @@ class RecordedArm:
         return [list(names).index(joint) for joint in self.joints]
 
     def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
-        """Convert recorded positions, a column per joint in the order of `joints`, to joint angles (rad).
+        """Convert recorded angles, a column per joint in the order of `joints`, to radians.
 
-        The result is None if not all joints rotate, or if the URDF has not exactly one chain with as many joints.
+        The result is None if the URDF has not exactly one chain with as many joints.
         """
         try:
             read_chain(self.urdf, len(self.joints))
@@ -141,34 +146,29 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper (m) from positions in recorded units, one column per joint in order of `joints`.
+        """Compute base_from_gripper (m) from recorded angles, one column per joint in order of `joints`.
 
-        Raises InputError if the positions are so large that they are degrees, although the unit is radians.
+        Raises InputError if the angles are so large that they are degrees, although the unit is radians.
         """
-        positions = recorded * self.unit
-        if (largest := float(np.abs(positions).max(initial=0.0))) > 2 * RADIANS_LIMIT:
+        angles = recorded * self.unit
+        if (largest := float(np.abs(angles).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(f"angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg")
-        poses = np.empty((len(positions), 4, 4))
-        for pose, row in zip(poses, positions, strict=True):
-            self.urdf.update_cfg(dict(zip(self.joints, row, strict=True)))
-            pose[:] = self.urdf.get_transform(self.gripper, self.base)
-        return poses
+        return forward_kinematics(self.arm, angles)
 
     def interpolated(
         self, samples: Sequence[tuple[Int[ndarray, " _"], Float[ndarray, " _"]]], stamp_ns: Stamps
     ) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
-        """Return the joint positions at n time stamps (ns), and the largest gap (ns) between joint samples around each.
+        """Return the recorded angles at n time stamps (ns), and the largest gap (ns) between joint samples around each.
 
-        `samples` are the ascending time stamps (ns) and recorded positions of each of the j joints. Positions are
-        interpolated linearly, in the recorded units; a joint turns the shorter way, also across ±π.
+        `samples` are the ascending time stamps (ns) and recorded angles of each of the j joints. Angles are interpolated
+        linearly; a joint turns the shorter way, also across ±π.
         """
         rows, gap = np.zeros((len(stamp_ns), len(samples))), np.zeros(len(stamp_ns), np.int64)
-        for k, ((stamps, positions), turn) in enumerate(zip(samples, self.turn.tolist(), strict=True)):
+        turn = 2 * np.pi / self.unit
+        for k, (stamps, angles) in enumerate(samples):
             before, share, width = bracket(stamps, stamp_ns)
-            step = positions[np.minimum(before + 1, len(stamps) - 1)] - positions[before]
-            if turn > 0:
-                step = step - turn * np.round(step / turn)
-            rows[:, k] = positions[before] + share * step
+            step = angles[np.minimum(before + 1, len(stamps) - 1)] - angles[before]
+            rows[:, k] = angles[before] + share * (step - turn * np.round(step / turn))
             gap = np.maximum(gap, width)
         return rows, gap
 
@@ -176,8 +176,8 @@ class RecordedArm:
 def read_arm(options: ReadOptions) -> RecordedArm:
     """Read the arm of `options.urdf` between its links `options.base_frame` (None: root) and `options.gripper_frame`.
 
-    Units of recorded positions are those of `options.pose_units`; "auto": m and rad. Raises InputError if a link is
-    missing, if no moving joint lies between the links, or if the URDF is invalid.
+    The unit of recorded angles is that of `options.pose_units`; "auto": rad. Raises InputError if a link is missing, if
+    no moving joint lies between the links, if one does not rotate, or if the URDF is invalid.
     """
     file = options.urdf
     assert file is not None
@@ -189,22 +189,8 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     if base not in (*parents, gripper):
         raise InputError(f"{file}: no joints lead from {base} to {gripper}; name the base with --base-frame")
     chain = chain[parents.index(base) :] if base in parents else []
-    moving = [joint for joint in chain if joint.type != "fixed"]
-    names = tuple(dict.fromkeys(joint.mimic.joint if joint.mimic else joint.name for joint in moving))
+    names = tuple(joint.name for joint in chain if joint.type != "fixed")
     if not names:
         raise InputError(f"{file}: nothing moves between {base} and {gripper}; name a link after a joint")
-    if unknown := [name for name in names if name not in urdf.actuated_joint_names]:
-        raise InputError(
-            f"{file}: a joint mimics {unknown[0]}, which is not an independent joint of the URDF; correct it"
-        )
-    angle = np.radians(1.0) if options.pose_units.endswith("deg") else 1.0
-    length = 1e-3 if options.pose_units.startswith("mm") else 1.0
-    slides = np.array([urdf.joint_map[name].type == "prismatic" for name in names])
-    return RecordedArm(
-        urdf=urdf,
-        base=base,
-        gripper=gripper,
-        joints=names,
-        unit=np.where(slides, length, angle),
-        turn=np.where(slides, 0.0, 2 * np.pi / angle),
-    )
+    unit = float(np.radians(1.0)) if options.pose_units.endswith("deg") else 1.0
+    return RecordedArm(arm=_arm_of(chain, file), urdf=urdf, gripper=gripper, joints=names, unit=unit)
