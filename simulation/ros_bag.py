@@ -10,15 +10,13 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.capture.images import read_depth_images, read_image
+from jcr.capture.images import read_image
 from jcr.extras import extra
 from jcr.geometry import rotation_between_deg, transform
 from jcr.records import Capture
 
 FPS, TF_HZ = 30.0, 100.0
 START_NS = 1_700_000_000_123_456_789
-DEPTH_LATER_NS = 5_000_000
-"""Colour and depth are not of the same instant."""
 BLUR_PX_PER_M = 30.0
 """Length of the blur (px) per m/s: 600 px of focal length, half a metre away, 25 ms of exposure."""
 
@@ -44,8 +42,7 @@ def write_bag(
 ) -> Path:
     """Write a bag in which the arm stops at every view of a capture and moves smoothly between them.
 
-    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
-    /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
+    Topics: /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
     /tf_static (world to base_link).
     """
     rosbag1, rosbag2 = extra("rosbags.rosbag1", "ros", "a bag"), extra("rosbags.rosbag2", "ros", "a bag")
@@ -138,12 +135,6 @@ def _messages(
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
         row = round(float(rows[0]))
-        if capture.depths is not None and (name := capture.depths[row]) is not None:
-            depth = (
-                (1000 * read_depth_images(capture.folder / name, capture.image_size)).round().astype("<u2")
-            )
-            message = image_message(at + DEPTH_LATER_NS, "16UC1", depth)
-            yield at, "/camera/aligned_depth_to_color/image_raw", message
         # Blurred by the camera's speed, with one grey level of noise in places: no two frames are alike.
         length = 1 + round(BLUR_PX_PER_M * float(speeds[0]))
         image = images[row] ^ (rng.random(images[row].shape[:2]) < 0.02)[..., None].astype(np.uint8)

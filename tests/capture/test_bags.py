@@ -1,6 +1,5 @@
 """Recordings of robots: ROS 1, sqlite3 and MCAP bags give the frames at which the arm stood still."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,11 +9,10 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from jcr.capture.images import encode_png, read_depth_images, read_image
+from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.recording import best_frames
 from jcr.capture.ros import image_of, read_ros_depth
-from jcr.files import write_bytes
 from jcr.records import Capture
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
@@ -55,27 +53,6 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
             files = got.folder / name, capture.folder / capture.images[k]
             image, original = (read_image(file).astype(int) for file in files)
             assert kind != "sqlite3" or np.abs(image - original).max() <= 1  # raw; the bag adds noise
-
-
-@pytest.mark.slow
-def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Capture):
-    width, height = capture.image_size
-    few = capture.base_from_gripper[:4]
-    for k, name in enumerate(capture.images[:4]):
-        write_bytes(tmp_path / name, (capture.folder / name).read_bytes())
-        depth = np.full((height, width), 500 + k, np.uint16)
-        depth[:, : 10 * k] = 0
-        write_bytes(tmp_path / f"depth/{k}.png", encode_png(depth))
-    names = tuple(f"depth/{k}.png" for k in range(4))
-    taken = replace(capture, folder=tmp_path, images=capture.images[:4], base_from_gripper=few, depths=names)
-    bag = write_bag(tmp_path / "scan", taken, "mcap", 4.0, fps=5.0, tf_hz=50.0)
-    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
-    assert got.depths is not None and all(got.depths)
-    _, _, view = nearest_view(got.base_from_gripper, few)
-    for name, k in zip(got.depths, view, strict=True):
-        depth = read_depth_images(got.folder / str(name), got.image_size)
-        assert depth[0, -1] == pytest.approx((500 + k) / 1000) and (depth == 0).sum() == 10 * k * height
-    assert jcr.read_capture(tmp_path / "frames").depths == got.depths
 
 
 def test_depth_messages_are_read_in_every_encoding():

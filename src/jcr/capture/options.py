@@ -52,5 +52,5 @@ class ReadOptions:
     max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0
     """Recordings: largest gap between two poses across which one is interpolated; beyond it the image is left out."""
     episode: tuple[int, ...] = (0,)
-    """LeRobot: episodes to take frames from; they must show the same scene, untouched in between. In `jcr batch` each
-    episode is a capture of its own, and those whose camera moved are named."""
+    """LeRobot: the episode to take frames from. `jcr batch` takes several, each as a capture of its own, and names those
+    whose camera moved."""

@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8, UInt16
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.capture.checks import checked_capture
-from jcr.capture.images import BLURRED, DEPTH, encode_png, sharpness
+from jcr.capture.images import BLURRED, encode_png, sharpness
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pose_track import NEVER
 from jcr.capture.ros import read_camera_info
@@ -57,8 +57,6 @@ class Recording:
     """Function from an image size (width, height) to the recorded intrinsics; used without `options.camera_info`."""
     joints: Float[ndarray, "n j"] | None = None
     """Joint angles (rad) of the arm in `options.urdf`, one row per frame; None if they are unknown."""
-    depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
-    """Function from a row to the depth image (mm) aligned with its frame; None without depth."""
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
@@ -92,15 +90,10 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
 
     poses = recording.base_from_gripper
     rows, remarks = best_frames(poses, recording.speed, fresh, sharpness_of, options.frames)
-    images, depths = list[str](), list[str | None]()
+    images = list[str]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
-        name = recording.names[row]
-        images.append(f"images/{name}{ending}")
+        images.append(f"images/{recording.names[row]}{ending}")
         write_bytes(into / images[-1], image if isinstance(image, bytes) else encode_png(image))
-        depth = None if recording.depth_at is None else recording.depth_at(row)
-        depths.append(None if depth is None else f"{DEPTH}/{name}.png")
-        if depth is not None:
-            write_bytes(into / f"{DEPTH}/{name}.png", encode_png(depth))
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     known = recording.intrinsics_of_size
     if options.camera_info is not None:
@@ -111,7 +104,6 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         capture,
         joints=None if recording.joints is None else recording.joints[rows[kept]],
         urdf=None if recording.joints is None else options.urdf,
-        depths=tuple(depths[k] for k in kept) if any(depths[k] for k in kept) else None,
         intrinsics=known(capture.image_size),
         notes=(*notes, *remarks, *capture.notes),
     )
@@ -191,22 +183,14 @@ def _most_informative(
 
     `gain` are the information matrices of the poses, `before` is that of earlier ones. Each choice reduces most the sum
     of the variances of gripper_from_camera and log scale in units of 1 mm, 0.1° and 0.2 % (A-optimal design: Pukelsheim,
-    Optimal Design of Experiments, 1993, chapter 9). Gains fall as poses are added, so only candidates with the largest
-    earlier gains are evaluated again (accelerated greedy selection: Minoux, Optimization Techniques, 1978).
+    Optimal Design of Experiments, 1993, chapter 9).
     """
-
-    def uncertainty_of(rows: list[int]) -> float:
-        """Return the sum of the variances, without a unit, if the poses of these indices are added."""
-        return float((np.diag(expected_covariance(before + gain[rows].sum(0))) / UNIT**2).sum())
-
-    chosen, reduction, last = list[int](), np.full(len(gain), np.inf), uncertainty_of([])
+    chosen = list[int]()
     while len(chosen) < min(count, len(gain)):
-        evaluated = dict[int, float]()
-        while (row := int(reduction.argmax())) not in evaluated:
-            evaluated[row] = uncertainty_of([*chosen, row])
-            reduction[row] = last - evaluated[row]
-        chosen.append(row)
-        reduction[row], last = -np.inf, evaluated[row]
+        covariance = expected_covariance(before + gain[chosen].sum(0) + gain)
+        uncertainty = (np.diagonal(covariance, axis1=1, axis2=2) / UNIT**2).sum(1)
+        uncertainty[chosen] = np.inf
+        chosen.append(int(uncertainty.argmin()))
     return chosen
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import chosen_name, read_yaml
 from jcr.capture.pose_track import Stamps, TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
-from jcr.capture.ros import image_of, intrinsics_of_ros, read_ros_depth
+from jcr.capture.ros import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -24,10 +24,6 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SUFFIXES = (".bag", ".mcap", ".db3")
-ALIGNED = "aligned_depth"
-"""Part of the topic names of depth images whose pixels coincide with those of the colour image (realsense2_camera)."""
-SAME_MOMENT_NS = 20_000_000
-"""Largest difference (ns) between the time stamps of the colour and the depth image of one exposure."""
 
 
 def recognises(path: Path) -> bool:
@@ -70,7 +66,6 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             images_of_rows=bag.pictures,
             intrinsics_of_size=bag.intrinsics,
             joints=joints,
-            depth_at=bag.depth_at if bag.depth else None,
         )
         return capture_of_recording(recording, into, report)
 
@@ -91,8 +86,6 @@ class _Bag:
         self.camera_info: Any = None
         self.topic = topic = _camera_topic(reader, options, path)
         self.images = [c for c in reader.connections if c.topic == topic]
-        self.depth = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
-        """Connections of the depth images whose pixels coincide with those of the colour images."""
         infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
         info = [c for name in infos for c in reader.connections if c.topic == name and c.msgtype == INFO][:1]
         span = max(reader.end_time - reader.start_time, 1)
@@ -144,21 +137,6 @@ class _Bag:
                 if _stamp(message, at) == self.stamp_ns[row]:
                     yield row, *image_of(message, f"{self.path}: {self.topic}")
                     break
-
-    def depth_at(self, row: int) -> UInt16[ndarray, "h w"] | None:
-        """Return the depth image (mm) nearest in time to the colour image of a row; None if none is within 20 ms.
-
-        A row is the index of a colour image in the order of time stamps. The depth image has the pixels of the colour
-        image, with 0 where no depth was measured.
-        """
-        stamp, logged = int(self.stamp_ns[row]), int(self.log_ns[row])
-        span = {"start": logged - 5 * SAME_MOMENT_NS, "stop": logged + 5 * SAME_MOMENT_NS}
-        near = [
-            (abs(_stamp(message, at) - stamp), connection.topic, message)
-            for connection, at, message in self.messages(self.depth, **span)
-        ]
-        apart, topic, message = min(near, key=lambda one: one[0], default=(SAME_MOMENT_NS + 1, "", None))
-        return read_ros_depth(message, f"{self.path}: {topic}") if apart <= SAME_MOMENT_NS else None
 
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
         """Return the intrinsics in the bag's CameraInfo for images of `size` (width, height); None if it has none.

@@ -80,10 +80,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Extract the sharpest frames at rest from the episodes that the options name; return them as a capture.
+    """Extract the sharpest frames at rest from the episode that the options name; return them as a capture.
 
     Images are written to the folder `into`; `report` receives the progress. Raises InputError that lists the existing
-    cameras, states or episodes if the options name others.
+    cameras, states or episodes if the options name others, or more than one episode.
     """
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
@@ -93,22 +93,21 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     states = [key for key, feature in features.items() if feature.dtype.startswith("float")]
     usual = [key for key in ((STATE,) if options.urdf else (CARTESIAN, STATE)) if key in states][:1]
     key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
-    episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
-    if len({episode.state.shape[1] for episode in episodes}) > 1:
-        raise InputError(f"{path}: {key} has another length in another episode; read one episode")
-    state = np.concatenate([episode.state for episode in episodes])
-    poses, joints = _poses(state, key, features[key], options, path)
-    ends = np.cumsum([len(episode.time_s) for episode in episodes])
-    stamps = [np.round(1e9 * episode.time_s).astype(np.int64) for episode in episodes]
-    pieces = zip(stamps, np.split(poses, ends[:-1]), strict=True)
+    if len(options.episode) != 1:
+        raise InputError(
+            f"{path}: {len(options.episode)} episodes; read one, or several one by one with jcr batch"
+        )
+    episode = read_episode(path, info, camera, key, options.episode[0])
+    poses, joints = _poses(episode.state, key, features[key], options, path)
+    stamps = np.round(1e9 * episode.time_s).astype(np.int64)
     recording = Recording(
         source=path,
         options=options,
-        names=[f"episode_{e.index:06d}_frame_{k:06d}" for e in episodes for k in range(len(e.time_s))],
+        names=[f"episode_{episode.index:06d}_frame_{k:06d}" for k in range(len(poses))],
         base_from_gripper=poses,
-        speed=np.concatenate([speed(partial(interpolated_poses, at, part), at) for at, part in pieces]),
-        gap_ns=np.zeros(len(state), np.int64),  # pose and image of a row have the same time
-        images_of_rows=lambda rows: _images(episodes, rows, camera, info.fps),
+        speed=speed(partial(interpolated_poses, stamps, poses), stamps),
+        gap_ns=np.zeros(len(poses), np.int64),  # pose and image of a row have the same time
+        images_of_rows=lambda rows: _images(episode, rows, camera, info.fps),
         joints=joints,
     )
     return capture_of_recording(recording, into, report)
@@ -181,31 +180,24 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
     return contained(path, name, str(path / INFO))
 
 
-def _images(episodes: list[Episode], rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
-    """Yield row, image (encoded bytes or RGB pixels) and file ending for each of k ascending rows.
+def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
+    """Yield row, image (encoded bytes or RGB pixels) and file ending for each of k ascending rows of an episode.
 
-    A row is the index of a frame, counted over all episodes. The images are from the videos or tables of `episodes`.
-    `key` is the image column, `fps` the frame rate of the videos (1/s).
+    The images are from its video or table. `key` is the image column, `fps` the frame rate of the video (1/s).
     """
-    first = 0
-    for episode in episodes:
-        local = rows[(rows >= first) & (rows < first + len(episode.time_s))] - first
-        mine, first = local + first, first + len(episode.time_s)
-        if len(mine) == 0:
-            continue
-        if episode.video is not None:
-            frames = _video_frames(episode.video, episode.video_start_s + episode.time_s[local], 0.5 / fps)
-            yield from ((row, rgb, ".png") for row, rgb in zip(mine.tolist(), frames, strict=True))
-            continue
-        numbers = episode.frame[local].tolist()
-        found = _read_table(episode.table, ["frame_index", key], episode.index, numbers)
-        images = dict(zip(found["frame_index"], found[key], strict=True))
-        for row, number in zip(mine.tolist(), numbers, strict=True):
-            file = images[number].get("bytes") if isinstance(images[number], dict) else None
-            if not file:
-                what = f"holds no {key} of frame {number}; write the data set with embedded images"
-                raise InputError(f"{episode.table}: {what}")
-            yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+    if episode.video is not None:
+        frames = _video_frames(episode.video, episode.video_start_s + episode.time_s[rows], 0.5 / fps)
+        yield from ((row, rgb, ".png") for row, rgb in zip(rows.tolist(), frames, strict=True))
+        return
+    numbers = episode.frame[rows].tolist()
+    found = _read_table(episode.table, ["frame_index", key], episode.index, numbers)
+    images = dict(zip(found["frame_index"], found[key], strict=True))
+    for row, number in zip(rows.tolist(), numbers, strict=True):
+        file = images[number].get("bytes") if isinstance(images[number], dict) else None
+        if not file:
+            what = f"holds no {key} of frame {number}; write the data set with embedded images"
+            raise InputError(f"{episode.table}: {what}")
+        yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
 
 
 def _video_frames(
