@@ -6,6 +6,7 @@ prints them, translation with quaternion, rotation vector or angles, a 3x3 rotat
 poses, gripper in base and marker in camera.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,21 @@ from jcr.errors import InputError
 SUFFIXES = (".yaml", ".yml", ".json", ".samples")
 PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
 """Keys of the gripper pose and the marker pose in a sample of MoveIt Calibration and of easy_handeye2."""
-_XYZW, _WXYZ = ("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")
-_CELLS_OF_ROTATION = (
-    dict.fromkeys(("orientation", "rotation", "quaternion", "quat", "q", "quat_xyzw"), _XYZW)
-    | dict.fromkeys(("rvec", "rotvec", "rotation_vector", "axis_angle"), ("rvec_x", "rvec_y", "rvec_z"))
-    | dict.fromkeys(("rpy", "euler", "roll_pitch_yaw"), ("roll", "pitch", "yaw"))
-    | {"quat_wxyz": _WXYZ}
-)
-"""Names of a rotation's cells, by the key of the rotation in the file."""
+_ALIASES = {
+    re.compile(r"(?:[tp]_?|(?:pos|position|xyz|translation|tvec)_)([xyz])"): r"\1",
+    re.compile(r"(?:q|quat|quaternion|orientation|rotation)_(?:xyzw_|wxyz_)?([xyzw])"): r"q\1",
+    re.compile(r"(?:rvec|rotvec|rotation_vector|axis_angle|r|ur)_([xyz])"): r"r\1",
+}
+"""Patterns of other column names for position, quaternion and rotation vector, and the name that replaces them."""
 Entry = dict[str, Any] | list[Any]
 """Cells (texts or numbers) of one pose: a dictionary by the column names of a table, or a list without names."""
+
+
+def usual_name(column: str) -> str:
+    """Return the name that jcr uses for a column of poses: "Position.X" gives "x"; an unknown name in lower case."""
+    plain = re.sub(r"[\s.]+", "_", column.strip().strip('"').lower()).strip("_")
+    matches = ((pattern.fullmatch(plain), usual) for pattern, usual in _ALIASES.items())
+    return next((match.expand(usual) for match, usual in matches if match), plain)
 
 
 def read_yaml_or_json(file: Path) -> Any:
@@ -87,8 +93,9 @@ def _entry(entry: Any, where: str) -> Entry:
     for name, cell in _cells(entry, ""):
         if cells.setdefault(name, cell) != cell:
             raise InputError(f"{where}: holds two values of {name[:20]}; give one pose per entry")
-    if "m00" in cells and "m03" not in cells and {"x", "y", "z"} <= cells.keys():
-        cells |= {f"m{row}3": cells.pop(axis) for row, axis in enumerate("xyz")}
+    if "m00" in cells and "m03" not in cells:  # a 3x3 rotation
+        position = {usual_name(name): name for name in cells}
+        cells |= {f"m{row}3": cells.pop(position[axis]) for row, axis in enumerate("xyz") if axis in position}
     if not cells:
         text = "is no pose; give position and orientation, or a 4x4 matrix"
         raise InputError(f"{where}: {shown(entry)} {text}")
@@ -96,38 +103,23 @@ def _entry(entry: Any, where: str) -> Entry:
 
 
 def _cells(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield column name and number, such as ("qx", 0.1), of each number in a nested pose of a YAML or JSON file.
+    """Yield column name and cell, such as ("position_x", 0.1), of each number and text in a pose of a YAML or JSON file.
 
     `value` is the pose or a part of it, such as its rotation, and `key` its key in the file.
     """
-    names = _CELLS_OF_ROTATION.get(key)
     if isinstance(value, dict):
         parts = {str(name).lower(): part for name, part in value.items()}
-        seconds = parts.get("sec", parts.get("secs"))
-        nanoseconds = parts.get("nanosec", parts.get("nsecs", 0))
-        if type(seconds) is int and type(nanoseconds) is int:
-            yield "timestamp", seconds * 10**9 + nanoseconds
-        elif set("xyzw") <= parts.keys():
-            yield from ((f"q{axis}", parts[axis]) for axis in "xyzw")
-        elif names is not None and set("xyz") <= parts.keys():
-            yield from _cells([parts[axis] for axis in "xyz"], key)
-        else:
-            for name, part in parts.items():
-                if name not in dict(PAIRS).values():
-                    yield from _cells(part, name)
-    elif isinstance(value, list):
-        yield from _cells_of_list(value, names)
-    elif key and _is_plain(value):
-        yield key, value
-
-
-def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[tuple[str, Any]]:
-    """Yield column name and number of each number in a list: a matrix, a rotation or a position (x, y, z).
-
-    A matrix has nine, twelve or 16 numbers in rows, named m00, m01, … by row and column. `names` are the column names
-    if the list is a rotation; None: its key in the file is not that of a rotation.
-    """
-    rows = [row if isinstance(row, list) else [row] for row in value]
+        if type(parts.get("sec")) is int and type(parts.get("nanosec")) is int:
+            yield "timestamp", parts["sec"] * 10**9 + parts["nanosec"]
+            return
+        for name, part in parts.items():
+            if _is_plain(part):
+                column = f"{key}_{name}"
+                yield (name if usual_name(column) == column else column), part
+            else:
+                yield from _cells(part, name)
+        return
+    rows = [row if isinstance(row, list) else [row] for row in value] if isinstance(value, list) else []
     flat, widths = [cell for row in rows for cell in row], {len(row) for row in rows}
     width = {9: 3, 12: 4, 16: 4}.get(len(flat), 0)
     if not all(map(_is_plain, flat)) or not widths <= {1, width}:
@@ -135,10 +127,13 @@ def _cells_of_list(value: list[Any], names: tuple[str, ...] | None) -> Iterator[
     if width:
         yield from ((f"m{k // width}{k % width}", cell) for k, cell in enumerate(flat))
     elif len(flat) == 4:
-        yield from zip(names or _XYZW, flat, strict=False)
+        order = "wxyz" if key.endswith("wxyz") else "xyzw"
+        yield from ((f"q{axis}", cell) for axis, cell in zip(order, flat, strict=True))
     elif len(flat) == 3:
-        angles = ("rx", "ry", "rz") if names in (_XYZW, _WXYZ) else names
-        yield from zip(angles or "xyz", flat, strict=True)
+        # Three numbers of a rotation may be a vector or angles; those of an unknown key are the position.
+        prefix = {"qx": "r", "rx": f"{key}_"}.get(usual_name(f"{key}_x"), "")
+        names = ("roll", "pitch", "yaw") if key == "rpy" else [f"{prefix}{axis}" for axis in "xyz"]
+        yield from zip(names, flat, strict=True)
 
 
 def _is_plain(value: Any) -> bool:

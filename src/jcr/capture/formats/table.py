@@ -5,15 +5,16 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from jcr.capture.checks import checked_capture, require_frames
-from jcr.capture.controllers import CONVENTIONS, METRES, checked_rows, tolerated
+from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
 from jcr.capture.formats import pose_lists
+from jcr.capture.formats.pose_lists import usual_name
 from jcr.capture.images import DEPTH
-from jcr.capture.options import ConventionName, ReadOptions, UnitsName
+from jcr.capture.options import ConventionName, ReadOptions
 from jcr.capture.pairing import PoseTable, pair_with_images, stamp_ns
 from jcr.capture.plain_files import number_of, read_lines, read_npy, shown, split_cells
 from jcr.capture.ros import CAMERA_INFO, read_camera_info
@@ -26,22 +27,16 @@ TABLES = tuple(f"{stem}{suffix}" for stem in ("poses", "gripper_poses", "robot_p
 _IMAGE = (
     "image", "image_name", "image_path", "file", "filename", "file_name", "file_path", "name", "picture",
 )  # fmt: skip
-_STAMP = ("timestamp", "stamp", "time", "t")
+_STAMP = ("timestamp", "timestamp_ns", "stamp", "time", "time_s", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that column names identify; rx, ry, rz, which may be a rotation vector or angles, identify none."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
-_ALIASES = {
-    re.compile(r"(?:[tp]_?|pos_|position_|translation_)([xyz])"): r"\1",
-    re.compile(r"(?:q|quat|quaternion|orientation|rotation)_([xyzw])"): r"q\1",
-    re.compile(r"(?:rvec|rotvec|r|ur)_([xyz])"): r"r\1",
-}
-"""Patterns of other column names for position, quaternion and rotation vector, and the name that replaces them."""
 _EXPLICIT: dict[str, ConventionName] = {
     "ur_x": "ur", "rvec_x": "rotation-vector", "rotvec_x": "rotation-vector",
+    "rotation_vector_x": "rotation-vector", "axis_angle_x": "rotation-vector",
 }  # fmt: skip
 """Conventions that the first rotation column identifies; `ur_x` is that of UR's p[…]."""
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
-_UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
 
 
 def recognises(path: Path) -> bool:
@@ -92,8 +87,8 @@ def pose_table(
 ) -> PoseTable:
     """Convert rows of cells to poses, NaN for rows without one; raise InputError if more are than `tolerated` permits.
 
-    `header` has the names of the columns; None if the table has no header. Convention and units follow from `options`
-    or, if "auto", from the header. Messages begin with `where`.
+    `header` has the names of the columns; None if the table has no header. The convention follows from `options` or, if
+    "auto", from the header. Messages begin with `where`.
     """
     if not rows or not rows[0]:
         raise InputError(f"{where}: holds no poses; expected one row per image")
@@ -101,7 +96,7 @@ def pose_table(
     for number, row in enumerate(rows, start=1):
         if len(row) != width:
             raise InputError(f"{where}: row {number} has {len(row)} columns, not {width}; correct it")
-    cells, units, convention = _named_columns(header, rows, options, where)
+    cells, convention = _named_columns(header, rows, options, where)
     image, stamp = (next((cells[one] for one in names if one in cells), None) for names in (_IMAGE, _STAMP))
     require_frames(0 if image is None else len(image), where, 0)
     wanted = CONVENTIONS[convention].columns
@@ -120,7 +115,7 @@ def pose_table(
             else:
                 text = f"{shown(cell)} is not a number; correct or drop the row"
                 texts.setdefault(row, f"{where}: row {row + 1}, column {name}: {text}")
-    poses, faults = checked_rows(numbers, convention, units, where)
+    poses, faults = checked_rows(numbers, convention, options.pose_units, where)
     faults |= texts
     if len(faults) > tolerated(len(rows)):
         raise InputError(faults[min(faults)])
@@ -150,28 +145,22 @@ def _convention_of(names: Collection[str], where: str) -> ConventionName:
 
 def _named_columns(
     header: Sequence[str] | None, rows: Sequence[Sequence[Any]], options: ReadOptions, where: str
-) -> tuple[dict[str, tuple[Any, ...]], UnitsName, ConventionName]:
-    """Return the columns of a table of poses, and the units and convention of its poses, by the options or the header.
+) -> tuple[dict[str, tuple[Any, ...]], ConventionName]:
+    """Return the columns of a table of poses, and the convention of its poses, by the options or the header.
 
     The columns are a dictionary from name ("x", "qx", "image", …) to cells. Without a header, an image name or time
     stamp is expected first, then the columns of the convention. Messages of InputError begin with `where`.
     """
     columns, convention = [tuple(column) for column in zip(*rows, strict=True)], options.pose_convention
     if header is not None:
-        names, stated = zip(*(_name_and_unit(cell) for cell in header), strict=True)
+        names = [usual_name(cell) for cell in header]
         if twice := [name for name, count in Counter(names).items() if count > 1]:
             raise InputError(f"{where}: two columns are named {', '.join(sorted(twice))}; keep one")
         for cell in header if convention == "auto" else ():
             convention = _EXPLICIT.get(cell, convention)
         if convention == "auto":
             convention = _convention_of(names, where)
-        units = options.pose_units
-        if units == "auto" and {*stated} - {"", "s", "ns"}:
-            length, angle = CONVENTIONS[convention].usual.split("-")
-            length = next((unit for unit in METRES if unit in stated), length)
-            angle = next((unit for unit in ("deg", "rad") if unit in stated), angle)
-            units = next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
-        return dict(zip(names, columns, strict=True)), units, convention
+        return dict(zip(names, columns, strict=True)), convention
     named = dict[str, tuple[Any, ...]]()
     if number_of(columns[0][0]) is None:
         named["image"] = columns.pop(0)
@@ -194,7 +183,7 @@ def _named_columns(
             f"{where}: {len(columns)} columns of numbers; --pose-convention {convention} has {len(wanted)}: "
             f"{', '.join(wanted)}"
         )
-    return named | dict(zip(wanted, columns, strict=True)), options.pose_units, convention
+    return named | dict(zip(wanted, columns, strict=True)), convention
 
 
 def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]]]:
@@ -220,7 +209,7 @@ def _read_rows(file: Path) -> tuple[Sequence[str] | None, Sequence[Sequence[Any]
     # TUM and ethz-asl write the names of their columns as a comment.
     for comment in reversed(comments):
         cells = [cell for cell in re.split(r"[,;\s]+", comment) if cell]
-        if rows and len(cells) == len(rows[0]) and set("xyz") <= {_name_and_unit(cell)[0] for cell in cells}:
+        if rows and len(cells) == len(rows[0]) and set("xyz") <= {usual_name(cell) for cell in cells}:
             return cells, rows
     return None, rows
 
@@ -244,15 +233,3 @@ def _rows_of_ur(file: Path, lines: list[str]) -> tuple[Sequence[str], list[list[
             )
     first = () if len(rows[0]) == 6 else ("image",) if number_of(rows[0][0]) is None else ("timestamp",)
     return (*first, "x", "y", "z", "ur_x", "ur_y", "ur_z"), rows
-
-
-def _name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name that jcr uses for a column, and the unit in its header: "Pos_X (mm)" gives "x" and "mm".
-
-    The unit is "" if the header has none.
-    """
-    plain = re.sub(r"[\s.]+", "_", cell.strip().strip('"').lower()).strip("_")
-    match = _UNIT.match(plain)
-    name, unit = match.groups() if match else (plain, "")
-    matches = ((pattern.fullmatch(name), usual) for pattern, usual in _ALIASES.items())
-    return next((match.expand(usual) for match, usual in matches if match), name), unit
