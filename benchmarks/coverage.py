@@ -21,7 +21,6 @@ from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import reached
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction, fit_poses
 from jcr.camera import parameters, with_parameters
@@ -32,7 +31,7 @@ from jcr.estimation.prediction import predict
 from jcr.estimation.solve import adjust_wrist, recon_frame, uncertainty_of
 from jcr.geometry import step_between
 from jcr.pipeline.check import assumptions_of, spread_rows
-from jcr.records import Capture, Intrinsics, Reconstruction
+from jcr.records import Capture, Intrinsics, Reconstruction, Uncertainty
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed
 
@@ -223,11 +222,16 @@ def predicted(draws: int) -> Float[ndarray, "k 3"]:
         if not (hand_eye.converged and case.hand_eye.converged):
             continue
         prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
-        foretold, reported = (
-            (reached(one, "seen")[0], *reached(one, "camera")) for one in (prediction, hand_eye.uncertainty)
-        )
+        foretold, reported = map(_bounds, (prediction, hand_eye.uncertainty))
         ratios.append(np.divide(foretold, reported))
     return np.reshape(ratios, (-1, 3))
+
+
+def _bounds(one: Uncertainty) -> tuple[float, float, float]:
+    """Return bounds on 95 % of the errors of a seen point (mm), and of the camera's position (mm) and rotation (°)."""
+    assert one.seen is not None
+    metres, radians = (within_95(one.covariance[part, part]) for part in (slice(0, 3), slice(3, 6)))
+    return one.seen.within_95_mm, 1e3 * metres, float(np.degrees(radians))
 
 
 def _made(seed: int) -> tuple[Capture, Reconstruction]:

@@ -27,7 +27,6 @@ from jcr.estimation.point_uncertainty import (
     point_in_base,
     scene_points,
     scene_uncertainty,
-    valid_radius_px,
     within_95,
 )
 from jcr.estimation.problem import (
@@ -314,24 +313,6 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
     in_camera = drawn @ x[:3, :3]
     for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
-
-
-def test_a_bound_holds_up_to_the_valid_radius_and_not_beyond():
-    x, uncertainty, camera, _ = estimated()
-    half = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    turns = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * half / np.linalg.norm(half)
-
-    def worst(radius: float) -> float:
-        return max(
-            map(within_95, point_covariance(x, uncertainty, camera, half + radius * turns, DISTANCE_M))
-        )
-
-    corner = float(np.linalg.norm(half))
-    assert valid_radius_px(x, uncertainty, camera, DISTANCE_M, 1.001 * worst(corner)) is None
-    bound_m = (worst(0.0) + worst(corner)) / 2
-    radius = valid_radius_px(x, uncertainty, camera, DISTANCE_M, bound_m)
-    assert radius is not None and 0 < radius < corner
-    assert worst(radius) <= bound_m < worst(radius + 0.021 * corner)
 
 
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():

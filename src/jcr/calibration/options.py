@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from jcr.errors import InputError
-from jcr.findings.requirement import Where
 
 GRASPING = (5.0, 1.0)
 """Default of the required accuracy (mm, degrees): a parallel gripper that opens 10 mm wider than its object has 5 mm to
@@ -19,11 +18,8 @@ class CalibrateOptions:
     """Required accuracy, checks and priors of a hand-eye calibration."""
 
     require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Required accuracy: 95 % of errors must be below this, else exit status 3. Unset: a calibration worse than 5 mm and
-    1°, which are enough for grasping, only gives a warning."""
-    require_at: Where = "seen"
-    """Quantity that the limit refers to. seen: a point at the centre of an image, at the working distance, by intrinsics
-    and transform together; camera: the camera on the gripper by itself; scene: the mapped points in the base frame."""
+    """Required accuracy of a point at the image centre, at the working distance: 95 % of errors must be below this, else
+    exit status 3. Unset: a calibration worse than 5 mm and 1°, which are enough for grasping, only gives a warning."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None

@@ -54,8 +54,11 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """
     limit = ""
     if (required := content.requirement) is not None:
-        in_corners = "" if required.valid_px is None else " not met in the corners"
-        unmet = in_corners if required.met else " not met"
+        corner = None if content.uncertainty is None else content.uncertainty.corner
+        is_less = corner is not None and corner.within_95_mm > required.translation_mm
+        unmet = (
+            "" if required.met and not is_less else " not met in the corners" if required.met else " not met"
+        )
         limit = f" (limit {required.translation_mm:g} mm, {required.rotation_deg:g}°{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {len(content.images)} images"
@@ -69,7 +72,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
 def _result(content: Calibration) -> list[str]:
     """Return the lines of an accepted calibration: transform with standard deviations, accuracy, and intrinsics.
 
-    The accuracy is the bound on 95 % of the errors of the quantity that `--require-at` selects.
+    The accuracy is the bound on 95 % of the errors of a point that the camera sees.
     """
     uncertainty, matrix = content.uncertainty, content.parent_from_camera
     quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
@@ -78,14 +81,10 @@ def _result(content: Calibration) -> list[str]:
     rotation = " ".join(significant(size) for size in uncertainty.rotation_std_deg)
     accuracy, required = "unknown", content.requirement
     if required is not None:
-        far, at = f"a point at {significant(1e-3 * required.distance_mm)} m", required.at
-        place = {"seen": far, "camera": "the camera's own place", "scene": "mapped points"}[at]
         bound = f"{significant(required.reached_mm)} mm, {significant(required.reached_deg)}° (95 %)"
-        accuracy = f"{place}: {bound}"
-        if at == "seen" and (corner := uncertainty.corner) is not None:
-            radius, most = required.valid_px, f"{required.translation_mm:g} mm"
-            far = "" if radius is None else f"{most} up to {radius:.0f} px from it, "
-            accuracy += f" at the image centre; {far}{significant(corner.within_95_mm)} mm in the corner"
+        accuracy = f"a point at {significant(1e-3 * required.distance_mm)} m: {bound}"
+        if (corner := uncertainty.corner) is not None:
+            accuracy += f" at the image centre; {significant(corner.within_95_mm)} mm in the corner"
     tested = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
     used = [LENGTHS[one.name] for one in content.lengths if one.used and one.name != "network"]
     sources = joined(["the robot", *used]) if used else "the robot alone"

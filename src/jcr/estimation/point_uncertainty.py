@@ -38,8 +38,6 @@ ScenePoints = tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 p 3"], Float[ndar
 """p points in the base frame (m); their covariance by camera poses (m²); covariance of each by triangulation (m²)."""
 SCENE_POINTS = 300
 """Largest number of random points that represent a scene."""
-RADII = 50
-"""Steps from the centre of the image to a corner, of `valid_radius_px`: 2 % of the half diagonal each."""
 
 
 def point_covariance(
@@ -130,25 +128,6 @@ def seen_points(
         for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
     )
     return PointUncertaintyOverImage(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
-
-
-def valid_radius_px(
-    x: Transform, uncertainty: Uncertainty, camera: Intrinsics, distance_m: float, bound_m: float
-) -> float | None:
-    """Return the radius (px) around the image centre within which 95 % of position errors are below `bound_m`.
-
-    The points have the distance `distance_m` (m) along their rays. They lie on the four half diagonals of the image, in
-    RADII steps each; the worst of the four counts. `x` is gripper_from_camera. The result is None if the bound holds up
-    to the corners, and 0 if it does not hold at the centre.
-    """
-    half = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    corners = half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
-    x_px = half + np.linspace(0, 1, RADII + 1)[:, None, None] * corners
-    covariance = point_covariance(x, uncertainty, camera, x_px, distance_m)
-    exceeds = np.array([max(map(within_95, ring)) > bound_m for ring in covariance])
-    if not exceeds.any():
-        return None
-    return float(max(int(exceeds.argmax()) - 1, 0) / RADII * np.linalg.norm(half))
 
 
 def with_given_intrinsics(

@@ -1,15 +1,11 @@
 """Record of the required accuracy of a calibration and of the accuracy that the calibration reaches."""
 
 from dataclasses import dataclass
-from typing import Literal
-
-Where = Literal["seen", "camera", "scene"]
-"""Quantity that an accuracy refers to: a point that the camera sees, the camera on the gripper, or the mapped scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """Required and reached accuracy of a calibration, as bounds on 95 % of the errors."""
+    """Required and reached accuracy of a point that the camera sees, as bounds on 95 % of the errors."""
 
     translation_mm: float
     """Required bound on the translation error."""
@@ -18,7 +14,7 @@ class Requirement:
     asked: bool
     """Whether the user gave the required accuracy; otherwise it is the default, enough for grasping."""
     distance_mm: float
-    """Distance from the camera to the point to which the translation bounds refer; 0: the camera itself."""
+    """Distance from the camera to the point at the image centre to which the bounds refer."""
     reached_mm: float
     """Bound on the translation error that the calibration reaches."""
     reached_deg: float
@@ -26,11 +22,6 @@ class Requirement:
     more_images: int | None = None
     """Number of images to add until the required accuracy is reached, by an estimate; 0 if it is reached, None if no
     reasonable number suffices."""
-    at: Where = "camera"
-    """Quantity to which the required and reached bounds refer."""
-    valid_px: float | None = None
-    """Radius (px) around the image centre within which the position of a point meets the required bound; None: in the
-    whole image, or the intrinsics were not estimated."""
 
     @property
     def met(self) -> bool:
@@ -40,5 +31,4 @@ class Requirement:
     @property
     def details(self) -> dict[str, float | str]:
         """Required and reached accuracy as the `details` of a finding that the requirement is not met."""
-        named = {name: value for name, value in vars(self).items() if value is not None}
-        return {name: one if isinstance(one, str) else float(one) for name, one in named.items()}
+        return {name: float(value) for name, value in vars(self).items() if value is not None}

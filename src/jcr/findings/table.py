@@ -24,9 +24,8 @@ ONE_PART = (
     "the other part only where "
 )
 REACHED = (
-    "{at:seen=a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's "
-    "base frame (95 % of errors)|camera=95 % of errors of the camera on the gripper are below {reached_mm:~} mm and "
-    "{reached_deg:~}°|scene=95 % of errors of mapped points are below {reached_mm:~} mm and {reached_deg:~}°}; "
+    "a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's base frame "
+    "(95 % of errors); "
     "{translation_mm:g} mm and {rotation_deg:g}° are {asked:required|needed to grasp}"
 )
 """Template of the sentence with the reached and the required bound on 95 % of the errors."""

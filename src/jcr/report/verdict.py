@@ -79,22 +79,15 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     """
     uncertainty, required = calibration.uncertainty, calibration.requirement
     if required is not None:
-        name = {"seen": "Point at the image centre", "camera": "Camera", "scene": "Mapped point"}[required.at]
-        far = f"at {significant(1e-3 * required.distance_mm)} m, " if required.distance_mm else ""
-        yield (
-            name,
-            f"{significant(required.reached_mm)} mm",
-            f"{far}{significant(required.reached_deg)}°; 95 %",
-            True,
-        )
+        far, turned = significant(1e-3 * required.distance_mm), significant(required.reached_deg)
+        bound = f"{significant(required.reached_mm)} mm"
+        yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", True
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
         degrees = significant(seen.corners.rotation_95_deg)
-        radius = None if required is None else required.valid_px
-        limit = "" if radius is None else f"; the limit is met up to {radius:.0f} px from the image centre"
         yield (
             "Point in the image corner",
             f"{significant(seen.corners.within_95_mm)} mm",
-            f"{degrees}°; 95 %{limit}",
+            f"{degrees}°; 95 %",
             True,
         )
     elif uncertainty is not None:
