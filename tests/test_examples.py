@@ -164,15 +164,14 @@ def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_pa
     assert (out / "export" / "hand_eye.urdf").is_file() and "map at the point: occupancy" in text
 
 
-def test_the_notebook_runs_and_shows_the_result(done: Path, tmp_path: Path):
+def test_the_notebook_runs(done: Path, tmp_path: Path):
     notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text())
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     (tmp_path / "examples").symlink_to(EXAMPLES)
     shutil.copytree(done, tmp_path / "out" / "notebook")  # its finished stages are taken from there
     (tmp_path / "out" / "notebook" / "report.html").unlink()
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.chdir(tmp_path):
-        exec("\n".join(cells) + "\nprint(result._repr_html_())\n", {})
-    assert "<b>gripper_from_camera, accepted" in out.getvalue()
+        exec("\n".join(cells), {})
     assert (tmp_path / "out/notebook/report.html").is_file()
     assert "out/notebook/export/hand_eye.launch" in out.getvalue()
 

@@ -222,10 +222,6 @@ class RunResult:
             )
         return calibration, capture, reconstruction
 
-    def _repr_html_(self) -> str:
-        """Return the calibration as an HTML table, which notebooks display."""
-        return self.found.as_html(str(self.out / REPORT))
-
 
 def load_run(out: str | Path) -> RunResult:
     """Return the result of the run in the folder `out`; raise InputError if calibration.json is missing or damaged."""

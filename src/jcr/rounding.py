@@ -16,12 +16,6 @@ def decimals_of(std: float) -> int:
     return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
 
 
-def with_std(value: float, std: float) -> str:
-    """Return a value and its standard deviation as text, both with `decimals_of` decimals, such as "25.40 ± 0.05"."""
-    decimals = decimals_of(std)
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
-
-
 def significant(value: float, digits: int = 2) -> str:
     """Return the number as text with `digits` significant digits and at most six decimals, without an exponent.
 

@@ -10,16 +10,15 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.record import Calibration
+from jcr.calibration.robot_errors import errors_of
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import camera_error_covariance
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, pose_residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
-from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, strongest_first
@@ -315,14 +314,14 @@ def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | Non
     if robot is None:
         if joints is not None:
             raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
-        return smooth_errors(gripper)
+        return errors_of(gripper).systematic
     arm = arm_named(robot) if isinstance(robot, str) else robot
     angles = None if joints is None else _numbers(joints, "joints", "(n,dof) in rad")
     if angles is not None and angles.shape != (wanted := (len(gripper), arm.dof)):
         raise InputError(f"joints: shape {angles.shape}; {wanted[0]} poses of a {arm.name} need {wanted}")
     if angles is not None and not np.isfinite(angles).all():
         raise InputError("joints: NaN or infinite; give the angle of every joint at every image")
-    return arm_errors(*posed(arm, angles, gripper))
+    return errors_of(gripper, arm, angles).systematic
 
 
 def _numbers(values: ArrayLike, name: str, shape: str) -> Float[ndarray, "..."]:

@@ -39,10 +39,9 @@ from jcr.findings import (
     warnings_of,
     without_consequences,
 )
-from jcr.geometry import Similarity, rotation_log
+from jcr.geometry import Similarity
 from jcr.records import (
     Attempt,
-    BoardEstimate,
     Capture,
     DepthCheck,
     GivenIntrinsicsResult,
@@ -68,11 +67,6 @@ NAMES = {
     "base": ("base_from_camera", "gripper_from_object"),
 }
 """Names of the two transforms of a calibration, for a camera on the gripper and for one fixed in the base frame."""
-HTML = """\
-<p><b>{{ heading }}</b></p><table>
-{%- for row in rows %}<tr><th>{{ row[0] }}</th>{% for cell in row[1:] %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor -%}
-</table><p>{{ note }}</p>"""
-"""Template of the table that notebooks display; all texts are escaped."""
 
 
 def as_json(finding: Finding) -> dict[str, Any]:
@@ -259,8 +253,6 @@ class Calibration(Outcome):
     """Scale and noise of the depth images; None without them, or if too few features have a depth."""
     lengths: tuple[LengthCheck, ...] = ()
     """Known lengths, each compared with the robot's positions."""
-    board: BoardEstimate | None = None
-    """Adjusted board; None unless a board was adjusted together with features."""
 
     @model_validator(mode="after")
     def _is_of_one_mount(self) -> "Calibration":
@@ -384,27 +376,6 @@ class Calibration(Outcome):
         pixel, depth_m, pose = (np.asarray(one, float) for one in (pixel, depth_m, base_from_gripper))
         return point_in_base(x, self.uncertainty, self.intrinsics, self.robot_noise, pixel, depth_m, pose)
 
-    def _repr_html_(self) -> str:
-        """Return the calibration as an HTML table, which notebooks display."""
-        return self.as_html()
-
-    def as_html(self, note: str = "") -> str:
-        """Return an HTML table of transform, standard deviations, verdict and warnings, with `note` below it."""
-        from jinja2 import Template  # which no command needs for its help
-
-        x = self.parent_from_camera
-        mm, degrees = 1e3 * x[:3, 3], np.degrees(rotation_log(x[:3, :3]))
-        std_mm, std_deg = self.uncertainty.translation_std_mm, self.uncertainty.rotation_std_deg
-        rows = [("", "translation", "rotation vector")] + [
-            (axis, f"{mm[k]:.2f} ± {std_mm[k]:.2f} mm", f"{degrees[k]:.3f} ± {std_deg[k]:.3f}°")
-            for k, axis in enumerate("xyz")
-        ]
-        used = f"{self.images_used} of {len(self.images)} images used"
-        verdict = ": ".join(filter(None, (self.verdict, "; ".join(self.warnings))))
-        heading = f"{self.mount}_from_camera, {verdict}; {used}"
-        page = Template(HTML, autoescape=True)
-        return page.render(heading=heading, rows=rows, note=f"1σ, {self.mount} axes. {note}")
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FailedCalibration(Outcome):
@@ -441,29 +412,6 @@ class FailedCalibration(Outcome):
 
 
 AnyCalibration = Calibration | FailedCalibration
-
-
-def failed_calibration(
-    capture: Capture,
-    backend: str,
-    findings: Sequence[Finding],
-    timings_s: dict[str, float],
-    attempts: Sequence[Attempt] = (),
-) -> FailedCalibration:
-    """Return the result for a capture that could not be reconstructed; `findings` are the reasons.
-
-    `backend` is the last one tried, `timings_s` the seconds of each stage by name, `attempts` all reconstructions tried.
-    """
-    why = "not registered"
-    return FailedCalibration(
-        mount=capture.mount,
-        backend=backend,
-        images=tuple(ImageVerdict(image=name, used=False, reason=why) for name in capture.images),
-        intrinsics=capture.intrinsics and capture.intrinsics.with_std(None),
-        findings=tuple(findings),
-        attempts=tuple(attempts),
-        timings_s=timings_s,
-    ).with_notes()
 
 
 @cache

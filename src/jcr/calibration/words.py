@@ -18,7 +18,7 @@ from jcr.findings import (
     without_consequences,
 )
 from jcr.records import GivenIntrinsicsResult, LeaveOneOut, PointUncertaintyOverImage, share_of
-from jcr.rounding import labelled, significant, with_std
+from jcr.rounding import labelled, significant
 
 NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
@@ -156,7 +156,7 @@ def log(content: AnyCalibration) -> str:
 
 
 def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
-    """Return blocks of named values as text: {title: {name: value}}, with times, uncertainty, lengths, robot, board."""
+    """Return blocks of named values as text: {title: {name: value}}, with times, uncertainty, lengths and robot."""
     time = {stage: f"{seconds:.1f} s" for stage, seconds in content.timings_s.items()}
     time["together"] = f"{sum(content.timings_s.values()):.1f} s"
     for k, attempt in enumerate(content.attempts, start=1):
@@ -192,25 +192,12 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
         for name, size in sorted(sizes.items(), key=lambda item: -item[1][0]):
             if (size > least).any():
                 parts[name] = f"{size[0]:.2f} mm {size[1]:.3f}°"
-    board = dict[str, str]()
-    if (found := content.board) is not None:
-        stated = f", {found.stated_mm:g} mm stated" if found.stated_mm else ""
-        board = {
-            found.spec: f"{found.corners} corners in {found.images} images, {found.rms_px:.2f} px rms per axis",
-            "side by the robot's positions": f"{with_std(found.side_mm, found.side_std_mm)} mm{stated}",
-            "lowest to highest corner": f"{significant(found.bend_mm)} mm",
-        }
-        for k, (at, tilt) in enumerate(zip(found.centres_in_base, found.tilts_deg, strict=True), start=1):
-            name = f"place of tag {k}" if found.bodies > 1 else "place"
-            centre = ", ".join(f"{x:.3f}" for x in at)
-            board[name] = f"({centre}) m in the base, {tilt:.1f}° from horizontal"
     return {
         "Time": time,
         "Uncertainty, 1 σ per axis": parts,
         "Lengths": lengths,
         "Depth camera": depth,
         "Robot": robot,
-        "Board": board,
     }
 
 

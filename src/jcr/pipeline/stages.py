@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed
-from jcr.calibration.record import AnyCalibration, failed_calibration, write_calibration
+from jcr.calibration.record import AnyCalibration, FailedCalibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
@@ -33,7 +33,7 @@ from jcr.findings import sentence
 from jcr.pipeline.selection import NothingFoundError, select_reconstruction, timings_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct import candidates, device_of
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, ImageVerdict, Reconstruction
 from jcr.records.npz import FORMAT, write_reconstruction
 from jcr.result import (
     CALIBRATION,
@@ -198,7 +198,17 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
         if not is_same(out):
             forget_reconstruction(out)
         tried = error.attempts
-        content = failed_calibration(capture, tried[-1].backend, error.findings, timings_of(tried), tried)
+        content = FailedCalibration(
+            mount=capture.mount,
+            backend=tried[-1].backend,
+            images=tuple(
+                ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images
+            ),
+            intrinsics=capture.intrinsics and capture.intrinsics.with_std(None),
+            findings=error.findings,
+            attempts=tried,
+            timings_s=timings_of(tried),
+        ).with_notes()
         boards = proposed(capture, options.reconstruct.board)
         content = content.with_findings(*boards).with_notes() if boards else content
         keep_calibration(out, content)

@@ -447,34 +447,6 @@ class LengthCheck:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardEstimate:
-    """Adjusted board, or adjusted tags of one `--board` option: size, flatness, and positions in the base frame."""
-
-    spec: str
-    """Value of the option `--board`."""
-    bodies: int
-    """Number of tags; 1 for a board."""
-    images: int
-    """Number of images that show the board or a tag."""
-    corners: int
-    """Number of different corners."""
-    side_mm: float
-    """Side of a square or tag (mm) by the robot's positions alone."""
-    side_std_mm: float
-    """Standard deviation of `side_mm`."""
-    stated_mm: float | None
-    """Side that the user stated (mm); None: unknown."""
-    rms_px: float
-    """Root mean square of the corners' reprojection errors, per axis (px)."""
-    bend_mm: float
-    """Height difference of the lowest and highest corner over the plane of a board or tag (mm); the largest of all."""
-    centres_in_base: tuple[Numbers3, ...]
-    """Centres of board or tags in the base frame (m)."""
-    tilts_deg: tuple[float, ...]
-    """Angles of board or tags to the base's horizontal plane (degrees)."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """One attempt to reconstruct and calibrate a capture with one back end: registered images, failure and times."""
 

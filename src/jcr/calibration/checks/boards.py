@@ -14,8 +14,8 @@ from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD, STRETCHED_STD
 from jcr.estimation.projection import by_points
 from jcr.estimation.solve import Solution, size_of_boards
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import apply, skew
-from jcr.records import BoardEstimate, Boards, Tracks
+from jcr.geometry import skew
+from jcr.records import Tracks
 
 LIKELY, STRETCHED = 2.0, 4.0
 """Stretch of a board, in standard deviations of a printer's stretch, from which it is estimated without a prior; and the
@@ -34,8 +34,7 @@ to 250 mm have up to 3.6 mm."""
 def check_boards(case: Case) -> Case:
     """Return the case with findings on boards: not found, moved, stretched, bent, or of a size that was estimated.
 
-    If a board was adjusted, its record is set too (`Calibration.board`). A case without the option --board is
-    unchanged.
+    A case without the option --board is unchanged.
     """
     boards = case.reconstruction.tracks.boards
     if boards is None:
@@ -50,18 +49,23 @@ def check_boards(case: Case) -> Case:
     hand_eye = case.hand_eye
     if case.adjusted is None or case.adjusted.problem.boards is None:
         return case.after(tuple(findings))
-    found = board_estimate(case.adjusted, boards)
+    adjusted, shapes = case.adjusted, case.adjusted.problem.boards
     if boards.is_stretched:
-        stretch, std = stretch_of(case.adjusted)
+        stretch, std = stretch_of(adjusted)
         size = {"value": abs(stretch), "std": std, "board": boards.spec}
         findings.append(Finding.of(FindingKind.BOARD_STRETCHED, "warns", "none", **size))
-    if found.bend_mm > 1e3 * BENT_M:
-        height = {"value": 1e-3 * found.bend_mm, "board": boards.spec}
-        findings.append(Finding.of(FindingKind.BOARD_BENT, "informs", "none", **height))
+    shape = adjusted.state.camera_steps[adjusted.problem.columns.boards]
+    height = adjusted.state.scale * np.exp(shape[0]) * (shapes.by_shape[:, 2] @ shape)
+    bend = max(float(np.ptp(height[shapes.body == k])) for k in np.unique(shapes.body))
+    if bend > BENT_M:
+        findings.append(Finding.of(FindingKind.BOARD_BENT, "informs", "none", value=bend, board=boards.spec))
     if boards.size_std is None and hand_eye.source == "images":
-        side = {"value": 1e-3 * found.side_mm, "std": 1e-3 * found.side_std_mm}
-        findings.append(Finding.of(FindingKind.BOARD_SIDE, "informs", "none", **side, board=boards.spec))
-    return case.after(tuple(findings), replace(hand_eye, board=found))
+        size, by_unknown = size_of_boards(adjusted)
+        side = boards.side * float(np.exp(size))
+        std = side * float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
+        sides = {"value": side, "std": std, "board": boards.spec}
+        findings.append(Finding.of(FindingKind.BOARD_SIDE, "informs", "none", **sides))
+    return case.after(tuple(findings))
 
 
 def check_board_shapes(case: Case) -> Case:
@@ -170,35 +174,3 @@ def stretch_of(adjusted: Solution) -> tuple[float, float]:
     shape, own = adjusted.state.camera_steps[columns], adjusted.camera_unknowns(columns)
     k = int(np.where(ways, np.abs(shape), -1.0).argmax())
     return float(shape[k]), float(np.sqrt(adjusted.covariance[own, own][k, k]))
-
-
-def board_estimate(adjusted: Solution, boards: Boards) -> BoardEstimate:
-    """Return the record of the adjusted boards: size, residuals, flatness, and positions in the base frame.
-
-    `adjusted` must contain boards; `boards` states their name and printed size. BoardEstimate defines units and terms.
-    """
-    problem, state, shapes = adjusted.problem, adjusted.state, adjusted.problem.boards
-    assert shapes is not None and problem.observations is not None
-    size, by_unknown = size_of_boards(adjusted)
-    side_mm = 1e3 * boards.side * float(np.exp(size))
-    std = float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
-    of_corners = np.isin(problem.observations.point, shapes.point)
-    shape = state.camera_steps[problem.columns.boards]
-    height_mm = 1e3 * state.scale * np.exp(shape[0]) * (shapes.by_shape[:, 2] @ shape)
-    numbers = np.unique(shapes.body)
-    rigs = state.world_from_rig[shapes.first_rig + numbers]
-    normals = rigs[:, :3, 2] @ state.z[0][:3, :3].T
-    points = apply(state.z[0], state.scale * state.points_in_world[shapes.point])
-    return BoardEstimate(
-        spec=boards.spec,
-        bodies=len(numbers),
-        images=len(np.unique(problem.observations.image[of_corners])),
-        corners=len(shapes.point),
-        side_mm=side_mm,
-        side_std_mm=side_mm * std,
-        stated_mm=None if boards.size_std is None else 1e3 * boards.side,
-        rms_px=float(np.sqrt((adjusted.images.view.residual_px[of_corners] ** 2).mean())),
-        bend_mm=max(float(np.ptp(height_mm[shapes.body == k])) for k in numbers),
-        centres_in_base=tuple(points[shapes.body == k].mean(0) for k in numbers),
-        tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
-    )

@@ -208,7 +208,7 @@ def _fused(
         # The scale error of the depth images refers to the new scale.
         percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
         depth = replace(depth, off_percent=percent)
-    measured = {name: getattr(hand_eye, name) for name in ("findings", "lengths", "board")}
+    measured = {name: getattr(hand_eye, name) for name in ("findings", "lengths")}
     return judged(replace(refined, depth_check=depth, **measured)), adjusted
 
 
