@@ -9,7 +9,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import by_point, project, unproject
-from jcr.compiled import compiled
+from jcr.compiled import compiled, inlined
 from jcr.geometry import inverse
 from jcr.records import Intrinsics, Tracks
 
@@ -39,10 +39,15 @@ _FREE = 8
 """Number of unknowns: shift x and y, gain, offset, and the affine part row by row."""
 _STEEPEST = 5.0
 """Largest scale from one image to another; a larger one means that the warp is invalid."""
-_POINTS_AT_ONCE = 256
+_POINTS_AT_ONCE = 64
 """Number of tracks that a thread aligns at a time."""
 _FLAT = 1e-3
 """Standard deviation, in grey levels, below which a patch has no texture."""
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(-_RADIUS, _RADIUS + 1.0)] * 2), -1).reshape(-1, 2)
+"""Offsets (n,2), x and y in px, of the pixels of a patch from its centre, row by row."""
+_WEIGHTS = np.exp(-0.5 * (_OFFSETS**2).sum(1) / _WINDOW**2)
+_WEIGHTS /= _WEIGHTS.sum()
+"""Gaussian weights (n) of the pixels of a patch, with the sum 1."""
 
 
 def align_tracks(
@@ -74,11 +79,9 @@ def align_tracks(
     of_reference = np.repeat(reference, np.diff(ends))
     warp, bend = _warps(x_px, image, x_in_recon, facing, of_reference, recon_from_camera, intrinsics)
 
-    def align(level: UInt8[ndarray, "m h2 w2"], job: tuple[Any, ...], first: int) -> None:
-        """Align the tracks from number `first` on; each thread writes only to observations of its own tracks."""
-        some = slice(first, first + _POINTS_AT_ONCE)
-        _align_all(level, image, ends[first : some.stop + 1], reference[some], *job)
-
+    first = range(0, len(reference), _POINTS_AT_ONCE)
+    parts = [slice(ends[k], ends[min(k + _POINTS_AT_ONCE, len(reference))]) for k in first]
+    of_parts = [of_reference[part] - part.start for part in parts]
     start_px, start_affine = x_px.copy(), warp
     found, variance = x_px.copy(), np.full(len(point), KEYPOINT_STD_PX**2)
     for reduced in _REDUCED:
@@ -86,11 +89,15 @@ def align_tracks(
         level = np.stack([cv2.resize(grey, size, interpolation=cv2.INTER_AREA) for grey in greys])
         factor = np.array(size) / [intrinsics.width, intrinsics.height]
         keypoint_px, aligned_px = ((at + 0.5) * factor - 0.5 for at in (x_px, start_px))
-        affine, variance_px = start_affine.copy(), np.full(len(point), np.inf)
-        job = (keypoint_px, (aligned_px, affine, bend * reduced), variance_px, MOST_PX / reduced)
+        affine = start_affine.copy()
+        # Each thread writes only to observations of its own tracks.
+        job = (
+            [of_all[part] for part in parts]
+            for of_all in (image, keypoint_px, aligned_px, affine, bend * reduced)
+        )
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(partial(align, level, job), range(0, len(reference), _POINTS_AT_ONCE)))
-        variance_px *= reduced**2
+            variances = pool.map(partial(_align_all, level, MOST_PX / reduced), of_parts, *job)
+        variance_px = reduced**2 * np.concatenate([np.empty(0), *variances])
         aligned, better = variance_px < KEYPOINT_STD_PX**2, variance_px < variance
         start_px[aligned] = (aligned_px[aligned] + 0.5) / factor - 0.5
         start_affine[aligned] = affine[aligned]
@@ -147,182 +154,165 @@ def _x_in_b(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) ->
     return np.einsum("kij,kj->ki", b_from_a[:, :3, :3], x_in_a) + b_from_a[:, :3, 3]
 
 
-@compiled
-@no_type_check
-def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
-    """Align all observations except the references: update `warp` and `variance_px` (k) in place.
+def _align_all(
+    greys: UInt8[ndarray, "m h w"],
+    most_px: float,
+    of_reference: Int[ndarray, " k"],
+    image: Int[ndarray, " k"],
+    keypoint_px: Float[ndarray, "k 2"],
+    x_px: Float[ndarray, "k 2"],
+    affine: Float[ndarray, "k 2 2"],
+    bend: Float[ndarray, "k 2 3"],
+) -> Float[ndarray, " k"]:
+    """Align all observations except the references; return their variances, px², infinite for those not aligned.
 
-    `warp` has the pixels (k,2), affine parts (k,2,2) and bends (k,2,3) of the k observations; the bends do not change.
-    `image` and `keypoint_px` are the image (row of `greys`) and the initial pixel of each observation; `most_px` is the
-    largest shift. `ends` are the first observations of the tracks and the end of the last track; `reference` is the
-    reference observation of each track. The variance (px²) of an observation that could not be aligned does not change.
+    `x_px` (initial pixels) and `affine` are updated in place; they and `bend` are the warp of `_warps`. `image` and
+    `keypoint_px` are the image (row of `greys`) and keypoint of each observation, and `of_reference` is the row of its
+    reference observation. An aligned observation is at most `most_px` from its keypoint.
     """
-    offsets, window = _window(_RADIUS)
-    wide, _ = _window(_RADIUS + 1)
-    around = np.empty(len(wide))
-    template = np.empty(len(offsets))
-    patch = np.empty(len(offsets))
-    pull = np.empty((len(offsets), _FREE))
-    straight = np.zeros((2, 2))
-    straight[0, 0] = straight[1, 1] = 1.0
-    flat = np.zeros((2, 3))
-    for p in range(len(reference)):
-        r = reference[p]
-        if not _patch(greys[image[r]], keypoint_px[r], straight, flat, wide, around):
-            continue
-        deviation = _template(around, offsets, window, template, pull)
-        if deviation < _FLAT:
-            continue
-        xx = xy = yy = 0.0
-        for k in range(len(offsets)):
-            xx += pull[k, 0] * pull[k, 0]
-            xy += pull[k, 0] * pull[k, 1]
-            yy += pull[k, 1] * pull[k, 1]
-        for o in range(ends[p], ends[p + 1]):
-            if o != r:
-                x_px, affine = warp[0][o], warp[1][o]
-                correlation = _align(
-                    greys[image[o]], keypoint_px[o], x_px, affine, warp[2][o], offsets, window, template, pull, patch,
-                    deviation, most_px
-                )  # fmt: skip
-                if correlation > LEAST_CORRELATION:
-                    # Both patches have noise: their difference has the variance 2 (1 − correlation) deviation².
-                    noise = 2 * max(1 - correlation, 1e-6) * deviation * deviation
-                    along_x = affine[0, 0] * affine[0, 0] + affine[1, 0] * affine[1, 0]
-                    across = affine[0, 0] * affine[0, 1] + affine[1, 0] * affine[1, 1]
-                    along_y = affine[0, 1] * affine[0, 1] + affine[1, 1] * affine[1, 1]
-                    variance_px[o] = noise * (along_x * xx + 2 * across * xy + along_y * yy) / 2
+    rows, track = np.unique(of_reference, return_inverse=True)
+    template, pull, deviation = _templates(greys, image[rows], keypoint_px[rows])
+    used = np.flatnonzero((of_reference != np.arange(len(image))) & (deviation >= _FLAT)[track])
+    warp, correlation = (keypoint_px, x_px, affine, bend), np.full(len(image), -1.0)
+    _align_used(greys, used, image, track, *warp, template, pull, deviation, most_px, correlation)
+    # Both patches have noise: their difference has the variance 2 (1 − correlation) deviation².
+    noise = 2 * np.maximum(1 - correlation, 1e-6) * deviation[track] ** 2
+    by_grey = np.swapaxes(pull[..., :2], 1, 2) @ pull[..., :2]
+    variance_px = noise * np.einsum("kij,kjl,kil->k", affine, by_grey[track], affine) / 2
+    return np.where(correlation > LEAST_CORRELATION, variance_px, np.inf)
 
 
-@compiled
-@no_type_check
-def _window(radius):
-    """Return the offsets (n,2), x and y in px, of the pixels of a patch, row by row, and their weights of sum 1.
+def _templates(
+    greys: UInt8[ndarray, "m h w"], image: Int[ndarray, " p"], x_px: Float[ndarray, "p 2"]
+) -> tuple[Float[ndarray, "p n"], Float[ndarray, "p n 8"], Float[ndarray, " p"]]:
+    """Return reference patches minus their means, the gain matrices of the unknowns, and the standard deviations.
 
-    The patch has 2 · radius + 1 pixels on each side; the weights (n) are Gaussian, with standard deviation _WINDOW px.
+    The patches are those around the pixels `x_px` of the images `image` (rows of `greys`), with the greys of `_patch`,
+    row by row. Row k of a gain matrix is the change of the eight unknowns per grey level of difference at pixel k. The
+    unknowns are shift x and y, gain, offset, and the affine part row by row. Where the texture does not determine the
+    unknowns, the gains are very large, and the resulting variance rejects the patch. The standard deviation is 0 if the
+    patch, with one more pixel on every side, leaves its image.
     """
-    side = 2 * radius + 1
-    index = np.arange(side * side)
-    offsets = np.stack((index % side - radius, index // side - radius), axis=1).astype(np.float64)
-    weight = np.exp(-0.5 * (offsets**2).sum(axis=1) / _WINDOW**2)
-    return offsets, weight / weight.sum()
+    p, far, size = len(x_px), _RADIUS + 1, np.array(greys.shape[:0:-1])
+    inside = ((x_px - far >= 1) & (x_px + far < size - 2)).all(1)
+    column, row = np.clip(
+        x_px.astype(int)[:, :, None] + np.arange(-far - 1, far + 3), 0, size[:, None] - 1
+    ).swapaxes(0, 1)
+    patch, side = greys[image[:, None, None], row[:, :, None], column[:, None]].astype(float), 2 * far + 1
+    across, down = (np.stack(_spline.py_func(share))[:, :, None, None] for share in (x_px % 1).T)
+    patch = np.sum([share * patch[:, :, k : k + side] for k, share in enumerate(across)], axis=0)
+    patch = np.sum([share * patch[:, k : k + side] for k, share in enumerate(down)], axis=0)
+    template = patch[:, 1:-1, 1:-1].reshape(p, -1)
+    slope_x = (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]).reshape(p, -1) / 2
+    slope_y = (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]).reshape(p, -1) / 2
+    mean = template @ _WEIGHTS
+    deviation = np.sqrt(np.maximum(template**2 @ _WEIGHTS - mean**2, 0.0))
+    template -= mean[:, None]
+    constant = np.broadcast_to(deviation[:, None], template.shape)
+    along = [slope * offset / _WINDOW for slope in (slope_x, slope_y) for offset in _OFFSETS.T]
+    jacobian = np.stack([slope_x, slope_y, template, constant, *along], 2)
+    weighted = jacobian * _WEIGHTS[:, None]
+    normal = jacobian.swapaxes(1, 2) @ weighted
+    normal += np.eye(_FREE) * (1e-9 * normal + 1e-12)  # a tiny term for singular directions
+    return template, weighted @ np.linalg.inv(normal), np.where(inside, deviation, 0.0)
 
 
-@compiled
+@inlined
 @no_type_check
-def _patch(grey, x_px, affine, bend, offsets, patch):
-    """Write to `patch` (n) the grey at the `offsets` (n,2), warped about `x_px`; return whether the image contains all.
+def _spline(f):
+    """Return the weights of the four pixels around a position, `f` behind the second one, for a cubic B-spline."""
+    e = 1 - f
+    return e * e * e / 6, 2 / 3 - f * f * (1 - f / 2), 2 / 3 - e * e * (1 + f) / 2, f * f * f / 6
 
-    The warp of `_warps`, with `affine` (2,2) and `bend` (2,3), leads to pixels of the image `grey` around the pixel
-    `x_px`. The grey is that of a cubic B-spline whose coefficients are the pixels, which blurs by 0.58 px. Without this
-    blur, interpolation would smooth differently on pixels and between them, which biases positions.
+
+@inlined
+@no_type_check
+def _patch(greys, image, x_px, affine, bend, o, patch):
+    """Write to `patch` (n) the greys around observation `o`, warped; return whether the image contains all of them.
+
+    The warp of `_warps`, with `affine` (k,2,2) and `bend` (k,2,3), leads to pixels of the image with row `image` of
+    `greys` around the pixel x_px[o]. The grey is that of a cubic B-spline whose coefficients are the pixels, which
+    blurs by 0.58 px. Without this blur, interpolation would smooth differently on pixels and between them, which biases
+    positions.
     """
-    for k in range(len(offsets)):
-        u = offsets[k, 0]
-        v = offsets[k, 1]
-        x = x_px[0] + affine[0, 0] * u + affine[0, 1] * v
-        y = x_px[1] + affine[1, 0] * u + affine[1, 1] * v
-        x += bend[0, 0] * u * u + bend[0, 1] * u * v + bend[0, 2] * v * v
-        y += bend[1, 0] * u * u + bend[1, 1] * u * v + bend[1, 2] * v * v
-        if not (x >= 1 and y >= 1 and x < grey.shape[1] - 2 and y < grey.shape[0] - 2):
-            return False
-        column = int(x)
-        row = int(y)
-        f = x - column
-        g = y - row
-        across = ((1 - f) ** 3 / 6, 2 / 3 - f * f * (1 - f / 2), 2 / 3 - (1 - f) ** 2 * (1 + f) / 2, f**3 / 6)
-        down = ((1 - g) ** 3 / 6, 2 / 3 - g * g * (1 - g / 2), 2 / 3 - (1 - g) ** 2 * (1 + g) / 2, g**3 / 6)
-        value = 0.0
-        for i in range(4):
-            line = grey[row + i - 1]
-            for j in range(4):
-                value += down[i] * across[j] * line[column + j - 1]
-        patch[k] = value
+    _, h, w = greys.shape
+    n = 0
+    for v in range(-_RADIUS, _RADIUS + 1):
+        for u in range(-_RADIUS, _RADIUS + 1):
+            x = x_px[o, 0] + affine[o, 0, 0] * u + affine[o, 0, 1] * v
+            y = x_px[o, 1] + affine[o, 1, 0] * u + affine[o, 1, 1] * v
+            x += bend[o, 0, 0] * u * u + bend[o, 0, 1] * u * v + bend[o, 0, 2] * v * v
+            y += bend[o, 1, 0] * u * u + bend[o, 1, 1] * u * v + bend[o, 1, 2] * v * v
+            if not (x >= 1 and y >= 1 and x < w - 2 and y < h - 2):
+                return False
+            column, row = int(x), int(y)
+            across, down = _spline(x - column), _spline(y - row)
+            patch[n] = 0.0
+            for i in range(4):
+                line = 0.0
+                for j in range(4):
+                    line += across[j] * greys[image, row + i - 1, column + j - 1]
+                patch[n] += down[i] * line
+            n += 1
     return True
 
 
 @compiled
 @no_type_check
-def _template(around, offsets, window, template, pull):
-    """Write the reference patch minus its mean to `template` (n), and the gain matrix of the unknowns to `pull` (n,8).
+def _align_used(
+    greys,
+    used,
+    image,
+    track,
+    keypoint_px,
+    x_px,
+    affine,
+    bend,
+    template,
+    pull,
+    deviation,
+    most_px,
+    correlation,
+):
+    """Align the patches of the observations `used` by Gauss-Newton; update `x_px`, `affine` and `correlation` (k).
 
-    `around` has the greys of the patch, row by row, with one more pixel on every side. `offsets` and `window` are its
-    pixels and their weights (`_window`). Row k of `pull` is the change of the eight unknowns per grey level of
-    difference at pixel k. The unknowns are shift x and y, gain, offset, and the affine part row by row. Returns the
-    standard deviation of the patch. Where the texture does not determine the unknowns, `pull` is very large, and the
-    resulting variance rejects the patch.
+    `track` is the row of each observation in `template`, `pull` and `deviation`, which come from `_templates`. A step
+    is Σ (grey − template)·pull. The correlation is that of patch and template, weighted by _WEIGHTS. It does not change
+    without convergence, if the patch leaves the image, or if its centre moves more than `most_px` from `keypoint_px`.
+    Other arguments are those of `_align_all`.
     """
-    side = 2 * _RADIUS + 3
-    mean = 0.0
-    square = 0.0
-    jacobian = np.empty((len(offsets), _FREE))
-    for k in range(len(offsets)):
-        middle = int((offsets[k, 1] + _RADIUS + 1) * side + offsets[k, 0] + _RADIUS + 1)
-        template[k] = around[middle]
-        jacobian[k, 0] = (around[middle + 1] - around[middle - 1]) / 2
-        jacobian[k, 1] = (around[middle + side] - around[middle - side]) / 2
-        mean += window[k] * template[k]
-        square += window[k] * template[k] * template[k]
-    deviation = np.sqrt(max(square - mean * mean, 0.0))
-    for k in range(len(offsets)):
-        template[k] -= mean
-        jacobian[k, 2] = template[k]
-        jacobian[k, 3] = deviation
-        for i in range(2):
-            for j in range(2):
-                jacobian[k, 4 + 2 * i + j] = jacobian[k, i] * offsets[k, j] / _WINDOW
-    weighted = jacobian * window.reshape((-1, 1))
-    normal = jacobian.T @ weighted
-    for i in range(_FREE):  # a tiny term for singular directions
-        normal[i, i] += 1e-9 * normal[i, i] + 1e-12
-    pull[:] = weighted @ np.linalg.inv(normal)
-    return deviation
-
-
-@compiled
-@no_type_check
-def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
-    """Align one patch to the template by Gauss-Newton: update `x_px` (2) and `affine` (2,2); return the correlation.
-
-    The correlation is that of patch and template, weighted by `window`. The result is -1 without convergence, if the
-    patch leaves the image `grey`, or if its centre `x_px` moves more than `most_px` from `keypoint_px`. `bend` is the
-    fixed part of the warp (`_warps`), `offsets` and `window` come from `_window`, and `patch` (n) is overwritten.
-    `template`, `pull` and `deviation` come from `_template`: a step is Σ (grey − template)·pull.
-    """
-    step = np.empty(_FREE)
-    for _ in range(_STEPS):
-        if not _patch(grey, x_px, affine, bend, offsets, patch):
-            return -1.0
-        mean = 0.0
-        square = 0.0
-        for k in range(len(offsets)):
-            mean += window[k] * patch[k]
-            square += window[k] * patch[k] * patch[k]
-        gain = deviation / np.sqrt(max(square - mean * mean, 1e-12))
-        for i in range(_FREE):
-            step[i] = 0.0
-        correlation = 0.0
-        for k in range(len(offsets)):
-            here = gain * (patch[k] - mean)
-            correlation += window[k] * here * template[k]
+    patch, step = np.empty(len(_WEIGHTS)), np.empty(_FREE)
+    for o in used:
+        t = track[o]
+        for _ in range(_STEPS):
+            if not _patch(greys, image[o], x_px, affine, bend, o, patch):
+                break
+            mean = square = found = moved = away = 0.0
+            for k in range(len(patch)):
+                mean += _WEIGHTS[k] * patch[k]
+                square += _WEIGHTS[k] * patch[k] * patch[k]
+            gain = deviation[t] / np.sqrt(max(square - mean * mean, 1e-12))
             for i in range(_FREE):
-                step[i] += (here - template[k]) * pull[k, i]
-        a, b, c, d = step[4] / _WINDOW + 1, step[5] / _WINDOW, step[6] / _WINDOW, step[7] / _WINDOW + 1
-        determinant = a * d - b * c
-        if determinant < 0.3:
-            return -1.0
-        moved = 0.0
-        away = 0.0
-        for i in range(2):
-            first, second = affine[i, 0], affine[i, 1]
-            affine[i, 0] = (first * d - second * c) / determinant
-            affine[i, 1] = (second * a - first * b) / determinant
-            shift = affine[i, 0] * step[0] + affine[i, 1] * step[1]
-            x_px[i] -= shift
-            moved += shift * shift
-            away += (x_px[i] - keypoint_px[i]) ** 2
-        if away > most_px * most_px:
-            return -1.0
-        if moved < _SETTLED_PX * _SETTLED_PX:
-            return correlation / (deviation * deviation)
-    return -1.0
+                step[i] = 0.0
+            for k in range(len(patch)):
+                here = gain * (patch[k] - mean)
+                found += _WEIGHTS[k] * here * template[t, k]
+                for i in range(_FREE):
+                    step[i] += (here - template[t, k]) * pull[t, k, i]
+            a, b, c, d = step[4] / _WINDOW + 1, step[5] / _WINDOW, step[6] / _WINDOW, step[7] / _WINDOW + 1
+            determinant = a * d - b * c
+            if determinant < 0.3:
+                break
+            for i in range(2):
+                first, second = affine[o, i, 0], affine[o, i, 1]
+                affine[o, i, 0] = (first * d - second * c) / determinant
+                affine[o, i, 1] = (second * a - first * b) / determinant
+                shift = affine[o, i, 0] * step[0] + affine[o, i, 1] * step[1]
+                x_px[o, i] -= shift
+                moved += shift * shift
+                away += (x_px[o, i] - keypoint_px[o, i]) ** 2
+            if away > most_px * most_px:
+                break
+            if moved < _SETTLED_PX * _SETTLED_PX:
+                correlation[o] = found / (deviation[t] * deviation[t])
+                break
