@@ -20,7 +20,7 @@ def intrinsics(rs: ModuleType) -> Any:
         315.0,
         242.0,
     )
-    found.model, found.coeffs = rs.distortion.inverse_brown_conrady, [0.05, -0.02, 1e-3, -5e-4, 0.0]
+    found.model, found.coeffs = rs.distortion.inverse_brown_conrady, 5 * [0.0]
     return found
 
 

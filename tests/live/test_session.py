@@ -15,12 +15,11 @@ import pytest
 from numpy import ndarray
 
 import jcr
-from capture_writers import rows_as
 from jcr.capture.images import read_image
 from jcr.live import robot
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
-from jcr.live.robot import MOVED_ON, RobotState, next_rest, pose_of_numbers, typed_poses, without_commands
+from jcr.live.robot import MOVED_ON, RobotState, next_rest
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from scripted_capture import RATE, Scripted, a_capture, poses, still, still_frames, take_all, video
 from simulation.ur import SimulatedUr
@@ -72,14 +71,6 @@ def test_a_capture_ends_by_itself_when_it_is_accurate(tmp_path: Path, tabletop: 
     assert len(taken.folder.names) == 8
     met = [answer["calibration"]["requirement_met"] for answer, _ in heard if "calibration" in answer]
     assert met[-8:] == 7 * [False] + [True]
-
-
-def test_commands_are_distinguished_from_poses():
-    others = ["", "0.4 0 0.5 0 0 0", "re", "remove it", "finish 1", "undo 2", "take 1", "retake ²"]
-    lines = ["retake", *others[:4], "rem 3", *others[4:], "FINISH\n", "undo"]
-    pressed: list[tuple[str, int | None]] = []
-    assert list(without_commands(lines, lambda *command: pressed.append(command))) == others
-    assert pressed == [("retake", None), ("remove", 3), ("finish", None), ("undo", None)]
 
 
 def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
@@ -300,25 +291,3 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
     server.close()
     with pytest.raises(jcr.InputError, match="check the address"):
         next(closed)
-
-
-def test_typed_poses_follow_the_pendant(tabletop: Path):
-    pose, said = poses(tabletop)[0], list[str]()
-    numbers = rows_as("kuka", pose[None])[0]
-    lines = iter([" ".join(f"{value:.4f}" for value in numbers), "0.4 0 0.5 0 0 0", ""])
-    (found,) = typed_poses(lines, said.append, "kuka")
-    assert np.allclose(found, pose, atol=1e-5)
-    assert "x y z a b c; mm, deg" in said[0]
-    # Metres, typed where the pendant shows millimetres.
-    assert any("too near for this convention's millimetres" in text for text in said)
-
-
-def test_poses_are_typed_in_three_ways_and_mistakes_asked_again():
-    said: list[str] = []
-    lines = ["0.4 0 0.5 0 3.14159265 0", "p[0.4, 0, 0.5, 0]", "abc", "0.4 0 0.5 0 1 0 0", "", "1 2 3"]
-    found = list(typed_poses(iter(lines), said.append))
-    assert len(found) == 2  # nothing after the empty line
-    assert np.allclose(found[0], found[1], atol=1e-6)
-    assert sum("refused" in text for text in said) == 2
-    matrix = pose_of_numbers(found[0].ravel().tolist(), "typed")
-    assert np.allclose(matrix, found[0])

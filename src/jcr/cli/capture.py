@@ -2,36 +2,23 @@
 
 import os
 import sys
-import threading
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jcr.capture.formats.capture_json import read_intrinsics
-from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.estimation.arms import CHOICES, ROBOT_NAMES, RobotName, arm_named
+from jcr.estimation.arms import CHOICES, RobotName
 from jcr.files import locked
 from jcr.live.cameras import CameraOptions, open_camera
-from jcr.live.robot import (
-    HELP,
-    RobotState,
-    States,
-    address_of,
-    states_of,
-    typed_poses,
-    without_commands,
-)
+from jcr.live.robot import states_of
 from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
 from jcr.rounding import labelled
 
 if TYPE_CHECKING:
-    from jcr.live.server import LiveServer
     from jcr.result import RunResult
 
 
@@ -42,42 +29,29 @@ class CaptureCommand:
     An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the calibration is
     updated, and its accuracy, its faults and what would improve it are printed. OUT/result is the calibration of all
     images. After Ctrl-C the same command resumes. The live page, whose address is printed, has buttons to take, retake
-    and remove images, to undo, and to finish; the same commands can be typed.
+    and remove images, to undo, and to finish.
 
     for example:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
-      jcr capture --robot list
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
       jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
       jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses http --page-port 7464
-      jcr capture captures/table --camera 0 --poses typed --pose-convention kuka --pose-units mm-deg
-      JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 192.168.0.5:7464
     """
 
-    out: Annotated[Path | None, tyro.conf.Positional] = None
+    out: tyro.conf.Positional[Path]
     """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     settings: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
-    """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
-    or http (a program posts them, jcr docs http)."""
-    pose_convention: ConventionName = "auto"
-    """Notation of typed poses; auto: 6 numbers end with a rotation vector, 7 with a quaternion xyzw, 16 are a matrix."""
-    pose_units: UnitsName = "auto"
-    """Units of typed poses; auto: those of the convention."""
-    robot: Annotated[RobotName | Literal["list"] | None, tyro.conf.arg(metavar=f"{{list,{CHOICES[1:]}")] = (
-        None
-    )
-    """The arm, to model its joint offsets and link errors; list prints the arms."""
+    """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, or http (a program posts
+    them, jcr docs http)."""
+    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
+    """The arm, to model its joint offsets and link errors."""
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
-    """Port of the live page and of samples on this machine alone; 0: any free one."""
-    listen: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Serve other machines too, at this address and under this host name only; needs the key of the session in the
-    environment variable JCR_TOKEN. Without JCR_TOKEN the key is random."""
-    timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
-    """Time limit for --poses http: stop after this many seconds without a pose."""
+    """Port of the live page and of samples on this machine; 0: any free one. The key is random, or that of the
+    environment variable JCR_TOKEN."""
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
@@ -85,27 +59,16 @@ class CaptureCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Take images until the user ends or `--until-accurate` is met, and calibrate with all; or list the arms."""
-        if self.robot == "list":
-            arms = [arm_named(name) for name in ROBOT_NAMES]
-            lines = [f"{arm.name:<8}{arm.dof} joints, reach {arm.reach:.2f} m" for arm in arms]
-            facts = {"robots": [{"name": arm.name, "joints": arm.dof, "reach_m": arm.reach} for arm in arms]}
-            self.output.result(lines, facts)
-            return 0
-        if self.out is None:
-            raise InputError("OUT: required, and not given (jcr capture --help)")
+        """Take images until the user ends or `--until-accurate` is met, and calibrate with all."""
         from jcr.live.calibration import LiveCalibration
-        from jcr.live.server import LOOPBACK, LiveServer
+        from jcr.live.server import LiveServer
 
-        options, out = self.session, self.out
+        options, out, states = self.session, self.out, states_of(self.poses)
         if options.until_accurate and options.require is None:
             raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
-        states, address = states_of(self.poses), (LOOPBACK, self.page_port)
-        if self.listen is not None:
-            address = address_of(self.listen, 7464, "--listen ")
         given = None if self.intrinsics_from is None else read_intrinsics(self.intrinsics_from)
-        if states is None and self.poses not in ("typed", "http"):
-            raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or http")
+        if states is None and self.poses != "http":
+            raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST or http")
         answers: list[Answer] = []
 
         def tell(answer: Answer, lines: list[str]) -> None:
@@ -120,11 +83,17 @@ class CaptureCommand:
             session = LiveSession(calibration, camera, options, tell, gripper)
             token = os.environ.get("JCR_TOKEN") or None
             try:
-                with LiveServer(session, *address, token, self.poses == "http") as server:
+                with LiveServer(session, self.page_port, token, self.poses == "http") as server:
                     _print(
                         f"{len(calibration.live.names)} images in {out}; open {server.address} in a browser"
                     )
-                    session.run(_source(self, session, states, server))
+                    if states is None:
+                        _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
+                        session.run()
+                    else:
+                        where = self.poses.partition(":")[2]
+                        _print(f"move the arm; an image is taken whenever it rests ({where})")
+                        session.run(lambda: session.watch(states))
                     result = session.finish()
             finally:
                 calibration.close()
@@ -165,30 +134,3 @@ def _print(text: str) -> None:
     """Print progress on stderr."""
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
-
-
-def _source(
-    arguments: CaptureCommand, session: LiveSession, states: States | None, server: "LiveServer"
-) -> Callable[[], None]:
-    """Return a function that takes images at the gripper poses of `--poses`, and start to read typed commands.
-
-    `states` reads the states of an arm (None: poses are typed or posted); `server` receives posted poses.
-    """
-    lines = without_commands(sys.stdin, session.press)
-    if sys.stdin.isatty():
-        _print(HELP)
-    if arguments.poses == "typed":
-        poses = typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
-
-        def take_all() -> None:
-            """Take an image at each typed pose."""
-            for pose in poses:
-                session.take(RobotState(time.monotonic(), pose))
-
-        return take_all
-    threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
-    if states is not None:
-        _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
-        return lambda: session.watch(states)
-    _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
-    return lambda: server.await_samples(arguments.timeout)

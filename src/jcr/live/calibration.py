@@ -44,7 +44,7 @@ class LiveCalibration:
     """Calibration that is computed again whenever an image is added to its capture or removed from it.
 
     `folder` is the folder of the capture; a capture that was begun there is continued. `intrinsics` belong to all
-    images; None: they are estimated. `robot` names the arm (`jcr capture --robot list` shows the names).
+    images; None: they are estimated. `robot` names the arm (`jcr capture --help` shows the names).
     Images and poses are written into the folder when they are added, so that jcr.read_capture can read the capture at
     any time. Methods may be called from several threads.
     """

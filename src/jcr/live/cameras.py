@@ -26,8 +26,6 @@ TIMEOUT_S = 10.0
 """Time without an image (s) after which a camera counts as lost."""
 REALSENSE = "realsense"
 """Prefix of a RealSense camera in `--camera`; `:SERIAL` or the file of a recording, `:FILE`, may follow."""
-FITTED_PX = 0.05
-"""Largest accepted difference (px) between OpenCV's distortion, with fitted coefficients, and the maker's model."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Camera:
     latest: Callable[[], Frame | None]
     """Function that returns the newest frame, without waiting; None before the first one."""
     intrinsics: IntrinsicsEntry | None = None
-    """Intrinsics that the maker stored in the camera; None if it stores none that OpenCV's model can express."""
+    """Intrinsics that the maker stored in the camera; None if it stores none, or a distortion."""
 
 
 @contextmanager
@@ -258,9 +256,12 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
             sensor.set_option(rs.option.enable_auto_exposure, 0)
             sensor.set_option(option, exposure)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
-        intrinsics = _realsense_intrinsics(rs, stored)
+        # The distortion models of librealsense are not OpenCV's; most colour cameras are without distortion.
+        intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
         read = _realsense_reader(rs, pipeline, profile, is_file)
-        yield stack.enter_context(_read_by(read, None if is_file else name, intrinsics))
+        yield stack.enter_context(
+            _read_by(read, None if is_file else name, None if any(stored.coeffs) else intrinsics)
+        )
 
 
 def _realsense_reader(
@@ -296,30 +297,6 @@ def _realsense_reader(
         return Frame(pixels, stamp, depth_mm)
 
     return read
-
-
-def _realsense_intrinsics(rs: ModuleType, stored: Any) -> IntrinsicsEntry | None:
-    """Return the intrinsics that a RealSense stores, as an entry of capture.json with OpenCV's distortion model.
-
-    OpenCV's coefficients k1, k2, p1, p2, k3 are fitted by linear least squares to the rays that librealsense gives for
-    a grid of pixels. The distortion models of librealsense differ from OpenCV's ("Projection in Intel RealSense SDK
-    2.0"). Returns None if the fit deviates by 0.05 px or more. `rs` is the module pyrealsense2, `stored` its object
-    rs.intrinsics of the colour camera.
-    """
-    intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
-    if not any(stored.coeffs):
-        return intrinsics
-    u, v = np.meshgrid(np.linspace(0, stored.width - 1, 25), np.linspace(0, stored.height - 1, 19))
-    x_px = np.stack([u.ravel(), v.ravel()], axis=1)
-    rays = np.array([rs.rs2_deproject_pixel_to_point(stored, pixel.tolist(), 1.0) for pixel in x_px])
-    (x, y), r2 = rays[:, :2].T, (rays[:, :2] ** 2).sum(1)
-    seen = (x_px - [stored.ppx, stored.ppy]) / [stored.fx, stored.fy]
-    by_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=1)
-    by_y = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=1)
-    matrix, goal = np.vstack([by_x, by_y]), np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
-    coefficients = np.linalg.lstsq(matrix, goal, rcond=None)[0]
-    off_px = max(stored.fx, stored.fy) * np.abs(matrix @ coefficients - goal).max()
-    return intrinsics.model_copy(update={"distortion": coefficients.tolist()}) if off_px < FITTED_PX else None
 
 
 # An image can be kept if it is at rest, sharp, well exposed, and different from the images at other gripper poses.

@@ -1,4 +1,4 @@
-"""States of a robot arm from its controller, detection of rest, gripper poses from plain numbers, and typed lines.
+"""States of a robot arm from its controller, detection of rest, and gripper poses from plain numbers.
 
 Universal Robots, Franka and UFACTORY arms are read. No motion is commanded, so an arm may be guided by hand. The readers
 raise InputError if a package is missing, the robot cannot be reached, or the connection ends.
@@ -10,16 +10,15 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
-from jcr.capture.options import ConventionName, UnitsName
+from jcr.capture.controllers import poses_from_numbers
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import inverse, rotation_angle
@@ -33,10 +32,12 @@ MOVED_ON = (0.01, np.radians(3.0))
 """Least motion (m, rad) from the last image's gripper pose to the pose at rest where the next image is taken."""
 TRY_AGAIN = (1e-3, np.radians(0.2))
 """Least motion (m, rad), in place of MOVED_ON, after an image that was refused."""
-BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
-"""Pose convention by the number of numbers, used if the convention is "auto"."""
-KINDS: tuple[ConventionName, ...] = ("ur", "franka", "xarm")
-"""Kinds of arms whose controllers can be read; each is named like the pose convention of its pendant."""
+BY_COUNT = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
+"""Pose convention by the number of numbers."""
+KINDS = ("ur", "franka", "xarm")
+"""Kinds of arms whose controllers can be read."""
+Action = Literal["take", "retake", "remove", "undo", "finish"]
+"""Command of the live page."""
 UR_PORT = 30003
 """Default port: the real-time interface of UR controllers."""
 UR_TIMEOUT_S = 5.0
@@ -93,28 +94,15 @@ def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[
     return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
 
 
-def pose_of_numbers(
-    numbers: list[float], where: str, convention: ConventionName = "auto", units: UnitsName = "auto"
-) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper (4,4) from the numbers of one pose; raise InputError, begun with `where`, for others.
+def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
+    """Return base_from_gripper (4,4) from the numbers of one pose (m, rad); raise InputError, begun with `where`, else.
 
-    `convention` "auto": 6 numbers are x y z and a rotation vector, 7 are x y z qx qy qz qw, 16 are a matrix by rows.
-    `units` "auto": the units of the convention, which are m and rad for these three.
+    6 numbers are x y z and a rotation vector, 7 are x y z qx qy qz qw, 16 are a matrix by rows.
     """
-    named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
-    if named is None or len(numbers) != len(CONVENTIONS[named].columns):
-        raise InputError(f"{where}: {len(numbers)} numbers; give {pose_columns(convention, units)}")
-    return poses_from_numbers(np.array([numbers], np.float64), named, units, where)[0]
-
-
-def pose_columns(convention: ConventionName, units: UnitsName) -> str:
-    """Return a text with names and units of the numbers of a pose in a convention, for prompts and messages."""
-    if convention == "auto":
-        unit = "m, rad" if units == "auto" else units.replace("-", ", ")
-        return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
-    form = CONVENTIONS[convention]
-    names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
-    return f"{names}; {(form.usual if units == 'auto' else units).replace('-', ', ')}"
+    if (named := BY_COUNT.get(len(numbers))) is None:
+        forms = "x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; m, rad"
+        raise InputError(f"{where}: {len(numbers)} numbers; give {forms}")
+    return poses_from_numbers(np.array([numbers], np.float64), named, "auto", where)[0]
 
 
 def states_of(source: str) -> States | None:
@@ -123,18 +111,12 @@ def states_of(source: str) -> States | None:
     if kind not in KINDS or not address:
         return None
     if kind == "ur":
-        host, port = address_of(address, UR_PORT, "--poses ur:")
-        return lambda: ur_states(host, port)
+        host, _, number = address.rpartition(":") if ":" in address else (address, "", str(UR_PORT))
+        if not host or not number.isdigit() or not int(number) < 65536:
+            raise InputError(f"--poses {source}: no address; write HOST:PORT such as 192.168.0.2:{UR_PORT}")
+        return lambda: ur_states(host, int(number))
     read = franka_states if kind == "franka" else xarm_states
     return lambda: read(address)
-
-
-def address_of(text: str, port: int, option: str) -> tuple[str, int]:
-    """Return host and port from HOST[:PORT]; `port` is the default. Raises InputError that begins with `option`."""
-    host, _, number = text.rpartition(":") if ":" in text else (text, "", str(port))
-    if not host or not number.isdigit() or not int(number) < 65536:
-        raise InputError(f"{option}{text}: no address; write HOST:PORT such as 127.0.0.1:{port}")
-    return host, int(number)
 
 
 def ur_states(host: str, port: int) -> Iterator[RobotState]:
@@ -224,50 +206,3 @@ def xarm_states(host: str) -> Iterator[RobotState]:
             time.sleep(XARM_POLL_S)
     finally:
         arm.disconnect()
-
-
-# A person types lines while a capture is taken: commands, and gripper poses that the pendant shows.
-
-Action = Literal["take", "retake", "remove", "undo", "finish"]
-WITH_NUMBER: tuple[Action, ...] = ("retake", "remove")
-"""Actions after which the number of an image may follow."""
-HELP = "type take, retake [NUMBER], remove [NUMBER], undo or finish, and Enter; NUMBER counts from 1, unset: the last"
-
-
-def without_commands(lines: Iterable[str], press: Callable[[Action, int | None], None]) -> Iterator[str]:
-    """Yield the typed lines that are no commands; for each command, call `press` with action and image number.
-
-    Commands are take, retake, remove, undo and finish. The number, counted from 1, is None if the command has none. The
-    first three letters of an action are enough.
-    """
-    for line in lines:
-        first, *rest = line.split() or [""]
-        found = [one for one in get_args(Action) if len(first) >= 3 and one.startswith(first.lower())]
-        most = any(action in WITH_NUMBER for action in found)
-        if len(found) == 1 and len(rest) <= most and all(word.isdecimal() for word in rest):
-            press(found[0], int(rest[0]) if rest else None)
-        else:
-            yield line
-
-
-def typed_poses(
-    lines: Iterator[str],
-    show: Callable[[str], None],
-    convention: ConventionName = "auto",
-    units: UnitsName = "auto",
-) -> Iterator[Float[ndarray, "4 4"]]:
-    """Yield base_from_gripper (4,4) from each typed line of numbers, until an empty line or the end of the input.
-
-    The numbers have the pose convention and units given, "auto" as in `pose_of_numbers`. `show` prints the prompt, and
-    the reason why a line is refused.
-    """
-    while True:
-        show(f"pose at rest ({pose_columns(convention, units)}; empty line ends):")
-        line = next(lines, "").strip().strip("[]p")
-        if not line:
-            return
-        try:
-            numbers = [float(word) for word in line.replace(",", " ").split()]
-            yield pose_of_numbers(numbers, "typed", convention, units)
-        except ValueError as error:  # InputError is a subclass of ValueError.
-            show(f"refused: {error}")

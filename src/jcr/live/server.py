@@ -6,7 +6,6 @@ page. Other web sites can therefore not read the capture, send commands or add a
 """
 
 import hmac
-import ipaddress
 import json
 import re
 import secrets
@@ -67,37 +66,26 @@ class LiveServer(ThreadingHTTPServer):
     def __init__(
         self,
         session: LiveSession,
-        host: str = LOOPBACK,
         port: int = 0,
         token: str | None = None,
         takes_samples: bool = False,
     ) -> None:
-        """Bind the address `host`:`port`; raise InputError if that fails, or if `host` is not loopback without a token.
+        """Bind a port of the loopback address; raise InputError if that fails.
 
         `token` is the key that the addresses of all requests contain; None: a random key. `port` 0: any free port.
         `takes_samples`: other programs may post gripper poses, at which images are then taken.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError("JCR_TOKEN: has characters that no address has; use letters, digits, - and _")
-        where = f"{'--page-port' if host == LOOPBACK else '--listen'} {host}:{port}"
-        is_any_host = host == ""
-        with suppress(ValueError):
-            is_any_host |= ipaddress.ip_address(host).is_unspecified
-        if is_any_host:
-            raise InputError(f"{where}: names no host; give the address of this machine that the robot uses")
-        if host != LOOPBACK and token is None:
-            raise InputError(f"{where}: others can reach that address; set a token (JCR_TOKEN)")
         self.session, self.key = session, token or secrets.token_urlsafe(16)
-        self.takes_samples, self.sampled_s = takes_samples, time.monotonic()
-        """Whether samples are accepted, and time (s, monotonic clock) of the last one; infinite during an answer."""
+        self.takes_samples = takes_samples
         self.page_version, self.page_s = -1, -np.inf
         """Version of the state that the page shows, and time (s, monotonic clock) of the page's last request."""
         try:
-            super().__init__((host, port), _Handler)
+            super().__init__((LOOPBACK, port), _Handler)
         except (OSError, OverflowError) as error:
-            raise InputError(f"{where}: {error}; choose an address of this machine and a free port") from None
-        names = (LOOPBACK, "localhost") if host == LOOPBACK else (host,)
-        self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in names)
+            raise InputError(f"--page-port {port}: {error}; choose a free port") from None
+        self.hosts = tuple(f"{name}:{self.server_address[1]}" for name in (LOOPBACK, "localhost"))
         """Accepted values of the header `Host`: name and port of this server."""
         self.address = f"http://{self.hosts[0]}/{self.key}/"
         """URL of the page, which includes the key."""
@@ -108,15 +96,6 @@ class LiveServer(ThreadingHTTPServer):
         result = self.session.state.result
         file = None if result is None else result.out / "report.html"
         return file if file is not None and file.is_file() else None
-
-    def await_samples(self, timeout_s: float) -> None:
-        """Wait until the session is over; raise InputError after `timeout_s` seconds without a sample."""
-        while not self.session.state.is_over:
-            if time.monotonic() - self.sampled_s > timeout_s:
-                raise InputError(
-                    f"--poses http: no sample for {timeout_s:.0f} s; the images are kept and the same command resumes"
-                )
-            time.sleep(0.1)
 
     def __enter__(self) -> "LiveServer":
         """Start to serve requests in a thread."""
@@ -213,9 +192,7 @@ class _Handler(BaseHTTPRequestHandler):
                 if pose is None:
                     server.session.end()
                     return {"accepted": True, "done": True}, 200
-                server.sampled_s = np.inf
                 answer = server.session.take(RobotState(time.monotonic(), pose), waits=True)
-                server.sampled_s = time.monotonic()
                 # Programs that do not parse the body see from the status whether the image is kept.
                 return answer, 200 if answer["accepted"] else 422
         return {"accepted": False, "reason": why}, status
