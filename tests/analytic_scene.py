@@ -46,12 +46,6 @@ def true_color(x: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
     return 0.5 + 0.45 * np.sin(x * [30, 40, 50] + [0, 1, 2])
 
 
-def warmth(cloud: PointCloud) -> Float[ndarray, "n 2"]:
-    """Return a property of two numbers, as any continuous property is stored."""
-    x = cloud.points_in_base
-    return np.stack([20 + 30 * x[:, 0], x[:, 2] > 0.02], -1)
-
-
 def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int = 0) -> PointCloud:
     """Return the points that the cameras see, with Gaussian noise (m) along the rays."""
     draw = np.random.default_rng(seed)

@@ -13,11 +13,10 @@ import pytest
 from scipy.special import expit
 
 import analytic_scene
-from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance, warmth
+from analytic_scene import BALL_CENTER, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
 from jcr.records import MATCHED, PRIOR, PointCloud
-from jcr.scene.cloud import write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
 from places import ROOT
@@ -42,10 +41,10 @@ def cloud() -> PointCloud:
 
 @pytest.fixture(scope="module")
 def scene(cloud: PointCloud) -> "SceneMap":
-    """The map of the analytic scene with one more property."""
+    """The map of the analytic scene."""
     from jcr.scene.build import build_scene
 
-    return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
+    return build_scene(cloud, OPTIONS)
 
 
 def uniform(count: int, seed: int = 0) -> np.ndarray:
@@ -117,26 +116,11 @@ def test_spheres_touch_what_they_reach_and_nothing_else(scene: "SceneMap"):
     assert scene.check_spheres(centers, radii + scene.cell / 2)[answer].all()
 
 
-def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):
-    from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
-
-    start, end = BALL_CENTER + [0, -0.12, 0.02], BALL_CENTER + [0, 0.12, 0.02]
-    above = np.array([0, 0, BALL_RADIUS + 0.05])
-    ends = [FREE, FREE]
-    assert scene.check_spheres(np.stack([start, end]), 0.01, "report").tolist() == ends
-    assert scene.check_segments(start, end, 0.01, "report") == OCCUPIED
-    assert scene.check_segments(start + above, end + above, 0.01, "report") == FREE
-    assert scene.check_segments(FREE_SPOT, OUTSIDE, 0.01, "report") == UNKNOWN
-    both = scene.check_segments(np.stack([start, start + above]), np.stack([end, end + above]), 0.01)
-    assert both.tolist() == [True, False]
-
-
-def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: PointCloud):
+def test_colours_and_labels_are_learnt(scene: "SceneMap", cloud: PointCloud):
     x = cloud.points_in_base
     sample = scene.query(x)
     assert np.abs(sample.color - analytic_scene.true_color(x)).mean() < 0.03
     assert (sample.label == cloud.label).mean() > 0.99
-    assert np.abs(sample.values["warmth"] - warmth(cloud)).mean() < 0.3
     assert scene.label_names == analytic_scene.LABELS
 
 
@@ -165,13 +149,8 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     color = analytic_scene.true_color(cloud.points_in_base[:20_000])
     assert np.abs(fields["color"](surface)["color"].numpy() - color).mean() < 0.12
     assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
-    doubted = replace(cloud, confidence=np.where(np.arange(len(cloud.label)) < 100, 1.0, 1e-3))
-    one, other = (train_paper(of, True, 2)["color"](surface)["color"] for of in (doubted, cloud))
-    assert not torch.equal(one, other)
     untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
     assert [type(one) for one in build_scene(cloud, untrained).fields.of] == 3 * [PaperField]
-    with pytest.raises(InputError, match="leave the values out"):
-        build_scene(cloud, untrained, values={"warmth": warmth(cloud)})
 
 
 def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
@@ -181,11 +160,14 @@ def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():
 
     cloud, coarse = analytic_scene.cloud(5000), replace(OPTIONS, cell=0.03)
     threads, state, x = torch.get_num_threads(), torch.get_rng_state(), uniform(20_000)
-    one = build_scene(cloud, coarse, values={"warmth": warmth(cloud)})
+    one = build_scene(cloud, coarse)
     assert torch.get_num_threads() == threads and (torch.get_rng_state() == state).all()
     torch.rand(7)
-    raw, again = one.field(x), build_scene(cloud, coarse, values={"warmth": warmth(cloud)}).field(x)
-    outputs = {"occupancy": 1, "color": 3, "label": len(analytic_scene.LABELS), "warmth": 2}
+    raw, again = (
+        {name: value.numpy() for name, value in of.fields(torch.tensor(x).float(), of.properties).items()}
+        for of in (one, build_scene(cloud, coarse))
+    )
+    outputs = {"occupancy": 1, "color": 3, "label": len(analytic_scene.LABELS)}
     assert {name: value.shape[1] for name, value in raw.items()} == outputs
     assert all(np.array_equal(again[name], value) for name, value in raw.items())
     seen = ~one.query(x).unknown
@@ -230,8 +212,7 @@ def test_a_loaded_map_gives_eight_threads_the_answers_of_the_saved_one(scene: "S
 
     def answers(of: "SceneMap", at: "np.ndarray | torch.Tensor") -> list[np.ndarray]:
         sample = of.query(at)
-        values = [*(getattr(sample, name) for name in names), sample.values["warmth"]]
-        return [np.asarray(value) for value in values] + [of.check_spheres(x, 0.02)]
+        return [np.asarray(getattr(sample, name)) for name in names] + [of.check_spheres(x, 0.02)]
 
     expected = answers(scene, x)
     scene.save(tmp_path / "map.safetensors")
@@ -262,18 +243,15 @@ def test_questions_and_clouds_that_make_no_sense_are_refused(scene: "SceneMap", 
     ):
         with pytest.raises(InputError, match=words):
             scene.check_spheres(centers, radii)
-    with pytest.raises(InputError, match="not finite"):
-        scene.check_segments(np.zeros((1, 3)), np.full((1, 3), np.inf), 0.1)
     nan = np.full((len(cloud.points_in_base), 1), np.nan)
     inverted, far = (0.4, -0.4, 0.0, -0.4, 0.4, 0.6), (3.0, 3.0, 3.0, 4.0, 4.0, 4.0)
-    for words, points, options, values in (
-        ("not finite", replace(cloud, points_in_base=cloud.points_in_base + nan), OPTIONS, None),
-        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far), None),
-        ("minimum below", cloud, replace(OPTIONS, workspace=inverted), None),
-        ("one finite row per point", cloud, OPTIONS, {"warmth": nan}),
+    for words, points, options in (
+        ("not finite", replace(cloud, points_in_base=cloud.points_in_base + nan), OPTIONS),
+        ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far)),
+        ("minimum below", cloud, replace(OPTIONS, workspace=inverted)),
     ):
         with pytest.raises(InputError, match=words):
-            build_scene(points, options, values=values)
+            build_scene(points, options)
 
 
 def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Path):
@@ -478,9 +456,8 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
 def test_manual_of_maps_runs(scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     page = (ROOT / "docs" / "how-to" / "map.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.S)
-    assert len(blocks) == 4
+    assert len(blocks) == 3
     scene.save(tmp_path / "out" / "table" / "map.safetensors")
-    write_cloud(tmp_path / "out" / "table" / "cloud.ply", analytic_scene.cloud())
     for file in urdf.parent.iterdir():
         shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -488,4 +465,4 @@ def test_manual_of_maps_runs(scene: "SceneMap", urdf: Path, tmp_path: Path, monk
     for block in blocks:
         exec(block, names)
     assert names["sample"].unknown.tolist() == [False, True, True]
-    assert "warmth" in names["warm"].properties
+    assert names["robot"].joint_names == ("turn", "bend", "push")

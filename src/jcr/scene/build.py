@@ -7,8 +7,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray
 from threadpoolctl import threadpool_limits
 
 from jcr.errors import InputError
@@ -32,14 +30,12 @@ def build_scene(
     cloud: PointCloud,
     options: MapOptions | None = None,
     progress: Progress | None = None,
-    values: dict[str, Float[ndarray, "n d"]] | None = None,
     device: str = "cpu",
 ) -> SceneMap:
     """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
 
-    `values` are other properties of the cloud's n points by name, (n,d) each, which the networks learn, too. Raises
-    InputError if fewer than 100 points lie in the workspace, or a number is not finite. The same error is raised for
-    `values` with the preset "paper". `device` is a torch device, such as "cuda".
+    Raises InputError if fewer than 100 points lie in the workspace, or a number is not finite. `device` is a torch
+    device, such as "cuda".
     """
     options = options or MapOptions()
     for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
@@ -58,14 +54,11 @@ def build_scene(
         carved = time.perf_counter()
         history = {"preset": options.preset, "carving_s": f"{carved - start:.3f}"}
         if options.preset == "paper":
-            if values:
-                raise InputError("the preset paper learns no further values; leave the values out")
             learnt = train_paper(cloud, seed=options.map_seed, box=box, max_seconds=options.max_seconds)
             fields = Fields(list(learnt.values())).to(device)
         else:
-            rays = workspace_rays(cloud, values or {}, box, cell, device)
-            heads = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
-            heads |= {"label": len(cloud.label_names)} if "label" in rays.targets else {}
+            rays = workspace_rays(cloud, box, cell, device)
+            heads = {"color": 3} | ({"label": len(cloud.label_names)} if "label" in rays.targets else {})
             lattices, generator = feature_lattices(seen), torch.Generator().manual_seed(options.map_seed)
             occupancy, surface = (
                 Field(own, HIDDEN, seen.box, lattices, grids=grids, generator=generator)

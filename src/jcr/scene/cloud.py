@@ -41,7 +41,7 @@ def point_cloud(
 ) -> PointCloud:
     """Return the confident points of the depth images in the base frame, with colour, label, std (m) and image of each.
 
-    `options` set the least confidence or its percentile, and the largest number of points. `labels` (m,h,w) are indices
+    `options` set the percentile of the least confidence, and the largest number of points. `labels` (m,h,w) are indices
     into `label_names`, 0 = none, at the pixels of the m registered images' depth. None gives label 0 to all points.
     Raises InputError if no point has enough confidence.
     """
@@ -51,16 +51,14 @@ def point_cloud(
     keep = confidence > 0
     # Only points from matching alone are tested by percentile: other points passed tests of their planes.
     alone = keep if dense.reason is None else keep & (dense.reason == MATCHED)
-    if options.confidence_threshold is not None:
-        keep &= confidence >= options.confidence_threshold
-    elif alone.any():
+    if alone.any():
         keep &= ~alone | (confidence >= np.percentile(confidence[alone], options.confidence_percentile))
     pixel = np.flatnonzero(keep)
     if len(pixel) == 0:
         best = float(confidence.max()) if confidence.size else 0.0
         raise InputError(
             f"{capture.folder}: no point is confident enough for a map (the best confidence is {best:.3g}); "
-            "lower --confidence-threshold or add images with more overlap"
+            "lower --confidence-percentile or add images with more overlap"
         )
     if len(pixel) > options.max_points:
         draw = np.random.default_rng(options.cloud_seed)

@@ -12,8 +12,6 @@ class CloudOptions:
 
     confidence_percentile: Annotated[float, tyro.conf.arg(metavar="PERCENT")] = 20.0
     """Drop this share (%) of the points that have only matching or a prediction as support, least confident first."""
-    confidence_threshold: float | None = None
-    """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
     max_points: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 200_000
     """Keep at most this many points, drawn evenly over the pixels of all images."""
     cloud_seed: int = 0

@@ -27,7 +27,6 @@ class PaperField(Field):
 
 def train_paper(
     cloud: PointCloud,
-    weighted: bool = False,
     steps: int = 1000,
     seed: int = 0,
     box: np.ndarray | None = None,
@@ -35,7 +34,7 @@ def train_paper(
 ) -> dict[str, PaperField]:
     """Return trained networks by property: "occupancy", "color" and, if the cloud has several labels, "label".
 
-    If `weighted`, the confidence of a point is its weight in the loss. `box` are lower and upper corner (m, base frame)
+    `box` are lower and upper corner (m, base frame)
     of the workspace; None computes them from the cloud. The training ends after `steps` steps or `max_seconds`. The
     loss is the sum of three terms: squared error of colours, cross-entropy of labels, and binary cross-entropy of
     occupancy. Points are occupied, and as many positions drawn uniformly in the workspace are free.
@@ -45,7 +44,6 @@ def train_paper(
     generator = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(box, dtype=torch.float32)
     x = torch.tensor(cloud.points_in_base[inside], dtype=torch.float32)
-    weight = torch.tensor(cloud.confidence[inside] if weighted else np.ones(len(x)), dtype=torch.float32)
     color, label = torch.tensor(cloud.color[inside] / 255).float(), torch.tensor(cloud.label[inside])
     outputs = {"occupancy": 1, "color": 3} | ({"label": n} if (n := len(cloud.label_names)) > 1 else {})
     fields = {name: PaperField(torch.stack([low, high]), name, n, generator) for name, n in outputs.items()}
@@ -60,6 +58,6 @@ def train_paper(
             error = error + F.cross_entropy(out["label"], label[rows], reduction="none")
         free = F.softplus(fields["occupancy"](negatives)["occupancy"]).mean()
         optimizer.zero_grad()
-        ((weight[rows] * error).sum() / weight[rows].sum() + free).backward()
+        (error.mean() + free).backward()
         optimizer.step()
     return {name: field.requires_grad_(False).eval() for name, field in fields.items()}

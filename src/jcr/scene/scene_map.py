@@ -93,13 +93,6 @@ class Sample:
         return self._answers(label)[0]
 
     @cached_property
-    def values(self) -> dict[str, Any]:
-        """Other properties (n,d) that the map was trained with, by name; NaN outside of the workspace."""
-        further = [name for name in self._map.properties if name not in ("occupancy", "color", "label")]
-        fields = self._map.fields
-        return {name: self._inside(lambda x, name=name: fields(x, (name,))[name]) for name in further}
-
-    @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
         """Values of `occupancy` (n,) and `unknown` (n,), which are computed together."""
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
@@ -164,7 +157,7 @@ class SceneMap:
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
         self.properties = tuple(name for field in fields.of for name in field.heads)
-        """Names of the properties: occupancy, color, and label and other values if the map was trained with them."""
+        """Names of the properties: occupancy, color, and label if the map was trained with labels."""
         for field in fields.of:
             if "occupancy" in field.heads and len(field.tables):
                 field.expand()
@@ -188,17 +181,6 @@ class SceneMap:
         """Return a copy of the map on a device, e.g. "cuda", which then computes the queries."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
         return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
-
-    def field(self, x_in_base: Float[ndarray, "n 3"] | Float[Tensor, "n 3"]) -> dict[str, Any]:
-        """Return the raw outputs of the networks at points (n,3) m in the base frame: (n,outputs) for each property.
-
-        Occupancy and labels are logits, other properties plain values. Unseen space is not considered.
-        """
-        x = self._points(x_in_base, "points")
-        answers = in_chunks(lambda x: tuple(self.fields(x, self.properties).values()), x)
-        if not isinstance(x_in_base, Tensor):
-            answers = tuple(answer.cpu().numpy() for answer in answers)
-        return dict(zip(self.properties, answers, strict=True))
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
@@ -238,30 +220,6 @@ class SceneMap:
         state = torch.where(surface, OCCUPIED, torch.where(any_, UNKNOWN, FREE)).to(torch.uint8)
         return state.cpu().numpy().reshape(batch)
 
-    def check_segments(
-        self,
-        starts_in_base: ArrayLike,
-        ends_in_base: ArrayLike,
-        radii: ArrayLike | float,
-        unknown: Unknown = "occupied",
-    ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether spheres collide while their centres move on lines from starts to ends (…,3), m, base frame.
-
-        `radii` (m), `unknown` and the result (…) are those of `check_spheres`. Spheres are tested at steps of half a
-        map cell (`cell`). A corner of an obstacle may therefore be inside the swept volume by r - sqrt(r² - (cell/4)²)
-        without being detected. This is 0.2 mm for a radius r of 2 cm and the default cell.
-        """
-        starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)
-        if starts.ndim == 0 or starts.shape[-1] != 3 or starts.shape != ends.shape:
-            raise InputError(f"segments: shapes {starts.shape} and {ends.shape}; give (…, 3) twice")
-        longest = float(np.linalg.norm(ends - starts, axis=-1).max(initial=0.0))
-        if not np.isfinite(longest):
-            raise InputError("segments: an end is not finite; remove such segments")
-        share = np.linspace(0.0, 1.0, int(np.ceil(longest / self.seen.cell)) + 1)
-        centers = starts[..., None, :] + share[:, None] * (ends - starts)[..., None, :]
-        along = np.broadcast_to(np.asarray(radii, np.float32)[..., None], centers.shape[:-1])
-        return _worst(self.check_spheres(centers, along, unknown), unknown)
-
     def check_robot(
         self,
         robot: str | Path | RobotSpheres,
@@ -283,7 +241,11 @@ class SceneMap:
         centers = spheres.centers(joint_values)
         if base_from_robot is not None:
             centers = apply(require_rigid(np.asarray(base_from_robot, float), "base_from_robot"), centers)
-        return _worst(self.check_spheres(centers, spheres.radii, unknown), unknown)
+        states = self.check_spheres(centers, spheres.radii, unknown)
+        if unknown != "report":
+            return np.asarray(states.any(-1))
+        rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too
+        return np.asarray(rank[rank[states].max(-1, initial=0)])
 
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
@@ -370,15 +332,3 @@ def digest(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         total.update(name.encode() + tensors[name].numpy().tobytes())
     return total.hexdigest()
-
-
-def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
-    """Combine the results of k spheres into one: OCCUPIED if any is occupied, else UNKNOWN if any is, else FREE.
-
-    The spheres are the last axis of `states`, which the result (*batch) lacks. If `unknown` is not "report", the
-    results are booleans; the result is then True if any sphere collides.
-    """
-    if unknown != "report":
-        return np.asarray(states.any(-1))
-    rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too
-    return np.asarray(rank[rank[states].max(-1, initial=0)])

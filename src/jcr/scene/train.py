@@ -49,7 +49,7 @@ class Rays:
     measured: Float[Tensor, " n"]
     """1 if the ray shows free space, 0 if not (see `PointCloud.cleared`)."""
     targets: dict[str, Tensor]
-    """Properties of the points to be learnt: color (n,3) in [0, 1], label (n,), other values (n,d)."""
+    """Properties of the points to be learnt: color (n,3) in [0, 1], and label (n,) if there are labels."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
         """Return the rays of the given rows, a tensor of indices or a slice."""
@@ -100,17 +100,15 @@ def rows_inside(cloud: PointCloud, box: Float[ndarray, "2 3"]) -> Int[ndarray, "
 
 def workspace_rays(
     cloud: PointCloud,
-    values: dict[str, Float[ndarray, "n d"]],
     box: Float[ndarray, "2 3"],
     cell: float,
     device: str,
 ) -> Rays:
-    """Return the training rays of the points inside `box` (m), with colour, label and `values` of each point as targets.
+    """Return the training rays of the points inside `box` (m), with colour and label of each point as targets.
 
-    `box` are lower and upper corner (base frame), and `cell` is the side (m) of a map cell. `values` are other
-    properties of the cloud's n points by name, (n,d) each. The weight of a point is proportional to w / (1 + (margin² +
-    depth_std²) / cell²). Here margin and depth_std are its standard deviations (m) from calibration and depth. The
-    factor w is its confidence divided by the median confidence, limited to 0.25 to 4.
+    `box` are lower and upper corner (base frame), and `cell` is the side (m) of a map cell. The weight of a point is
+    proportional to w / (1 + (margin² + depth_std²) / cell²). Here margin and depth_std are its standard deviations (m)
+    from calibration and depth. The factor w is its confidence divided by the median confidence, limited to 0.25 to 4.
     """
     inside = rows_inside(cloud, box)
     x, origin = cloud.points_in_base[inside], cloud.camera_centers_in_base[cloud.image[inside]]
@@ -128,10 +126,6 @@ def workspace_rays(
         return torch.as_tensor(array, dtype=torch.float32, device=device)
 
     targets = {"color": tensor(cloud.color[inside] / np.float32(255))}
-    for name, value in values.items():
-        if len(value) != len(cloud.points_in_base) or value.ndim != 2 or not np.isfinite(value).all():
-            raise InputError(f"values {name!r}: one finite row per point is needed, got shape {value.shape}")
-        targets[name] = tensor(value[inside])
     if len(cloud.label_names) > 1:
         targets["label"] = torch.as_tensor(cloud.label[inside], dtype=torch.int64, device=device)
     return Rays(
