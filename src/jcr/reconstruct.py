@@ -242,7 +242,7 @@ class ReconstructOptions:
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
     """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
     these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
-    circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     features: Literal["auto", "sift", "xfeat"] = "auto"
     """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
     texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""

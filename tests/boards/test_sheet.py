@@ -64,7 +64,7 @@ def test_a_printed_board_is_found_whole_and_at_its_size(spec: str):
             "charuco:12x9:0.020:0.015:DICT_4X4_50",
             "need 54 markers, but DICT_4X4_50 has 50; choose DICT_4X4_100",
         ),
-        ("circles:4x11:0.020", "prints charuco"),
+        ("apriltag:0.050:36h11", "prints charuco"),
         ("charuco:7x5:30:22:DICT_4X4_50", "30 mm is 0.030"),
     ],
 )

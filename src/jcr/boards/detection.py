@@ -19,7 +19,6 @@ from jcr.errors import InputError
 KINDS = (
     "charuco:7x5:0.030:0.022:DICT_4X4_50 (squares across x down, square and marker in metres)",
     "chessboard:9x6:0.025 (inner corners, square in metres)",
-    "circles:4x11:0.020 (asymmetric: circles in a row x rows, half the distance within a row in metres)",
     "aruco:0.050:DICT_4X4_50 and apriltag:0.050:36h11 (any number of tags, side of the black square in metres)",
 )
 INK = 120
@@ -60,7 +59,7 @@ class Board:
     name: str
     detect: Detector
     side: float
-    """Side of a square or tag (circles: half their distance within a row), m; 1 if it is unknown."""
+    """Side of a square or tag, m; 1 if it is unknown."""
     size_std: float | None
     """Relative standard deviation of the size; None: the side is unknown and is the unit of length."""
 
@@ -84,8 +83,6 @@ def boards(spec: str) -> list[Board]:
                     detectors[name] = _charuco((across, down), *lengths, _tags(tags), legacy)
             case "chessboard", [count, side]:
                 detectors = {spec: _chessboard(_count(count), _length(side))}
-            case "circles", [count, side]:
-                detectors = {spec: _circles(_count(count), _length(side))}
             case "aruco", [side, tags]:
                 detectors = {spec: _single_tags(_length(side), _tags(tags))}
             case "apriltag", [side, tags]:
@@ -179,7 +176,8 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
             f"a chessboard of {across}x{down} inner corners looks the same after a rotation by 180°; use one with an "
             "odd and an even side"
         )
-    x_in_board = _grid(across, down) * square
+    row, column = np.indices((down, across)).reshape(2, -1)
+    x_in_board = square * np.column_stack([column, row, 0 * row])
 
     def detect(grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -198,33 +196,6 @@ def _chessboard(count: tuple[int, int], square: float) -> Detector:
         return [Sighting(0, tuple(range(across * down)), x_in_board, x_px)]
 
     return detect
-
-
-def _circles(count: tuple[int, int], spacing: float) -> Detector:
-    """Return the detector of an asymmetric grid of `count` circles (in a row, rows) with rows `spacing` m apart.
-
-    Circles in a row are twice `spacing` apart, and every second row is displaced by `spacing`.
-    """
-    across, down = count
-    x_in_board = _grid(across, down)
-    x_in_board[:, 0] = 2 * x_in_board[:, 0] + x_in_board[:, 1] % 2
-    x_in_board *= spacing
-    index, blobs = tuple(range(across * down)), cv2.SimpleBlobDetector.Params()
-    blobs.minArea, blobs.maxArea, blobs.minDistBetweenBlobs = 20.0, 1e5, 4.0
-    finder = cv2.SimpleBlobDetector.create(blobs)
-
-    def detect(grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
-        flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
-        found, centers = cv2.findCirclesGrid(grey, count, flags=flags, blobDetector=finder)
-        return [Sighting(0, index, x_in_board, centers.reshape(-1, 2).astype(np.float64))] if found else []
-
-    return detect
-
-
-def _grid(across: int, down: int) -> Float[ndarray, "k 3"]:
-    """Return the points (column, row, 0) of a grid of `across` columns and `down` rows with spacing 1, row by row."""
-    row, column = np.indices((down, across)).reshape(2, -1).astype(float)
-    return np.column_stack([column, row, 0 * row])
 
 
 def _single_tags(side: float, tags: cv2.aruco.Dictionary) -> Detector:
