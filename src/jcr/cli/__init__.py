@@ -63,7 +63,6 @@ base frame, from images of a wrist camera and the gripper pose at each.
 
 jcr COMMAND --help     arguments, options and examples of a command
 jcr --version          the version
-jcr --tyro-write-completion bash FILE  a script that completes commands, options and files; also zsh, fish
 
 for example:
   jcr run captures/table out/table
@@ -127,14 +126,11 @@ def _dispatched(arguments: Sequence[str]) -> int:
 
         sys.stdout.write(f"jcr {__version__}\n")
         return 0
-    if name != "--tyro-write-completion" and name not in COMMANDS:
+    if name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
         raise InputError(f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (--help)")
-    from jcr.cli.usage import parsed, write_completion
+    from jcr.cli.usage import parsed
 
-    if name == "--tyro-write-completion":
-        write_completion({name: command(name) for name in COMMANDS}, arguments)
-        return 0
     try:
         record = parsed(command(name), f"jcr {name}", rest)
     except SystemExit as end:  # after --help

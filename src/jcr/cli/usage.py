@@ -7,12 +7,11 @@ import io
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
-from pathlib import Path
-from typing import Annotated, Any, Union, get_type_hints
+from typing import Any, get_type_hints
 
 import tyro
 from tyro import _errors
@@ -28,8 +27,6 @@ CONFIGURATION = (
 """Settings of tyro for the conversion of a command's fields to options."""
 WIDEST = 120
 """Largest width of the help's paragraphs in columns, also on a wider terminal."""
-SHELLS = ("bash", "zsh", "tcsh", "fish")
-"""Shells for which tyro writes a completion script."""
 
 
 def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
@@ -84,23 +81,6 @@ def _wrapped_paragraphs() -> Iterator[None]:
         wrapped = (textwrap.fill(line, width) if line[:1].isalpha() else line for line in lines)
         if printed.getvalue():  # writing even an empty text fails on a full disk
             output.write("\n".join(wrapped))
-
-
-def write_completion(records: Mapping[str, type], arguments: Sequence[str]) -> None:
-    """Write a shell script that completes all commands and options, as `--tyro-write-completion SHELL FILE` requests.
-
-    `records` are the classes of the commands by name. Raises InputError for an unknown shell, or if FILE is missing.
-    """
-    if len(arguments) != 3 or arguments[1] not in SHELLS:
-        raise InputError(f"{arguments[0]}: give a shell ({', '.join(SHELLS)}) and the file of the script")
-    commands = tuple(Annotated[record, tyro.conf.subcommand(name)] for name, record in records.items())
-    with suppress(SystemExit):
-        parsed(Union[commands], "jcr", arguments)  # noqa: UP007
-    script = Path(arguments[2])
-    # tyro 1.0 keeps a line break of a docstring, which the shell then takes for another completion.
-    lines = script.read_text("utf-8").split("\n")
-    whole = (line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC") else line for line in lines)
-    script.write_text("\n".join(whole), "utf-8")
 
 
 def _flags(record: Any) -> Iterator[str]:

@@ -1,6 +1,5 @@
 """Commands that use a run: map, export, query, measure and view."""
 
-import io
 import sys
 import threading
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from jcr.cli.output import Output, warn
 from jcr.errors import InputError, RejectedError
 from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
-from jcr.files import write_bytes, write_text
+from jcr.files import write_text
 from jcr.progress import progress_bars
 from jcr.rounding import decimals_of
 from jcr.scene.options import CloudOptions, MapOptions
@@ -120,7 +119,7 @@ class QueryCommand:
 
     for example:
       jcr query out/table points.csv
-      jcr query out/table cloud.ply --write answers.npy
+      jcr query out/table cloud.ply --write answers.csv
       jcr query out/table points.npy --unknown occupied --json
     """
 
@@ -129,8 +128,8 @@ class QueryCommand:
     points: Annotated[Path, tyro.conf.Positional]
     """.csv (three columns, header line optional), .npy of shape (n, 3), or .ply."""
     write: Path | None = None
-    """File to write, .csv or .npy (a structured array); by default points.answers.csv beside the points, or none with
-    --json, which prints the answers."""
+    """File to write, .csv; by default points.answers.csv beside the points, or none with --json, which prints the
+    answers."""
     unknown: Literal["occupied", "free", "report"] = "report"
     """Treatment of unseen space: occupied (solid), free (empty), or report (occupancy 0.5)."""
     output: Output = field(default_factory=Output)
@@ -160,16 +159,10 @@ class QueryCommand:
                 answers[name] = [None if value != value else value for value in rounded.tolist()]
         if self.write or not self.output.json:
             path = self.write or self.points.with_suffix(".answers.csv")
-            rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
-            if path.suffix == ".npy":
-                buffer = io.BytesIO()
-                np.save(buffer, np.asarray(rows))
-                write_bytes(path, buffer.getvalue())
-            elif path.suffix == ".csv":
-                lines = (_FORMATS % tuple(row) for row in rows.tolist())
-                write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
-            else:
-                raise InputError(f"{path}: answers are written as .csv or .npy")
+            if path.suffix != ".csv":
+                raise InputError(f"{path}: answers are written as .csv")
+            lines = (_FORMATS % row for row in zip(*(column.tolist() for column in columns), strict=True))
+            write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
             summary = f"wrote {path}: {summary}"
         self.output.result([summary], answers)
         return 0
