@@ -16,7 +16,6 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
-from PIL import ExifTags, Image
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -53,8 +52,6 @@ from jcr.sfm.model import (
     write_database,
 )
 
-_FILM_DIAGONAL_MM = 43.27
-"""Diagonal of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
 _START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
 """Initial focal lengths for unknown intrinsics, as multiples of the long side. COLMAP's 1.2 alone fails on two of three
 real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
@@ -204,14 +201,7 @@ def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple
     given, warnings = usable_intrinsics(capture.intrinsics)
     if given:
         return [given], True, warnings
-    # The 35 mm equivalent focal length of EXIF comes first if there is one, then usual ones.
-    width, height = capture.image_size
-    with Image.open(capture.folder / capture.images[0]) as opened:
-        exif = opened.getexif().get_ifd(ExifTags.IFD.Exif)
-    focal_35mm = exif.get(ExifTags.Base.FocalLengthIn35mmFilm)
-    diagonal = math.hypot(width, height) / max(width, height)
-    focals = [focal_35mm / _FILM_DIAGONAL_MM * diagonal] if focal_35mm else []
-    return [guessed_intrinsics((width, height), f) for f in (*focals, *_START_FOCALS)], False, warnings
+    return [guessed_intrinsics(capture.image_size, focal) for focal in _START_FOCALS], False, warnings
 
 
 def map_images(
