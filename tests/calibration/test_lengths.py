@@ -283,8 +283,3 @@ def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
         read_depth_images(folder / "images/0.png", (30, 20))
     with pytest.raises(InputError, match="align depth"):
         read_depth_images(folder / "depth/0.png", (60, 40))
-    (folder / "capture.json").unlink()
-    rows = "\n".join(",".join([f"{k}.png", *map(str, [0.1 * k, 0, 0.3, 0, 0.1 * k, 0])]) for k in range(4))
-    (folder / "poses.csv").write_text("image,x,y,z,roll,pitch,yaw\n" + rows + "\n")
-    table = read_capture(folder)
-    assert table.depths == tuple(f"depth/{k}.png" for k in range(4))

@@ -35,8 +35,6 @@ fourteen real captures the ratio is below 0.1 for images of one place with noise
 a board that fills a third of them, and above 0.75 between places."""
 USUAL_GREY = 2.0
 """Smallest contrast (grey levels) by which details are normalised; noise of 4 levels has 0.6 after the filter."""
-DEPTH = "depth"
-"""Folder of depth images: 16-bit PNG in mm, aligned with the colour images, 0 where no depth was measured."""
 JPEG_QUALITY = 80
 DARK, BRIGHT = 12, 243
 """Mean grey levels (0 to 255) below and above which an image is too dark or too bright to be used."""

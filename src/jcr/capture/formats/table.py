@@ -13,7 +13,6 @@ from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.controllers import CONVENTIONS, checked_rows, tolerated
 from jcr.capture.formats import pose_lists
 from jcr.capture.formats.pose_lists import usual_name
-from jcr.capture.images import DEPTH
 from jcr.capture.options import ConventionName, ReadOptions
 from jcr.capture.pairing import PoseTable, pair_with_images, stamp_ns
 from jcr.capture.plain_files import number_of, read_lines, read_npy, shown, split_cells
@@ -47,8 +46,8 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> Capture:
     """Read a capture from a file of gripper poses, or a folder with such a file, and the images in the same folder.
 
-    The images may also be in its subfolder images/. Depth images (depth/) and intrinsics (camera_info.yaml) in the
-    folder are read if they exist. Raises InputError if there is no such file or no image for it.
+    The images may also be in its subfolder images/. Intrinsics (camera_info.yaml) in the folder are read if they exist.
+    Raises InputError if there is no such file or no image for it.
     """
     file = options.poses or find_table(path)
     if file is None:
@@ -57,15 +56,12 @@ def read(path: Path, options: ReadOptions) -> Capture:
     table = read_pose_table(file, options)
     images, poses, faults, notes = pair_with_images(folder, file, table, options)
     capture, _ = checked_capture(folder, images, poses, str(file), faults)
-    names = [f"{DEPTH}/{Path(name).stem}.png" for name in capture.images]
-    depths = tuple(name if (folder / name).is_file() else None for name in names)
     info = options.camera_info or folder / CAMERA_INFO
     known = options.camera_info is not None or info.is_file()
     return replace(
         capture,
         source=file,
         notes=(*notes, *capture.notes),
-        depths=depths if any(depths) else None,
         intrinsics=read_camera_info(info, capture.image_size) if known else None,
     )
 
