@@ -36,8 +36,6 @@ MAP_STD = (4e-3, np.radians(0.25))
 """Standard deviations (m, rad) of a localised pose by errors of map and intrinsics, not in its covariance."""
 APART = float(chi2.isf(1e-6, 6))
 """Squared Mahalanobis distance above which two poses of a camera differ."""
-AT_A_FRAME = (0.01, np.radians(1.0))
-"""Distance (m, rad) to a pose of the wrist camera below which a camera stated as fixed is likely the wrist camera."""
 EXACT_SCALE = 1e-4
 """Assumed relative standard deviation of the scale between two cameras of one reconstruction."""
 LEAST_POSES = 3
@@ -163,15 +161,8 @@ class Rigs:
         if seen.camera.mount == "gripper":
             return self._on_same_gripper(seen)
         place = seen.places[int(np.trace(seen.covariances, axis1=1, axis2=2).argmin())]
-        seen = replace(seen, rig=np.full(len(seen.used), len(self.poses)))
         self.poses.append(place)
-        metres, radians = _apart(self.known.recon_from_camera, place)
-        near = np.flatnonzero((metres < AT_A_FRAME[0]) & (radians < AT_A_FRAME[1]))
-        if not len(near):
-            return seen
-        image, own = self.case.capture.images[self.rows[near[0]]], self.case.capture.camera_name
-        at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
-        return replace(seen, findings=(*seen.findings, at_own))
+        return replace(seen, rig=np.full(len(seen.used), len(self.poses) - 1))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Return the views of another camera on the own gripper; each image gets the rig of the own image taken with it.
@@ -203,8 +194,8 @@ class Rigs:
                 rig = rig[:first] if before else rig[first:]
                 seen = seen.without(dict.fromkeys(part.tolist(), "the camera moved on the gripper"))
         wrist = self.known.recon_from_camera[rig]
-        metres, radians = _apart(wrist[:, None], wrist)
-        if not ((metres > SAME_PLACE[0]) | (radians > SAME_PLACE[1])).any():
+        apart = np.linalg.norm(step_between(wrist[:, None], wrist).reshape(-1, 2, 3), axis=-1)
+        if (apart <= SAME_PLACE).all():
             return seen.refused(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
         on_rig = inverse(wrist) @ seen.places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
@@ -277,11 +268,3 @@ def fit_views(
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, camera_errors="none")
     known = (scale_prior(1.0, scale_std),)
     return found, effects_of_fit(carrier, seen.places, found, seen.names, priors=known)
-
-
-def _apart(
-    places: Float[ndarray, "*#k 4 4"], others: Float[ndarray, "*#k 4 4"]
-) -> tuple[Float[ndarray, "..."], Float[ndarray, "..."]]:
-    """Return the distances (m) and the angles (rad) between two arrays of poses, which broadcast."""
-    step = step_between(places, others)
-    return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)

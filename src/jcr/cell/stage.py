@@ -41,10 +41,6 @@ CONTRADICTS = 5.0
 """Reprojection error of an image, as a multiple of the median of all images, from which it contradicts the pose."""
 LEAST_PX = 1.0
 """Lower bound (px) of the median reprojection error that contradicts a pose, for images up to 1600 px wide."""
-LEAST_SPREAD = 0.05
-"""Smallest share of the image area that the points should span; crowded points determine a pose badly."""
-FAR_FROM_GRIPPER = 0.5
-"""Distance (m) from the gripper frame beyond which a camera is probably not on the gripper."""
 
 
 @one_blas_thread
@@ -234,14 +230,6 @@ def _placement(
     else:
         findings += _uncertain(views.camera, covariance, float(std[0]) / intrinsics.fx)
     used = list(views.used.values())
-    # The span of the points is four standard deviations along their principal axes.
-    sides = [4 * np.sqrt(np.linalg.eigvalsh(np.cov(one.x_px.T))) for one in used]
-    widest = max(float(side.prod()) for side in sides) / float(np.prod(views.camera.image_size))
-    if widest < LEAST_SPREAD:
-        findings.append(Finding.of(FindingKind.POINTS_CROWDED, "warns", "images", value=widest))
-    away = float(np.linalg.norm(transform[:3, 3]))
-    if views.camera.mount == "gripper" and away > FAR_FROM_GRIPPER:
-        findings.append(Finding.of(FindingKind.FAR_FROM_GRIPPER, "warns", "mount", value=away))
     for fault in faults:
         covariance = covariance + fault.covariance[:6, :6]
         rejected = any(one.severity == "rejects" for one in findings) or _uncertain(views.camera, covariance)

@@ -282,9 +282,6 @@ class FindingKind(StrEnum):
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not "
         "rigid, or the images are not of the frames that they stand for",
         help="tighten the mounts; check the frames")
-    FAR_FROM_GRIPPER = "camera far from the gripper", KindRow("cell",
-        "it is {value:.2f} m from the gripper's frame",
-        "check that it is on the gripper, and that the images are of the frames that they stand for")
     IMAGE_MISSES = "image contradicts the camera's place", KindRow("cell",
         "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
         "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
@@ -296,11 +293,6 @@ class FindingKind(StrEnum):
         "the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°",
         help="intrinsics, or more images")
-    AT_ANOTHER_CAMERA = "camera stands where another was", KindRow("cell",
-        "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
-        "not fixed", help="check that the image is its own")
-    POINTS_CROWDED = "points crowded", KindRow("cell", "its points lie in {percent:.0f} % of the image",
-        "more of the scene in view would help")
     STATIC_IMAGES = "images show no motion", KindRow("images",
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
         "by {rotation_deg:.0f}°",
