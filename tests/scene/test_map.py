@@ -369,7 +369,7 @@ def test_spheres_hold_the_shape_and_little_else():
     across = transform(np.eye(3), np.array([0.15, 0, 0.15]))
     shape = trimesh.util.concatenate([box((0.3, 0.03, 0.03)), box((0.03, 0.03, 0.3), across)])
     link_from_shape = transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.1, 0.2, 0.3]))
-    centers, radii = spheres_of_shape(shape, link_from_shape, EXCESS)
+    centers, radii = spheres_of_shape(shape, link_from_shape)
     surface = shape.sample(3000, seed=0)
     low, high = shape.bounds + [[-0.05], [0.05]]
     around = np.random.default_rng(0).uniform(low, high, (5000, 3))
@@ -397,8 +397,6 @@ def test_joints_move_the_spheres_as_in_yourdfpy(urdf: Path):
             mine = robot.link == robot.links.index(name)
             expected = apply(peer.get_transform(name), robot.centers_in_link[mine])
             np.testing.assert_allclose(centers[mine], expected, atol=1e-9)
-    by_name = robot.centers({"push": q[:, 2], "turn": q[:, 0], "bend": q[:, 1]})
-    assert np.array_equal(by_name, robot.centers(q))
     assert robot.centers(q.reshape(2, 2, 3)).shape == (2, 2, len(robot.radii), 3)
 
 
@@ -406,11 +404,12 @@ def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf
     from jcr.scene.robot import load_robot
     from jcr.scene.scene_map import FREE, OCCUPIED, UNKNOWN
 
+    robot = load_robot(urdf)
     # The foot stands on the table, behind the ball as seen along x.
     base_from_robot = transform(np.eye(3), BALL_CENTER * [1, 1, 0] + [-0.13, 0, 0.01])
 
     def ask(q: np.ndarray, unknown: str = "report", ignore: tuple[str, ...] = ("foot", "upper")) -> list:
-        return scene.check_robot(urdf, q, unknown, base_from_robot, ignore).tolist()
+        return scene.check_robot(robot, q, unknown, base_from_robot, ignore).tolist()
 
     above, into = [0.0, 0.0, 0.0], [0.0, 0.75, 0.05]
     assert ask(np.array([above, into])) == [FREE, OCCUPIED]
@@ -422,7 +421,7 @@ def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf
     assert ask(out_of_the_box, "occupied") is True
     assert ask(out_of_the_box, "free") is False
     many = np.tile(above, (4, 5, 1))
-    assert scene.check_robot(load_robot(urdf), many, "free", base_from_robot, ("foot",)).shape == (4, 5)
+    assert scene.check_robot(robot, many, "free", base_from_robot, ("foot",)).shape == (4, 5)
 
 
 def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urdf: Path, tmp_path: Path):
@@ -430,10 +429,7 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
 
     robot = load_robot(urdf)
     wrong = {
-        "no such URDF": (tmp_path / "none.urdf", np.zeros(3)),
         r"expected \(…, 3\), for turn, bend, push": (robot, np.zeros(4)),
-        "elbow": (robot, {"turn": 0.0, "bend": 0.0, "push": 0.0, "elbow": 1.0}),
-        "push": (robot, {"turn": 0.0, "bend": 0.0}),
         "not finite": (robot, np.array([0.0, np.nan, 0.0])),
         "arm7": (robot, np.zeros(3), "occupied", None, ("arm7",)),
         "base_from_robot": (robot, np.zeros(3), "occupied", np.diag([2.0, 2, 2, 1])),
@@ -441,6 +437,8 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urd
     for words, arguments in wrong.items():
         with pytest.raises(InputError, match=words):
             scene.check_robot(*arguments)
+    with pytest.raises(InputError, match="no such URDF"):
+        load_robot(tmp_path / "none.urdf")
     broken = tmp_path / "broken.urdf"
     robots = {  # the second one's mesh is not beside it
         "not a readable URDF": "<robot><link",

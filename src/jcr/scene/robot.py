@@ -1,6 +1,5 @@
 """Spheres that cover the collision shapes of a robot's URDF, and their positions at given joint values."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from jaxtyping import Float, Int, Integer
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from jcr.capture.urdf_chain import joints_to, load_urdf
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 VOXELS = 100_000
 """Largest number of voxels in the bounding box of a shape."""
 
-JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
-"""Joint values (rad, or m of sliding joints) in the order of `RobotSpheres.joint_names`, or by joint name."""
+EXCESS = 0.01
+"""Length (m) by which spheres exceed the shape that they cover."""
 Joint = tuple[int, int, Float[ndarray, "4 4"], Float[ndarray, "3"], bool, int | None, float, float]
 """Joint of a URDF: row of its parent link, row of its child link, parent_from_joint, unit axis, whether it slides,
 column of its value (None: fixed), factor and offset. The value of a joint that mimics another one is factor times the
@@ -55,20 +55,15 @@ class RobotSpheres:
             self, link=self.link[kept], centers_in_link=self.centers_in_link[kept], radii=self.radii[kept]
         )
 
-    def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:
+    def centers(self, joint_values: ArrayLike) -> Float[ndarray, "*batch s 3"]:
         """Return sphere centres (…,s,3) m in the frame of the robot's root link, for joint values (…,dof) rad or m.
 
-        The values are in the order of `joint_names`, or a mapping from these names to values (…). Raises InputError for
-        wrong names, a wrong number of values, or a value that is not finite.
+        The values are in the order of `joint_names`. Raises InputError for a wrong number of values, or a value that is
+        not finite.
         """
-        names = ", ".join(self.joint_names)
-        if isinstance(joint_values, Mapping):
-            if wrong := set(joint_values) ^ set(self.joint_names):
-                raise InputError(f"joints {sorted(wrong)}: missing or unknown; the robot's are {names}")
-            columns = [np.asarray(joint_values[name], float) for name in self.joint_names]
-            joint_values = np.stack(np.broadcast_arrays(*columns), -1)
         values = np.asarray(joint_values, float)
         if values.ndim == 0 or values.shape[-1] != len(self.joint_names):
+            names = ", ".join(self.joint_names)
             raise InputError(
                 f"joint values of shape {values.shape}: expected (…, {len(self.joint_names)}), for {names}"
             )
@@ -86,8 +81,8 @@ class RobotSpheres:
         return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
 
 
-def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
-    """Load the robot of a URDF file, with spheres that cover its collision shapes and exceed them by about `excess` (m).
+def load_robot(urdf: str | Path) -> RobotSpheres:
+    """Load the robot of a URDF file, with spheres that cover its collision shapes and exceed them by about 1 cm.
 
     Shapes are boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. Raises InputError if
     the file or one of its meshes cannot be read, or if no link has a collision shape.
@@ -95,8 +90,6 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
     path = Path(urdf)
     if not path.is_file():
         raise InputError(f"{path}: no such URDF file")
-    if not excess > 0:
-        raise InputError(f"excess {excess}: give metres above 0, e.g. 0.01")
     import yourdfpy
 
     tree = load_urdf(path)
@@ -119,7 +112,7 @@ def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
             on = graph.transforms.parents[on]
         link_from_shape, name = graph.get(frame_to=node, frame_from=on)
         found[on] += 1
-        center, radius = spheres_of_shape(shapes[name], np.asarray(link_from_shape), excess)
+        center, radius = spheres_of_shape(shapes[name], np.asarray(link_from_shape))
         link.append(np.full(len(radius), links.index(on)))
         centers.append(center)
         radii.append(radius)
@@ -168,24 +161,24 @@ def _joints(robot: "yourdfpy.URDF", links: tuple[str, ...], path: Path) -> tuple
 
 
 def spheres_of_shape(
-    shape: "trimesh.Trimesh", link_from_shape: Float[ndarray, "4 4"], excess: float
+    shape: "trimesh.Trimesh", link_from_shape: Float[ndarray, "4 4"]
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
     """Return centres (s,3) m in the link's frame and radii (s,) m of spheres that together contain a solid shape.
 
     `shape` is in metres, and `link_from_shape` is its pose in the link's frame. The spheres exceed the shape by at most
-    `excess` (m) plus half a voxel. Half a voxel is a sixth of the excess for shapes up to 15 cm. A shape that is a
-    sphere is returned unchanged.
+    EXCESS plus half a voxel. Half a voxel is a sixth of the excess for shapes up to 15 cm. A shape that is a sphere is
+    returned unchanged.
     """
     from trimesh.primitives import Sphere  # takes half a second, and is not needed without a URDF
 
     if isinstance(shape, Sphere):
         ball: Any = shape.primitive
         return apply(link_from_shape, np.asarray(ball.center)[None]), np.array([float(ball.radius)])
-    pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
+    pitch = max(EXCESS / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
     voxels = cast(Any, shape.voxelized(pitch)).fill()
     solid = np.pad(voxels.matrix, 1)
     distance = np.where(solid, pitch * (0.5 - np.asarray(distance_transform_edt(solid))), np.inf)
-    index, radii = cover_with_spheres(distance, pitch, excess)
+    index, radii = cover_with_spheres(distance, pitch, EXCESS)
     return apply(link_from_shape, apply(np.asarray(voxels.transform), index - 1.0)), radii
 
 

@@ -22,7 +22,7 @@ from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
 from jcr.scene.distance import DistanceGrid, distance_grid
 from jcr.scene.fields import Fields, in_chunks
-from jcr.scene.robot import JointValues, RobotSpheres, load_robot
+from jcr.scene.robot import RobotSpheres
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
@@ -222,22 +222,20 @@ class SceneMap:
 
     def check_robot(
         self,
-        robot: str | Path | RobotSpheres,
-        joint_values: JointValues,
+        robot: RobotSpheres,
+        joint_values: ArrayLike,
         unknown: Unknown = "occupied",
         base_from_robot: ArrayLike | None = None,
         ignore_links: tuple[str, ...] = (),
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Test whether a robot collides with the scene at joint values (…,dof); the result is that of `check_spheres`.
 
-        `robot` is a URDF file, which takes seconds to load, or the result of `jcr.load_robot`: spheres that cover its
-        collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names`, or a mapping from these
-        names. `base_from_robot` (4,4) is the pose of the URDF's root link in the base frame of the map; None: identity.
+        `robot` is the result of `jcr.load_robot`. Joint values (rad, m) are in the order of `RobotSpheres.joint_names`.
+        `base_from_robot` (4,4) is the pose of the URDF's root link in the base frame of the map; None: identity.
         `ignore_links` are links that may collide, e.g. the one that stands on the table. Collisions between links of the
-        robot are not tested. Raises InputError as `load_robot` and `RobotSpheres.centers` do.
+        robot are not tested. Raises InputError as `RobotSpheres.centers` does.
         """
-        spheres = robot if isinstance(robot, RobotSpheres) else load_robot(robot)
-        spheres = spheres.without(tuple(ignore_links))
+        spheres = robot.without(tuple(ignore_links))
         centers = spheres.centers(joint_values)
         if base_from_robot is not None:
             centers = apply(require_rigid(np.asarray(base_from_robot, float), "base_from_robot"), centers)
