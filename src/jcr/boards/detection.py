@@ -29,10 +29,8 @@ FEWEST_POINTS = 4
 """Least number of points of a board or tag that an image must show to be used."""
 PRINTED = 0.002
 """Relative standard deviation of a printed board's size."""
-SIDE, MARKER = "SIDE", "MARKER"
-"""Words that replace unknown lengths in a board's name; with SIDE, the unit is the side of a square or tag."""
-RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
-"""Usual ratios of marker to square of a ChArUco board, tried in this order."""
+SIDE = "SIDE"
+"""Word that replaces an unknown side of a square or tag in a board's name; the side is then the unit of length."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +65,10 @@ class Board:
 def boards(spec: str) -> list[Board]:
     """Return the boards that a name such as charuco:7x5:0.03:0.022:DICT_4X4_50 may mean, the one as written first.
 
-    A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. If its marker
-    length is the word MARKER (unknown), there is one board for each of the RATIOS of marker to side. The word SIDE
+    A ChArUco board is also returned in the layout of OpenCV before 4.6 and with columns and rows swapped. The word SIDE
     stands for an unknown side, which is then the unit of length. Raises InputError for a name that means no board.
     """
     kind, *parts = spec.split(":")
-    if MARKER in parts:
-        return [one for ratio in RATIOS for one in boards(spec.replace(MARKER, f"{ratio:g}"))]
     try:
         match kind, parts:
             case "charuco", [count, side, marker, tags]:
