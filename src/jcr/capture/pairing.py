@@ -114,14 +114,11 @@ def _paired_by_name(folder: Path, file: Path, table: PoseTable) -> Paired:
     Folder, slashes, case and file ending of a name may differ from those of the image file.
     """
     assert table.images is not None
-    own: dict[str, list[str]] = {}
+    own, located = dict[str, list[str]](), list[str]()
     for image in image_names(folder):
-        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
-            own.setdefault(key, []).append(image)
-    located = []
+        own.setdefault(Path(image).stem.casefold(), []).append(image)
     for name in table.images:
-        plain = PureWindowsPath(name).name  # splits at both kinds of slashes
-        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
+        like = own.get(PureWindowsPath(name).stem.casefold(), [])  # splits at both kinds of slashes
         places = (name, f"images/{name}", *(like if len(like) == 1 else ()))
         # Unlike Path.is_file, isfile is False for a name that is too long.
         located.append(next((place for place in places if isfile(folder / place)), name))
