@@ -49,8 +49,6 @@ class Faults:
     """Shift of the last row against the first in x."""
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Coefficients s1 to s4 of OpenCV's thin prism."""
-    centre_sags_px: float = 0.0
-    """Motion of the image, by optics on springs, when gravity is along it, in x and in y alike."""
     centre_scatter_px: float = 0.0
     """Standard deviation of the principal point between images, as an image stabiliser leaves it."""
     slip: tuple[float, float] = (0.0, 0.0)
@@ -111,7 +109,7 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     depth = np.median(
         np.einsum("nij,pj->npi", inverse(cameras)[:, 2:], np.insert(points, 3, 1.0, 1))[..., 0], 1
     )
-    optics = optics_of(faults, INTRINSICS, cameras, depth, rng)
+    optics = optics_of(faults, INTRINSICS, depth, rng)
     image, point, x_px = shown_points(
         points, cameras, [INTRINSICS] * images, NOISE_PX, rng, pixels=lambda k, at: optics[k].taken(at)
     )
@@ -219,12 +217,11 @@ class Optics:
 def optics_of(
     faults: Faults,
     believed: Intrinsics,
-    cameras: Poses,
     depth: Float[ndarray, " n"],
     rng: np.random.Generator,
 ) -> list[Optics]:
     """Draw the optics of each image; `depth` (m) is the distance of its scene."""
-    count = len(cameras)
+    count = len(depth)
     share = (depth - depth.mean()) / max(float(np.ptp(depth)), 1e-9)
     focal = np.exp(faults.focal_by_distance * share + faults.focal_scatter * rng.normal(size=count))
     focal *= np.where(np.arange(count) < count / 2, 1.0, 1 + faults.zoom)
@@ -232,10 +229,9 @@ def optics_of(
     real = with_parameters(
         believed, parameters(believed) + np.array([off.get(name, 0.0) for name in parameter_names(believed)])
     )
-    # Gravity, along -z of the base, in camera axes.
-    shift = -faults.centre_sags_px * cameras[:, 2, :2]
+    shift = np.zeros((count, 2))
     if faults.centre_scatter_px:
-        shift = shift + faults.centre_scatter_px * rng.normal(size=(count, 2))
+        shift = faults.centre_scatter_px * rng.normal(size=(count, 2))
     return [
         Optics(believed=believed, real=zoomed(real, float(one)), faults=faults, shift_px=by)
         for one, by in zip(focal, shift, strict=True)

@@ -154,7 +154,7 @@ def draw(scene: Rendered, seed: int, fault: ImageFault, given: bool = True) -> D
     # The images are those of the scene, so the gripper is where they would be of the moved camera and base.
     cameras = scene.base_from_gripper[rows] @ x
     true = inverse(pushes) @ cameras @ inverse(mounts)
-    optics = optics_of(faults, scene.camera, cameras, scene.distance[rows], of_faults)
+    optics = optics_of(faults, scene.camera, scene.distance[rows], of_faults)
     wide = [scene.images[row] for row in rows] if fault.scene is None else scene.changed(rows, fault.scene)
     images = [
         with_noise(taken(one, by.believed_from_px), pixels) for one, by in zip(wide, optics, strict=True)

@@ -50,12 +50,6 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         [5.6],
         0.6,
     ),
-    "image-stabilised optics": (
-        Faults(centre_sags_px=12.0),
-        r"moves with gravity, by ([\d.]+) ± \S+ px",
-        [12.0],
-        0.6,
-    ),
     "slight slip": (
         Faults(slip=(3.6e-3, np.radians(0.8))),
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
@@ -108,7 +102,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
 }
 
 
-OF_CAMERA = [*NAMED][:7]
+OF_CAMERA = [*NAMED][:6]
 
 
 @pytest.mark.parametrize("name", NAMED)

@@ -182,7 +182,7 @@ def two_cameras(nuisances: bool) -> tuple[CellProblem, Problem, State]:
         problem = replace(
             problem,
             freed=np.eye(18 + OF_IMAGE * images + PRISM)[:, 18:],
-            freed_std=np.r_[np.repeat([0.05, 0.3, 0.05, 0.05], images), np.full(PRISM, 0.1)],
+            freed_std=np.r_[np.repeat([0.05, 0.3], images), np.full(PRISM, 0.1)],
         )
     state = State(
         x=np.stack([x for x, _ in cell.starts]),

@@ -138,11 +138,10 @@ def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str
 
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     seen = None if found.expected is None else found.expected.seen
-    images = zip(capture.images, found.sharpness.tolist() or [None] * len(capture), strict=True)
     observed = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
-        "images": [{"image": name, "sharpness": own} for name, own in images],
+        "images": capture.images,
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
         "observability": {name: getattr(found.observability, name) for name in observed},

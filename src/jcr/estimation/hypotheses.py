@@ -58,8 +58,8 @@ class Row:
     """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
 
     The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
-    intrinsics in the units of problem.rows_of; then focal lengths, shears, x and y offsets of its images; then s1 to s4
-    of the thin prism.
+    intrinsics in the units of problem.rows_of; then focal lengths and shears of its images; then s1 to s4 of the
+    thin prism.
     """
 
     kind: FindingKind
@@ -439,7 +439,7 @@ TESTED_IF_GIVEN = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 """Intrinsics that are tested if they were given."""
 TESTED_IF_ESTIMATED = ("fx", "p1", "p2")
 """Intrinsics that are tested of estimated ones, for which fx = fy and p1 = p2 = 0 was assumed."""
-OfImage = Literal["focal", "shear", "x", "y"]
+OfImage = Literal["focal", "shear"]
 """Names of the OF_IMAGE parameters of each image, in the order of the rows of `Problem.directions`."""
 
 
@@ -462,13 +462,13 @@ def tested_intrinsics(model: Adjustment) -> list[str]:
 def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
-    Effects on images are focal lengths, shears (rolling shutter) and offsets by gravity. They include a zoom, with one
-    row for each image at which it may happen. Each has the common error of the focal length as nuisance; offsets and
-    prism also have the principal point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
+    Effects on images are focal lengths and shears (rolling shutter). They include a zoom, with one row for each image
+    at which it may happen. Each has the common error of the focal length as nuisance; the prism also has the principal
+    point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
     prism is tested only if there is one camera.
     """
-    problem, state = model.solution.problem, model.solution.state
-    observations, view = problem.observations, model.solution.images.view
+    problem, view = model.solution.problem, model.solution.images.view
+    observations = problem.observations
     assert observations is not None and model.camera is not None
     camera, mine = (
         problem.cameras[model.camera].intrinsics,
@@ -501,13 +501,6 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
         (FindingKind.ROLLING_SHUTTER_BY_IMAGE, np.eye(m)),
     ):
         yield Row(kind=kind, columns=of_images("shear", shares), nuisance=common, unit=camera.fx)
-    # Gravity in the camera frame: −z of the base.
-    base_from_camera = (
-        state.z[0] @ state.world_from_rig[observations.rig[mine]] @ state.rig_from_camera[model.camera]
-    )
-    down = -base_from_camera[:, 2, :3, None]
-    sag = np.concatenate([of_images("x", down[:, 0]), of_images("y", down[:, 1])], axis=1)
-    yield Row(kind=FindingKind.CENTRE_SAGS, columns=sag, nuisance=of_centre, unit=camera.width)
     places = range(LEAST_ZOOMED, m - LEAST_ZOOMED + 1)
     for k in places:
         after = of_images("focal", ((np.arange(m) >= k) - (m - k) / m)[:, None])

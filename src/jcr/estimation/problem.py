@@ -68,11 +68,11 @@ class Observations:
 
 CELLS = 8
 """Number of cells across an image's width; the features of one cell have correlated errors."""
-OF_IMAGE, PRISM = 4, 4
-"""Number of parameters of each image (focal, shear, x, y), and of the thin prism that all images share (s1 to s4).
+OF_IMAGE, PRISM = 2, 4
+"""Number of parameters of each image (focal, shear), and of the thin prism that all images share (s1 to s4).
 
 Parameters of an image: log of its focal length over its camera's; shear from top to bottom, in focal lengths (rolling
-shutter); offset in x and in y, in image widths. s1 to s4 are those of OpenCV."""
+shutter). s1 to s4 are those of OpenCV."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -210,7 +210,7 @@ class Problem:
     def directions(self) -> Float[ndarray, "r l"]:
         """Directions (columns) in which the parameters of cameras and images may differ from the means of their priors.
 
-        Rows: intrinsics of each camera (camera.parameters); focal lengths of all images, then shears, x and y offsets
+        Rows: intrinsics of each camera (camera.parameters); focal lengths of all images, then shears
         (OF_IMAGE); s1 to s4 of the thin prism. Columns: directions of each camera's prior, then `freed`.
         """
         own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
@@ -417,7 +417,7 @@ def with_observations(problem: Problem, state: State) -> tuple[Problem, State]:
 
 WEAK = 0.3, 0.3, 0.2, 0.2
 """Weak prior standard deviations of fx, fy (relative), cx, cy (image widths): they keep unobservable ones finite."""
-WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3, 0.1, 0.1)
+WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3)
 """Weak prior standard deviations of distortion, thin prism, and the OF_IMAGE parameters of each image."""
 
 
@@ -426,9 +426,9 @@ def rows_of(
 ) -> tuple[Int[ndarray, " e"], Float[ndarray, " e"], Float[ndarray, " e"]]:
     """Return three vectors for the e parameters of a camera, its m images and the prism: rows, units, weak prior std.
 
-    Rows are those of `Problem.directions`: q intrinsics; focal lengths, shears, x and y offsets of the m images; s1 to
-    s4. Units are fx and fy for the focal lengths, the image width for the principal point, else 1. The standard
-    deviations are in these units. `camera` is the camera's index; the problem must have observations.
+    Rows are those of `Problem.directions`: q intrinsics; focal lengths and shears of the m images; s1 to s4. Units are
+    fx and fy for the focal lengths, the image width for the principal point, else 1. The standard deviations are in
+    these units. `camera` is the camera's index; the problem must have observations.
     """
     assert problem.observations is not None
     intrinsics, own, n = problem.cameras[camera].intrinsics, problem.parameters_of[camera], problem.n_images

@@ -65,9 +65,8 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
     off = problem.displacement(state)[problem.parameters_of[-1].stop :]
     of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
     per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
-    width = _of_camera(problem, [camera.width for camera in cameras])
     own_map = np.stack([np.exp(of_images[0]), of_images[1] * per_height], axis=1)
-    projected = centre + _mapped(own_map, from_centre[..., None])[..., 0] + (width * of_images[2:]).T
+    projected = centre + _mapped(own_map, from_centre[..., None])[..., 0]
     projected += problem.prism @ off[-PRISM:]
     columns = problem.columns
     projected += problem.displacements @ state.camera_steps[columns.cameras.stop : columns.boards.start]
@@ -159,14 +158,11 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
     # No column frees parameters of images together with intrinsics, so that these columns are contiguous.
     columns = _slice(directions[first:])
     about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
-    focal, sheared, *offset = of_images[:-PRISM].reshape(OF_IMAGE, problem.n_images, -1)
+    focal, sheared = of_images[:-PRISM].reshape(OF_IMAGE, problem.n_images, -1)
     shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
-    width = _of_camera(problem, [camera.width for camera in view.cameras])
     # Each parameter is added in turn: with hundreds of images one term takes hundreds of megabytes.
     by_image += (own_map[:, :1] * about)[..., None] * focal[image][:, None]
     by_image[:, 0] += shear_px[:, None] * sheared[image]
-    for axis, one in enumerate(offset):
-        by_image[:, axis] += width[:, None] * one[image]
     if of_images[-PRISM:].any():
         by_image += problem.prism @ of_images[-PRISM:]
     return out

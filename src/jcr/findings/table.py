@@ -172,10 +172,6 @@ class FindingKind(StrEnum):
         "the images show a thin-prism distortion of up to {value:.1f} ± {std:~} px: the sensor is "
         "tilted, or the optics are decentred",
         "use the transform with the estimated intrinsics, which have the coefficients s1 to s4", explains=MISFIT)
-    CENTRE_SAGS = "principal point moves with gravity", KindRow("camera",
-        "the principal point moves with gravity, by {value:.1f} ± {std:~} px when it lies in the image"
-        ": the optics are image-stabilised or loose",
-        "switch image stabilisation off, or fix the optics", explains=MISFIT)
     INTRINSICS = "intrinsics contradict the images", KindRow("camera", "the {source} show {shown}",
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
         "resolution, or give no intrinsics (null) to have them estimated}", explains=MISFIT,

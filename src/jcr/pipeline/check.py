@@ -52,8 +52,6 @@ QUICK, QUICK_SIZE_PX = 8, 800
 class Examination:
     """Result of the check of a capture: motion, expected uncertainty, findings, and notes."""
 
-    sharpness: Float[ndarray, " n"]
-    """Variance of the Laplacian of each image, divided by the median; empty for a capture without images."""
     largest_move_m: float
     """Largest distance between the gripper's origins in two poses."""
     largest_rotation_rad: float
@@ -113,13 +111,13 @@ def check_capture(
         moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
         notes.append(f"the gripper moves {moved}: the positions may have been divided by 1000")
     options = CalibrateOptions(robot_noise=robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1])))
-    camera, sharpness, views, shown = None, np.zeros(0), (), _Comparison()
+    camera, views, shown = None, (), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear = errors_of(given), np.arange(len(capture))
         shown = _compare(capture, robot, options, seed, progress, thorough)
     else:
         robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
-        clear, sharpness, remarks = _look(capture, views)
+        clear, remarks = _look(capture, views)
         notes += remarks
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         if look and verdict_of(views) != "rejected":
@@ -138,7 +136,6 @@ def check_capture(
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
     return Examination(
-        sharpness=sharpness,
         largest_move_m=move_m,
         largest_rotation_rad=rotation_rad,
         observability=seen,
@@ -150,22 +147,20 @@ def check_capture(
     )
 
 
-def _look(
-    capture: Capture, views: tuple[Finding, ...]
-) -> tuple[Int[ndarray, " c"], Float[ndarray, " n"], list[str]]:
-    """Return the indices of well exposed sharp images, the sharpness of all n images, and remarks on their exposure.
+def _look(capture: Capture, views: tuple[Finding, ...]) -> tuple[Int[ndarray, " c"], list[str]]:
+    """Return the indices of well exposed sharp images, and remarks on the exposure of the others.
 
-    The sharpness is the variance of the Laplacian, divided by the median of all images. `views` are the findings of
-    `view_findings`, which name the blurred images.
+    `views` are the findings of `view_findings`, which name the blurred images.
     """
-    looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
-    brightness, sharpness = np.array(looks).T
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
-    faults = [exposure_fault(grey) for grey in brightness]
-    pairs = list(zip(capture.images, faults, strict=True))
-    clear = np.flatnonzero([fault is None and name not in blurred for name, fault in pairs])
-    remarks = [f"{name} is {fault}; expose it again" for name, fault in pairs if fault is not None]
-    return clear, sharpness / max(float(np.median(sharpness)), 1e-9), remarks
+    clear, remarks = list[int](), list[str]()
+    for row, name in enumerate(capture.images):
+        brightness, _ = brightness_and_sharpness(read_image(capture.folder / name))
+        if (fault := exposure_fault(brightness)) is not None:
+            remarks.append(f"{name} is {fault}; expose it again")
+        elif name not in blurred:
+            clear.append(row)
+    return np.array(clear, dtype=int), remarks
 
 
 def _compare(

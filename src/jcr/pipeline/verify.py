@@ -29,9 +29,6 @@ from jcr.records import Capture, CellCamera
 from jcr.result import RunResult
 from jcr.sfm.register import register
 
-ROUNDING = 1e-9
-"""Largest difference (m, or element of a rotation matrix) between two poses that count as copies of each other."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Verification(Drift):
@@ -196,13 +193,6 @@ def _in_old_scene(
     )
     if robot.unused is not None:
         notes = [*notes, sentence(robot.unused)]
-    near = np.abs(new.base_from_gripper[:, None] - capture.base_from_gripper).max((2, 3)) < ROUNDING
-    if same := [name for name, is_near in zip(new.images, near.any(1), strict=True) if is_near]:
-        notes = [
-            *notes,
-            f"{', '.join(same)}: the gripper pose is to the last digit one of the calibration; give the pose that the "
-            "robot measures there now, not a copy or the commanded one",
-        ]
     return _judged(found, options, [new.images[row] for row in rows], notes)
 
 

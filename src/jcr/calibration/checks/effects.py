@@ -106,7 +106,6 @@ POLICIES = {
     FindingKind.ZOOM: Policy("images", 1e-6),
     FindingKind.ROLLING_SHUTTER: Policy("images", 1e-6, least_px=3.0),
     FindingKind.ROLLING_SHUTTER_BY_IMAGE: Policy("images", 1e-6, least_px=3.0),
-    FindingKind.CENTRE_SAGS: Policy("mount", 1e-6, least_px=3.0),
     FindingKind.THIN_PRISM: Policy("intrinsics", 1e-6, least_px=1.0),
     FindingKind.INTRINSICS: Policy("intrinsics", 1e-6),
 }
