@@ -15,6 +15,7 @@ import yourdfpy
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from ompl import base, geometric, util
+from scipy.spatial.transform import Rotation
 
 import jcr
 
@@ -27,21 +28,50 @@ STEP_RAD = 0.01
 """Between the joint values that are checked along a motion; it moves the gripper by at most 8 mm."""
 
 
-class Clearance:
-    """Whether the arm touches the mapped scene at joint values (…,6)."""
+SPHERES = (
+    (1, (0, 0, 0.01), (0, 0, 0.05), 3, 0.06),
+    (2, (0, 0, -0.005), (0, 0, 0.355), 13, 0.05),
+    (3, (0.01, 0, 0), (0.27, 0, 0), 10, 0.042),
+    (4, (0.02, 0, 0), (0.06, 0, 0), 3, 0.042),
+    (5, (0.01, 0, 0), (0.03, 0, 0), 2, 0.042),
+    (6, (0.015, 0, 0), (0.045, 0, 0), 2, 0.037),
+    (6, (0.07, 0, 0), (0.11, 0, 0), 3, 0.022),
+)
+"""Spheres that cover the links: the joint that moves them, the first and last centre on the link (m), number, radius."""
 
-    def __init__(self, scene: jcr.SceneMap, arm: jcr.RobotSpheres) -> None:
-        self.scene = scene
-        self.arm = arm.without(("foot",))  # bolted to the table
-        self.gripper = arm.without(tuple(link for link in arm.links if link != "gripper"))
+
+class Clearance:
+    """Whether the arm touches the mapped scene at joint values (…,6); its foot is bolted to the table."""
+
+    def __init__(self, scene: jcr.SceneMap) -> None:
+        self.scene, arm = scene, yourdfpy.URDF.load(ARM, load_meshes=False)
+        self.joints = [arm.joint_map[name] for name in ("mount", *arm.actuated_joint_names)]
+        self.radii = np.concatenate([np.full(count, radius) for *_, count, radius in SPHERES])
+        self.gripper = np.concatenate([np.full(count, joint == 6) for joint, _, _, count, _ in SPHERES])
+
+    def centers(self, joint_values: Float[ndarray, "*batch 6"]) -> Float[ndarray, "*batch s 3"]:
+        """Centres of the spheres in the base frame, m."""
+        poses = [np.asarray(self.joints[0].origin)]
+        for k, joint in enumerate(self.joints[1:]):
+            turn = np.tile(joint.origin, (*joint_values.shape[:-1], 1, 1))
+            about = Rotation.from_rotvec(joint_values[..., k].reshape(-1, 1) * joint.axis).as_matrix()
+            turn[..., :3, :3] = turn[..., :3, :3] @ about.reshape(turn[..., :3, :3].shape)
+            poses.append(poses[-1] @ turn)
+        found = []
+        for joint, first, last, count, _ in SPHERES:
+            rotation, origin = poses[joint][..., :3, :3], poses[joint][..., None, :3, 3]
+            found.append(np.linspace(first, last, count) @ np.swapaxes(rotation, -1, -2) + origin)
+        return np.concatenate(found, axis=-2)
 
     def touches(self, joint_values: Float[ndarray, "*batch 6"]) -> Bool[ndarray, "*batch"]:
         """The gripper may go only where someone has looked; the rest of the arm must clear what was seen.
 
         The images show the table, not the space about the arm's own base.
         """
-        seen = self.scene.check_robot(self.arm, joint_values, unknown="free")
-        return np.asarray(seen | self.scene.check_robot(self.gripper, joint_values, unknown="occupied"))
+        centers, mine = self.centers(joint_values), self.gripper
+        seen = self.scene.check_spheres(centers, self.radii, unknown="free").any(-1)
+        unseen = self.scene.check_spheres(centers[..., mine, :], self.radii[mine], unknown="occupied")
+        return np.asarray(seen | unseen.any(-1))
 
 
 class Motions(base.MotionValidator):
@@ -98,7 +128,7 @@ def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/tabletop")
     util.RNG.setSeed(1)
     util.setLogLevel(util.LogLevel.LOG_ERROR)
-    clearance = Clearance(jcr.load_map(out), jcr.load_robot(ARM))
+    clearance = Clearance(jcr.load_map(out))
     straight = np.linspace(START, GOAL, 100)
     print(f"straight on: touches at {int(clearance.touches(straight).sum())} of {len(straight)} steps")
     path = plan(clearance, START, GOAL)

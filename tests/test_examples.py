@@ -75,7 +75,7 @@ def test_ompl_plans_an_arm_past_mapped_things_without_touching_them(done: Path, 
     planner = example("05_plan_with_ompl")
     planner.util.RNG.setSeed(1)
     planner.util.setLogLevel(planner.util.LogLevel.LOG_ERROR)
-    clearance = planner.Clearance(jcr.load_map(done), jcr.load_robot(planner.ARM))
+    clearance = planner.Clearance(jcr.load_map(done))
     straight = np.linspace(planner.START, planner.GOAL, 100)
     assert truly_touches(straight, true_mesh).sum() > 5
     assert clearance.touches(straight).sum() > 5

@@ -21,7 +21,7 @@ MAY_NEED_TORCH = (
     "export/rrd", "export/volume", "viewer/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""
-NEED_NONE = {"scene/cloud", "scene/map_file", "scene/options", "scene/robot"}
+NEED_NONE = {"scene/cloud", "scene/map_file", "scene/options"}
 """Among these, what a run without a map imports all the same."""
 
 

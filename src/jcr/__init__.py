@@ -9,7 +9,7 @@
 
 Captures      read_capture, check_capture, LiveCalibration
 Calibration   run, calibrate, solve_hand_eye, load_run, compare, verify_run, touch, add_camera
-Map           build_map, load_map, measure, load_robot
+Map           build_map, load_map, measure
 Files         export_run
 Networks      global_align
 Options       RunOptions (reconstruct, calibrate, cloud, map, segment, depth), ReadOptions, ExportOptions

@@ -69,8 +69,6 @@ from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions
 from .scene.options import MapOptions as MapOptions
-from .scene.robot import RobotSpheres as RobotSpheres
-from .scene.robot import load_robot as load_robot
 from .scene.scene_map import Sample as Sample
 from .scene.scene_map import SceneMap as SceneMap
 from .segments.measure import Measurement as Measurement

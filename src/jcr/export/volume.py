@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Integer
 from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
 from jcr.extras import extra
 from jcr.records import PointCloud
-from jcr.scene.robot import cover_with_spheres
 from jcr.scene.scene_map import FREE, OCCUPIED, SceneMap
 from jcr.scene.surface import surface_mesh
 
@@ -96,6 +95,32 @@ def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: E
     distance = scene.query(points.reshape(-1, 3), unknown).distance.reshape(count)
     index, radii = cover_with_spheres(distance, step, excess)
     _write_npz(path, notes, centers=points[tuple(index.T)], radii=radii, unknown=unknown)
+
+
+def cover_with_spheres(
+    distance: Float[ndarray, "x y z"], step: float, excess: float
+) -> tuple[Integer[ndarray, "k 3"], Float[ndarray, " k"]]:
+    """Return the voxel indices of the centres, and radii (m), of spheres that contain every voxel touching solid space.
+
+    `distance` d is the signed distance (m), negative inside, from solid space at the centres of voxels with side `step`
+    (m). A sphere with centre c and radius excess - d(c) exceeds solid space by at most `excess`. The cover is greedy:
+    the deepest voxel that is not yet covered becomes the next centre. A voxel is covered if its whole cube is inside a
+    sphere.
+    """
+    half = 0.5 * np.sqrt(3.0) * step
+    left = distance <= half
+    candidates = np.argwhere(left)
+    candidates = candidates[np.argsort(distance[left], kind="stable")]
+    radii, chosen = excess - distance, []
+    for at in candidates:
+        if left[tuple(at)]:
+            reach = float(radii[tuple(at)] - half) / step
+            low, high = np.maximum(at - int(reach), 0), np.minimum(at + int(reach) + 1, left.shape)
+            x, y, z = np.ogrid[*map(slice, low - at, high - at)]
+            left[*map(slice, low, high)] &= x * x + y * y + z * z > reach * reach
+            chosen.append(at)
+    index = np.array(chosen, dtype=int).reshape(-1, 3)
+    return index, radii[tuple(index.T)].astype(np.float64)
 
 
 def write_glb(path: Path, scene: SceneMap, notes: dict[str, str]) -> None:

@@ -19,10 +19,8 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.files import write_bytes
-from jcr.geometry import apply, require_rigid
 from jcr.scene.distance import DistanceGrid, distance_grid
 from jcr.scene.fields import Fields, in_chunks
-from jcr.scene.robot import RobotSpheres
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
@@ -219,31 +217,6 @@ class SceneMap:
         surface, any_ = self._touches(x, reach, "free"), self._touches(x, reach, "occupied")
         state = torch.where(surface, OCCUPIED, torch.where(any_, UNKNOWN, FREE)).to(torch.uint8)
         return state.cpu().numpy().reshape(batch)
-
-    def check_robot(
-        self,
-        robot: RobotSpheres,
-        joint_values: ArrayLike,
-        unknown: Unknown = "occupied",
-        base_from_robot: ArrayLike | None = None,
-        ignore_links: tuple[str, ...] = (),
-    ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
-        """Test whether a robot collides with the scene at joint values (…,dof); the result is that of `check_spheres`.
-
-        `robot` is the result of `jcr.load_robot`. Joint values (rad, m) are in the order of `RobotSpheres.joint_names`.
-        `base_from_robot` (4,4) is the pose of the URDF's root link in the base frame of the map; None: identity.
-        `ignore_links` are links that may collide, e.g. the one that stands on the table. Collisions between links of the
-        robot are not tested. Raises InputError as `RobotSpheres.centers` does.
-        """
-        spheres = robot.without(tuple(ignore_links))
-        centers = spheres.centers(joint_values)
-        if base_from_robot is not None:
-            centers = apply(require_rigid(np.asarray(base_from_robot, float), "base_from_robot"), centers)
-        states = self.check_spheres(centers, spheres.radii, unknown)
-        if unknown != "report":
-            return np.asarray(states.any(-1))
-        rank = np.array([0, 2, 1], np.uint8)  # of FREE, OCCUPIED, UNKNOWN; maps ranks back to states, too
-        return np.asarray(rank[rank[states].max(-1, initial=0)])
 
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
