@@ -15,7 +15,7 @@ import pytest
 import jcr
 from fake_arms import fake_xarm
 from jcr.geometry import rotation_exp, transform
-from jcr.live.cameras import CameraOptions, apply_options
+from jcr.live.cameras import set_up
 from places import ROOT
 
 POSE = transform(rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.42, -0.11, 0.36]))
@@ -94,40 +94,6 @@ def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its
     assert intrinsics["distortion"] is None
 
 
-FIXED = """
-    import json
-    from types import SimpleNamespace as Fake
-    import pyrealsense2 as rs
-    from jcr.errors import InputError
-    from jcr.live.cameras import CameraOptions, open_camera
-    fixed, refused = [], []
-    sensor = Fake(supports=lambda option: True, get_option_range=lambda option: Fake(min=1, max=1000))
-    sensor.set_option = lambda option, value: fixed.append([str(option), value])
-    lens = Fake(fx=600.0, fy=600.0, ppx=320.0, ppy=240.0, coeffs=[0.0] * 5)
-    stream = Fake(as_video_stream_profile=lambda: Fake(get_intrinsics=lambda: lens))
-    device = Fake(first_color_sensor=lambda: sensor, first_depth_sensor=lambda: Fake(get_depth_scale=lambda: 0.001))
-    profile = Fake(get_device=lambda: device, get_stream=lambda kind: stream)
-    def ended(limit_ms):
-        raise RuntimeError
-    rs.pipeline = lambda: Fake(start=lambda config: profile, stop=lambda: None, wait_for_frames=ended)
-    for options in (CameraOptions(exposure=200.0), CameraOptions(exposure=2000.0), CameraOptions(focus=3.0)):
-        try:
-            with open_camera("realsense", options):
-                pass
-        except InputError as error:
-            refused.append(str(error))
-    print(json.dumps([fixed, refused]))
-"""
-
-
-@pytest.mark.slow
-def test_a_realsense_fixes_its_exposure_and_refuses_a_focus():
-    needs("pyrealsense2")
-    fixed, refused = named_by(FIXED)
-    assert fixed == [["Enable Auto Exposure", 0], ["Exposure", 200.0]]
-    assert "--exposure 2000: this camera takes 1 to 1000" in refused[0] and "fixed focus" in refused[1]
-
-
 class Device:
     """A cv2.VideoCapture that follows some settings and not others."""
 
@@ -143,14 +109,14 @@ class Device:
         return self.values.get(prop, self.fixed.get(prop, 0.0))
 
 
-def test_a_device_keeps_to_size_exposure_and_focus_or_shows_what_it_does_instead():
+def test_a_device_keeps_to_its_size_or_shows_what_it_does_instead():
     device = Device({})
-    apply_options(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
-    properties = ["FRAME_WIDTH", "FRAME_HEIGHT", "AUTOFOCUS", "AUTO_EXPOSURE", "EXPOSURE", "FOCUS"]
-    values = [device.values[getattr(cv2, f"CAP_PROP_{name}")] for name in properties]
-    assert values == [1280, 720, 0, 1, 200.0, 30.0]
+    set_up(device, (1280, 720), "0")
+    values = [
+        device.values[getattr(cv2, f"CAP_PROP_{name}")]
+        for name in ("FRAME_WIDTH", "FRAME_HEIGHT", "AUTOFOCUS")
+    ]
+    assert values == [1280, 720, 0]
     small = Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480})
     with pytest.raises(jcr.InputError, match="--camera-size 1280 720: camera 0 gives 640x480"):
-        apply_options(small, CameraOptions((1280, 720)), "0")
-    with pytest.raises(jcr.InputError, match="--focus 30: camera 0 stays at 7"):
-        apply_options(Device({cv2.CAP_PROP_FOCUS: 7.0}), CameraOptions(focus=30.0), "0")
+        set_up(small, (1280, 720), "0")

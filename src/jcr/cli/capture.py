@@ -13,7 +13,7 @@ from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.estimation.arms import CHOICES, RobotName
 from jcr.files import locked
-from jcr.live.cameras import CameraOptions, open_camera
+from jcr.live.cameras import open_camera
 from jcr.live.robot import states_of
 from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
 from jcr.rounding import labelled
@@ -35,7 +35,7 @@ class CaptureCommand:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
-      jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
+      jcr capture captures/table --camera 2 --camera-size 1920 1080 --poses xarm:192.168.1.203
       jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses http --page-port 7464
     """
 
@@ -43,7 +43,8 @@ class CaptureCommand:
     """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
-    settings: CameraOptions = field(default_factory=CameraOptions)
+    camera_size: tuple[int, int] | None = None
+    """Resolution in pixels, WIDTH HEIGHT; unset: the camera's default (RealSense: 1280 720)."""
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, or http (a program posts
     them, jcr docs http)."""
@@ -76,7 +77,7 @@ class CaptureCommand:
             answers.append(answer)
             _print("\n".join(lines))
 
-        with locked(out), open_camera(self.camera, self.settings) as camera:
+        with locked(out), open_camera(self.camera, self.camera_size) as camera:
             given, limits = given or camera.intrinsics, {"require": options.require}
             calibration = LiveCalibration(out, intrinsics=given, robot=self.robot, options=limits)
             gripper = None if states is None else lambda: next(states())

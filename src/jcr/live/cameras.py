@@ -29,18 +29,6 @@ REALSENSE = "realsense"
 
 
 @dataclass(frozen=True)
-class CameraOptions:
-    """Camera settings that stay fixed during the capture."""
-
-    camera_size: tuple[int, int] | None = None
-    """Resolution in pixels, WIDTH HEIGHT; unset: the camera's default (RealSense: 1280 720)."""
-    exposure: float | None = None
-    """Fix the exposure, in the camera's own unit (V4L2: 0.1 ms, RealSense: µs); unset: automatic."""
-    focus: float | None = None
-    """Fix the focus, in the camera's own unit; unset: autofocus is switched off and the current focus kept."""
-
-
-@dataclass(frozen=True)
 class Frame:
     """Image of a camera with its time and, from a depth camera, its depth."""
 
@@ -118,14 +106,14 @@ def _read_by(
 
 
 @contextmanager
-def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[Camera]:
+def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Camera]:
     """Open a camera: a V4L2 device (number), a stream (address with ://), `realsense[:SERIAL]`, or else a video file.
 
-    Raises InputError if the camera cannot be opened or does not accept the options. The `with` statement closes it.
+    `size` is the width and height (px) of the images; None: the default of the device (RealSense: 1280x720). Raises
+    InputError if the camera cannot be opened or does not accept the size. The `with` statement closes it.
     """
-    options = options or CameraOptions()
     if source.partition(":")[0] == REALSENSE:
-        with _open_realsense(source.partition(":")[2], options) as camera:
+        with _open_realsense(source.partition(":")[2], size) as camera:
             yield camera
         return
     is_device = source.isdigit()
@@ -149,11 +137,11 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
                 "whether another program holds it, or whether the stream's address is right"
             )
         if is_device:
-            apply_options(video, options, source)
-        elif options != CameraOptions():
+            set_up(video, size, source)
+        elif size is not None:
             raise InputError(
-                f"--camera {source}: size, exposure and focus can be set for a device number or realsense; set "
-                "them in the camera, and leave the options out"
+                f"--camera {source}: the size can be set for a device number or realsense; set it in the camera, and "
+                "leave --camera-size out"
             )
         rate, numbers = video.get(cv2.CAP_PROP_FPS) or 30.0, count()
 
@@ -169,48 +157,34 @@ def open_camera(source: str, options: CameraOptions | None = None) -> Iterator[C
         yield stack.enter_context(_read_by(read, None if is_file else source))
 
 
-def apply_options(video: Any, options: CameraOptions, source: str) -> None:
-    """Set and fix size, exposure and focus of a cv2.VideoCapture; raise InputError if the camera keeps another value.
+def set_up(video: Any, size: tuple[int, int] | None, source: str) -> None:
+    """Set the size of a cv2.VideoCapture and switch autofocus off; raise InputError if the camera keeps another size.
 
-    Each value is read back, because a driver may accept a value without applying it (OpenCV, VideoCaptureProperties).
+    The size is read back, because a driver may accept a value without applying it (OpenCV, VideoCaptureProperties).
     `source` is the camera's name in messages.
     """
-    if options.camera_size is not None:
-        wanted = options.camera_size
-        video.set(cv2.CAP_PROP_FRAME_WIDTH, wanted[0])
-        video.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted[1])
-        size = round(video.get(cv2.CAP_PROP_FRAME_WIDTH)), round(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if size != wanted:
+    if size is not None:
+        video.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        video.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        found = round(video.get(cv2.CAP_PROP_FRAME_WIDTH)), round(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if found != size:
             raise InputError(
-                f"--camera-size {wanted[0]} {wanted[1]}: camera {source} gives {size[0]}x{size[1]}; choose a size that "
+                f"--camera-size {size[0]} {size[1]}: camera {source} gives {found[0]}x{found[1]}; choose a size that "
                 "v4l2-ctl --list-formats-ext lists"
             )
     # Autofocus is switched off because the focus changes the intrinsics. Some cameras have no such setting.
     video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
-    if options.exposure is not None:
-        video.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1)  # manual, in V4L2's control exposure_auto
-    wanted = (
-        (cv2.CAP_PROP_EXPOSURE, options.exposure, "--exposure"),
-        (cv2.CAP_PROP_FOCUS, options.focus, "--focus"),
-    )
-    for prop, value, option in wanted:
-        if value is not None and (
-            not video.set(prop, value) or abs(video.get(prop) - value) > 0.01 * abs(value) + 1.0
-        ):
-            raise InputError(
-                f"{option} {value:g}: camera {source} stays at {video.get(prop):g}; give a value that "
-                "v4l2-ctl --list-ctrls allows, or leave the option out"
-            )
 
 
 # Intel RealSense cameras are read with pyrealsense2: images, aligned depth, and the intrinsics that the maker stored.
 
 
 @contextmanager
-def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
+def _open_realsense(serial: str, size: tuple[int, int] | None) -> Iterator[Camera]:
     """Open a RealSense: `serial` is a serial number, empty for the first camera, or a recording (.bag, .db3).
 
-    Raises InputError if the package or the camera is missing, or the camera does not accept the options.
+    `size` is the width and height (px) of the images; None: 1280x720. Raises InputError if the package or the camera is
+    missing, or the camera does not accept the size.
     """
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
@@ -222,8 +196,8 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
     else:
         if serial:
             config.enable_device(serial)
-        size = options.camera_size or (1280, 720)  # every D400 has this size
-        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, 0)  # 0: any frame rate
+        width, height = size or (1280, 720)  # every D400 has this size
+        config.enable_stream(rs.stream.color, width, height, rs.format.rgb8, 0)  # 0: any frame rate
         config.enable_stream(rs.stream.depth)
     try:
         profile = pipeline.start(config)
@@ -242,19 +216,6 @@ def _open_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
 
         if is_file:
             profile.get_device().as_playback().set_real_time(False)
-        elif options.focus is not None:
-            raise InputError(f"--focus {options.focus:g}: a RealSense has fixed focus; leave the option out")
-        elif (exposure := options.exposure) is not None:
-            sensor, option = profile.get_device().first_color_sensor(), rs.option.exposure
-            if not sensor.supports(option):
-                raise InputError(f"--exposure {exposure:g}: this camera has no such setting; leave it out")
-            limits = sensor.get_option_range(option)
-            if not limits.min <= exposure <= limits.max:
-                raise InputError(
-                    f"--exposure {exposure:g}: this camera takes {limits.min:g} to {limits.max:g}"
-                )
-            sensor.set_option(rs.option.enable_auto_exposure, 0)
-            sensor.set_option(option, exposure)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
         # The distortion models of librealsense are not OpenCV's; most colour cameras are without distortion.
         intrinsics = IntrinsicsEntry(fx=stored.fx, fy=stored.fy, cx=stored.ppx, cy=stored.ppy)
