@@ -184,14 +184,17 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
     to_corners = np.arctan2([top, top, bottom, bottom], [left, right, left, right])
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)[:, None]
-    ray = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones((4001, len(angle)))], axis=-1)
-    slopes = _slopes(camera, ray[..., 0], ray[..., 1])
-    folded = slopes[..., 0, 0] * slopes[..., 1, 1] <= slopes[..., 0, 1] * slopes[..., 1, 0]
-    x_px = project(camera, ray)
-    outside = ((x_px < -0.5) | (x_px > [camera.width - 0.5, camera.height - 0.5])).any(-1)
+    for count in (400, len(radius)):  # the first rays leave the frame of most cameras
+        x, y = radius[:count] * np.cos(angle), radius[:count] * np.sin(angle)
+        slopes = _slopes(camera, x, y)
+        folded = slopes[..., 0, 0] * slopes[..., 1, 1] <= slopes[..., 0, 1] * slopes[..., 1, 0]
+        x_px = project(camera, np.stack([x, y, np.ones_like(x)], axis=-1))
+        outside = ((x_px < -0.5) | (x_px > [camera.width - 0.5, camera.height - 0.5])).any(-1)
+        if (folded | outside)[:-1].any(0).all():
+            break
     # A ray that is still in the frame at the widest angle counts as folded there.
     first_folded, first_outside = (
-        np.where(event.any(0), event.argmax(0), len(radius) - 1) for event in (folded, outside)
+        np.where(event.any(0), event.argmax(0), count - 1) for event in (folded, outside)
     )
     bad = first_folded <= first_outside
     if not bad.any():

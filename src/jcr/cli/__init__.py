@@ -9,6 +9,7 @@ stderr.
 import atexit
 import contextlib
 import errno
+import gc
 import io
 import os
 import sys
@@ -94,6 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     # Spinning threads gain nothing on small matrices; together with torch's threads they cost a run 2 of 15 seconds.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Imports make 250,000 objects that stay; searching them for garbage again and again takes half a second of a run.
+    gc.set_threshold(100_000)
     # Closed standard streams are opened on the null device; the next opened file would otherwise become such a stream.
     for number in range(3):
         try:
