@@ -340,7 +340,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
         )
     give_back()
     with ThreadPoolExecutor(1) as beside:
-        sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std)
+        sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std, support)
         scene = build_scene(cloud, options.map, progress, device=device_of(options.reconstruct))
         measured = None if sizes is None else sizes.result()
     write_cloud(result.out / CLOUD, cloud)
