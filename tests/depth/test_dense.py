@@ -165,7 +165,8 @@ def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     view = relative(0, np.arange(1, 4), poses, PINHOLE)
     for confirmed, seeing in ((chance, 0), (known, 1)):
         compared = inverse_depth_evidence(inverse_depth, known, confirmed)
-        mean, count, through, information = agreement(0, compared, *view, grid(PINHOLE), 0.01)
+        sums = np.zeros((4, *inverse_depth.shape[1:]), np.float32)
+        mean, count, through, information = agreement(sums, 0, compared, *view, grid(PINHOLE), 0.01)
         middle = np.s_[10:-10, 10:-10]
         assert (count[middle] == 2).all() and (through[middle] == seeing).all()
         np.testing.assert_allclose(mean[middle], 1.0, rtol=1e-6)

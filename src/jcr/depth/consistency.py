@@ -26,13 +26,13 @@ def inverse_depth_evidence(
 
 @compiled
 @no_type_check
-def agreement(i, compared, others, a, b, centre, k, tolerance):
-    """Compare the depth of each pixel of image i with the depths of the images `others`; return four maps (4,h,w).
+def agreement(sums, i, compared, others, a, b, centre, k, tolerance):
+    """Compare the depth of each pixel of image i with the depths of the images `others`; return four maps, `sums`.
 
-    Map 0 is the mean inverse depth over image i and the images that agree, converted to image i. Maps 1 and 2 are the
-    numbers of images that agree, and that see a surface more than 1 % behind the point. Map 3 is the sum over the
-    agreeing images of |∂x/∂(inverse depth)|², x being the point's pixel there. Their depth is interpolated bilinearly,
-    or is that of the nearest pixel if one of the four has none.
+    `sums` (4,h,w) is 0 before. Map 0 is the mean inverse depth over image i and the images that agree, converted to
+    image i. Maps 1 and 2 are the numbers of images that agree, and that see a surface more than 1 % behind the point.
+    Map 3 is the sum over the agreeing images of |∂x/∂(inverse depth)|², x being the point's pixel there. Their depth is
+    interpolated bilinearly, or is that of the nearest pixel if one of the four has none.
 
     `compared` (m,h,w) comes from `inverse_depth_evidence`. `others` (n) are image indices. R and t transform points of
     camera i to another camera, and K are the intrinsics. `a` (n,3,3) is K R and `b` (n,3) is K t; `centre` (n) is the
@@ -42,7 +42,6 @@ def agreement(i, compared, others, a, b, centre, k, tolerance):
     _, h, w = compared.shape
     half, one, tolerance = np.float32(0.5), np.float32(1), np.float32(tolerance)
     nearer = np.float32(1 - SEEN_THROUGH)
-    sums = np.zeros((4, h, w), np.float32)
     for v in range(h):
         for n in range(len(others)):
             row, there = _row(v, n, a, b, k, w, h), compared[others[n]]
@@ -76,20 +75,20 @@ def agreement(i, compared, others, a, b, centre, k, tolerance):
 
 @compiled
 @no_type_check
-def colours_agree(i, asked, inverse_depth, colors, others, a, b, k, tolerance):
+def colours_agree(sums, i, asked, inverse_depth, colors, others, a, b, k, tolerance):
     """Count for each pixel of image i the images that show its point in the same colour, in another, or see through it.
 
-    The result (3,h,w) has the three counts in this order. `asked` (h,w) is the inverse depth 1/z to test at each pixel,
-    0 for none. `inverse_depth` (m,h,w) is the matched inverse depth of all images, 0 for none. `colors` (m,h,w,3) are
-    their RGB colours (0 to 1). Both are read at the nearest pixel. An image sees through the point if its matched depth
-    is more than 1 % behind. An image whose matched depth is more than 1 % in front is not counted; one without depth is
-    taken to see the point. Colours are the same if their Euclidean distance is below `tolerance`. `others` are the
-    indices of the images to compare; their projections `a`, `b` and `k` are as in `agreement`.
+    The result `sums` (3,h,w), 0 before, has the three counts in this order. `asked` (h,w) is the inverse depth 1/z to
+    test at each pixel, 0 for none. `inverse_depth` (m,h,w) is the matched inverse depth of all images, 0 for none.
+    `colors` (m,h,w,3) are their RGB colours (0 to 1). Both are read at the nearest pixel. An image sees through the
+    point if its matched depth is more than 1 % behind. An image whose matched depth is more than 1 % in front is not
+    counted; one without depth is taken to see the point. Colours are the same if their Euclidean distance is below
+    `tolerance`. `others` are the indices of the images to compare; their projections `a`, `b` and `k` are as in
+    `agreement`.
     """
     h, w = asked.shape
     half, most = np.float32(0.5), np.float32(tolerance * tolerance)
     nearer, farther = np.float32(1 - SEEN_THROUGH), np.float32(1 + SEEN_THROUGH)
-    sums = np.zeros((3, h, w), np.float32)
     for n in range(len(others)):
         j = others[n]
         for v in range(h):

@@ -122,8 +122,9 @@ def _checked(
     neighbours (`relative`). Only pixels of `sees` can contradict the depth of other images.
     """
     compared, k = inverse_depth_evidence(depth, known, sees), grid(pinhole)
-    found = pool.map(lambda i: agreement(i, compared, *views[i], k, tolerance), range(len(views)))
-    mean, *others = np.stack(list(found), 1)
+    sums = np.zeros((len(views), 4, *depth.shape[1:]), np.float32)
+    list(pool.map(lambda i: agreement(sums[i], i, compared, *views[i], k, tolerance), range(len(views))))
+    mean, *others = np.moveaxis(sums, 1, 0)
     return [np.where(known, mean, depth), *others]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
+from jcr.compiled import random_state
 from jcr.depth.patch_match import UNKNOWN, random_planes, spread_planes
 from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
@@ -112,14 +113,14 @@ def match_depth(
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
         views = half.views(i, others, recon_from_camera)
-        found = random_planes(family, span, views[-1], h, blocks_of(w), i)
+        found = random_planes(family, span, views[-1], h, blocks_of(w), random_state(i))
         for n, (size, tries) in enumerate(_COARSE):
-            spread_planes(found, *views, (*span, size, tries, n == 0), seed + n)
+            spread_planes(found, *views, (*span, size, tries), n, random_state(seed + n))
         found = full.enlarged(found)
         views = full.views(i, others, recon_from_camera)
         found[3] = UNKNOWN
         for n, (size, tries) in enumerate(_FINE):
-            spread_planes(found, *views, (*span, size, tries, n == 0), seed + n)
+            spread_planes(found, *views, (*span, size, tries), n, random_state(seed + n))
         found = found[..., : pinhole.width]
         depth = np.einsum("chw,hwc->hw", found[:3], full_ray)
         return np.stack([np.maximum(depth, np.float32(0.5 * span[0])), found[3]])

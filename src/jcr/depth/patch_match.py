@@ -18,7 +18,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.compiled import compiled, inlined, random_state, uniform
+from jcr.compiled import compiled, inlined, uniform
 from jcr.depth.window import LANES, STRIDE, correlate
 
 MOST_SLANTED = 0.12
@@ -151,13 +151,13 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
 
 @compiled
 @no_type_check
-def random_planes(family, span, k, h, w, seed):
+def random_planes(family, span, k, h, w, state):
     """Return a random plane for each pixel, (4,h,w): rows 0 to 2 are the plane, and row 3 is the score UNKNOWN.
 
     Planes are vectors p in the camera frame with p·x = 1; `k` is fx, fy, cx, cy. About half of the planes are random
-    mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span`.
+    mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span`. `state`
+    is the state of the random generator `uniform`, which is updated.
     """
-    state = random_state(seed)
     lowest, highest = span
     found = np.empty((4, h, w), np.float32)
     found[3] = UNKNOWN
@@ -181,27 +181,26 @@ def random_planes(family, span, k, h, w, seed):
 
 @compiled
 @no_type_check
-def spread_planes(found, packed, motions, windows, k, search, seed):
+def spread_planes(found, packed, motions, windows, k, search, number, state):
     """Update the planes of all pixels in `found` once by planes of the row before or random changes that score higher.
 
     `found` (4,h,w), plane and score, is changed in place.
     `packed` (n,y,x) are the neighbours' greys from `quads`, and `motions` (n,12) the rows of K R, and K t, to them.
-    `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy. Rows are visited downwards
-    for even and upwards for odd seeds (Bleyer et al. 2011, section 3.2). `search` is (lowest inverse depth, highest
-    one, relative change to try, number of tries, whether the planes have no score yet). The change of inverse depth and
-    normal halves from try to try.
+    `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy. `number` counts the passes
+    at one resolution. Rows are visited downwards for even and upwards for odd numbers (Bleyer et al. 2011, section
+    3.2); in pass 0 the planes have no score yet. `search` is (lowest inverse depth, highest one, relative change to try,
+    number of tries). The change of inverse depth and normal halves from try to try. `state` is the state of the random
+    generator `uniform`, which is updated.
     """
-    state = random_state(seed)
     _, h, w = found.shape
     near, each = np.empty((len(motions), 12, LANES), np.float32), np.empty((len(motions), LANES), np.float32)
     tried = np.empty((7, LANES), np.float32)
-    tries, fresh = search[3:]
-    backward = seed % 2 == 1
+    tries = search[3]
     for row in range(h):
-        v, before = (h - 1 - row, h - row) if backward else (row, row - 1)
+        v, before = (row, row - 1) if number % 2 == 0 else (h - 1 - row, h - row)
         for u in range(0, w, LANES):
             _look(v, u, motions, k, near)
-            for option in range(-1 if fresh else 0, _PASSED + tries):
+            for option in range(-1 if number == 0 else 0, _PASSED + tries):
                 if option < 0:
                     _try_passed(found, v, u, 0, tried)
                 elif option >= _PASSED:

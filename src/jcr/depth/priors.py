@@ -141,7 +141,8 @@ def planar_prior(
     near = (on_support | lonely)[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
     points = np.where(asked, predicted, np.float32(0))
-    same, unlike, through = colours_agree(i, points, depths, colors, *view[:3], k, SAME_COLOUR)
+    counts = np.zeros((3, *label.shape), np.float32)
+    same, unlike, through = colours_agree(counts, i, points, depths, colors, *view[:3], k, SAME_COLOUR)
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
     # Where only one other image sees the point, it must agree, and a match or the support plane must confirm it.
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)

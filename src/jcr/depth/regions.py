@@ -41,7 +41,8 @@ def colour_regions(color: Float[ndarray, "h w 3"]) -> tuple[Int[ndarray, "h w"],
     second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
     # Sorting 16-bit numbers takes a fifth of the time.
     order = np.argsort((65535 * weight.clip(0, 1)).astype(np.uint16), kind="stable")
-    root = _joined(first[order], second[order], weight[order], h * w)
+    root = np.arange(h * w)
+    _join(first[order], second[order], weight[order], root, np.ones(h * w, int), np.zeros(h * w, np.float32))
     is_root = root == np.arange(h * w)
     label = (np.cumsum(is_root, dtype=np.int32) - 1)[root].reshape(h, w)
     return label, int(is_root.sum())
@@ -58,10 +59,7 @@ def _root(parent, x):
 
 @compiled
 @no_type_check
-def _joined(first, second, weight, n):
-    parent = np.arange(n)
-    size = np.ones(n, np.int64)
-    inner = np.zeros(n, np.float32)
+def _join(first, second, weight, parent, size, inner):
     for small in range(2):
         for e in range(len(weight)):
             a, b = _root(parent, first[e]), _root(parent, second[e])
@@ -75,9 +73,8 @@ def _joined(first, second, weight, n):
                 parent[b] = a
                 size[a] += size[b]
                 inner[a] = max(weight[e], inner[a], inner[b])
-    for x in range(n):
+    for x in range(len(parent)):
         parent[x] = _root(parent, x)
-    return parent
 
 
 def region_planes(

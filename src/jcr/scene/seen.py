@@ -128,7 +128,8 @@ def carve(
     toward = camera_centers_in_base[image] - points_in_base
     reach = np.linalg.norm(toward, axis=1)
     numbers = (points_in_base - box[0], toward / reach[:, None], reach)
-    _follow(state, *(array.astype(np.float32) for array in numbers), measured, np.float32(cell))
+    rays = (array.astype(np.float32) for array in numbers)
+    _follow(state, np.zeros_like(state), *rays, measured, np.float32(cell))
     lower, state = (torch.as_tensor(array, device=device) for array in (lower, state))
     return SeenGrid(lower, cell, state)
 
@@ -167,42 +168,47 @@ def _depth_image(
     return nearest.astype(np.float32), rotation, (float(corner[0]), float(corner[1])), pitch
 
 
-@compiled
-@no_type_check
-def _mark_before(crossed, nearest, rotation, start, block, corner, pitch):
-    """Set `crossed` (z,y,x) for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
+def _mark_before(
+    crossed: Bool[ndarray, "nz ny nx"],
+    nearest: Float[ndarray, "r c"],
+    rotation: Float[ndarray, "3 3"],
+    start: Float[ndarray, "3"],
+    block: np.float32,
+    corner: tuple[float, float],
+    pitch: float,
+) -> None:
+    """Set `crossed` for blocks of side `block` (m) that are nearer to a camera than its depth image shows.
 
     `crossed` is the mask of the blocks, which is changed in place. `nearest`, `rotation`, `corner` and `pitch` are the
     results of `_depth_image`. `start` is the centre (m) of the first block, relative to the camera, in the axes of the
     depth image.
     """
-    per_pitch, u0, v0 = np.float32(1 / pitch), np.float32(corner[0]), np.float32(corner[1])
+    along_z, along_y, along_x = (block * k.astype(np.float32) for k in np.ogrid[*map(slice, crossed.shape)])
+    x, y, z = (
+        s + r[0] * along_x + r[1] * along_y + r[2] * along_z for s, r in zip(start, rotation, strict=True)
+    )
+    with np.errstate(all="ignore"):
+        column, row = (
+            (at / z - np.float32(first)) * np.float32(1 / pitch)
+            for at, first in zip((x, y), corner, strict=True)
+        )
     rows, columns = nearest.shape
-    for z in range(crossed.shape[0]):
-        for y in range(crossed.shape[1]):
-            for x in range(crossed.shape[2]):
-                a, b, c = block * np.float32(x), block * np.float32(y), block * np.float32(z)
-                depth = start[2] + rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
-                if depth <= 0 or crossed[z, y, x]:
-                    continue
-                u = (start[0] + rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c) / depth
-                v = (start[1] + rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c) / depth
-                u, v = (u - u0) * per_pitch, (v - v0) * per_pitch
-                if u >= 0 and v >= 0 and u < columns and v < rows:
-                    crossed[z, y, x] = depth + block < nearest[int(v), int(u)]
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+    shown = nearest[row[inside].astype(int), column[inside].astype(int)]
+    crossed[inside] |= z[inside] + block < shown
 
 
 @compiled
 @no_type_check
-def _follow(state, points, towards, reach, measured, cell):
+def _follow(state, samples, points, towards, reach, measured, cell):
     """Set HIT in `state` for cells that contain a point, and CROSSED for cells that rays cross near their points.
 
-    `state` (nz,ny,nx) is changed in place. `points` (n,3) m are relative to the grid's lower corner, along the base
-    axes. `towards` (n,3) and `reach` (n) are unit vector and distance (m) from a point to its camera. A cell is crossed
-    if it contains four samples of rays, taken every half `cell` (m) on the last 6 cm. The cell half a cell behind a
-    point is hit, too, so that surfaces have a thickness. Rays that are not `measured` (n) cross no cells.
+    `state` (nz,ny,nx) is changed in place; `samples`, of the same shape, is 0 and counts the samples of rays. `points`
+    (n,3) m are relative to the grid's lower corner, along the base axes. `towards` (n,3) and `reach` (n) are unit
+    vector and distance (m) from a point to its camera. A cell is crossed if it contains four samples of rays, taken
+    every half `cell` (m) on the last 6 cm. The cell half a cell behind a point is hit, too, so that surfaces have a
+    thickness. Rays that are not `measured` (n) cross no cells.
     """
-    samples = np.zeros(state.shape, np.uint8)
     nz, ny, nx = state.shape
     step, per_cell = cell / np.float32(2), np.float32(1) / cell
     last = int(np.ceil(np.float32(RAY_END_M) / step)) - 1
