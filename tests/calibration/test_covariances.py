@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr.calibration.difference import StatedTransform, difference
+from jcr.calibration.difference import StatedTransform, compare
 from jcr.cli import dispatch
 from jcr.geometry import retract, rotation_exp, transform
 from places import ROOT
@@ -70,7 +70,7 @@ def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
     for _ in range(400):
         step = rng.multivariate_normal(np.zeros(6), 2 * robot + 2 * images)
         parts = {"robot_random": robot, "images": images}
-        found = difference(StatedTransform(X, parts), StatedTransform(retract(X, step), parts))
+        found = compare(StatedTransform(X, parts), StatedTransform(retract(X, step), parts))
         values.append(found.p_value)
         assert sum(found.explained_by.values()) == pytest.approx(1.0)
     assert abs(np.mean(np.array(values) < 0.5) - 0.5) < 0.09
@@ -78,6 +78,6 @@ def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
 
 
 def test_without_any_covariance_there_is_a_difference_and_no_verdict():
-    found = difference(StatedTransform(X), StatedTransform(retract(X, np.full(6, 1e-3))))
+    found = compare(StatedTransform(X), StatedTransform(retract(X, np.full(6, 1e-3))))
     assert found.p_value is None and found.sigmas is None
     assert np.linalg.norm(found.translation_m) == pytest.approx(1e-3 * np.sqrt(3))

@@ -21,11 +21,10 @@ from jcr.estimation.intrinsics_prior import (
     camera_about,
     camera_with_prior,
 )
-from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty
 from jcr.estimation.problem import LinearPrior
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, is_explained, verdict_of
-from jcr.records import Capture, Reconstruction, SceneUncertainty, Tracks
+from jcr.records import Capture, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200
 """Fewest observations with which images are adjusted; fewer do not improve the fit to camera poses."""
@@ -131,13 +130,6 @@ class Case:
         if self.adjusted is None or self.hand_eye.source == "poses":
             return None
         return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
-
-    @property
-    def scene_uncertainty(self) -> SceneUncertainty | None:
-        """Uncertainty of the reconstructed scene in the base frame; None for a calibration from camera poses alone."""
-        if self.adjusted is None or self.scene_distance_m is None:
-            return None
-        return scene_uncertainty(scene_points(self.adjusted))
 
     @property
     def is_adjustable(self) -> bool:

@@ -17,10 +17,23 @@ from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between
 from jcr.records.json_fields import Matrix, Spread3
 
+
+@dataclass(frozen=True)
+class StatedTransform:
+    """gripper_from_camera of a calibration or of a reference, with its covariance if that is known."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    parts: dict[str, Float[ndarray, "6 6"]] = field(default_factory=dict)
+    """Parts of the covariance of translation (m) and rotation vector (rad), as in COVARIANCE_ORDER, by cause of error.
+    Empty: the covariance is unknown."""
+    doubt: str | None = None
+    """Reason why the calibration is rejected; None if it is accepted, or if it is a reference without a verdict."""
+
+
 if TYPE_CHECKING:
     from jcr.result import RunResult
 
-    Comparable = RunResult | AnyCalibration | str | Path | ArrayLike
+    Comparable = RunResult | AnyCalibration | StatedTransform | str | Path | ArrayLike
 else:
     Comparable = object
 
@@ -37,6 +50,8 @@ class Difference:
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
     """Rotation vector r (rad): R_other = exp(r)·R."""
+    doubts: tuple[str | None, str | None] = (None, None)
+    """Reason why each of the two calibrations is rejected; None if it is accepted or a reference without a verdict."""
     sigmas: Float[ndarray, "6"] | None = None
     """Absolute translation and rotation per axis, divided by their standard deviations; None without covariances."""
     chi2: float | None = None
@@ -44,18 +59,6 @@ class Difference:
     p_value: float | None = None
     explained_by: dict[str, float] = field(default_factory=dict)
     """Share of χ² by cause of error, largest first; the sum is 1. Empty if both transforms are equal."""
-
-
-@dataclass(frozen=True)
-class StatedTransform:
-    """gripper_from_camera of a calibration or of a reference, with its covariance if that is known."""
-
-    gripper_from_camera: Float[ndarray, "4 4"]
-    parts: dict[str, Float[ndarray, "6 6"]] = field(default_factory=dict)
-    """Parts of the covariance of translation (m) and rotation vector (rad), as in COVARIANCE_ORDER, by cause of error.
-    Empty: the covariance is unknown."""
-    doubt: str | None = None
-    """Reason why the calibration is rejected; None if it is accepted, or if it is a reference without a verdict."""
 
 
 class _Reference(BaseModel):
@@ -70,12 +73,39 @@ class _Reference(BaseModel):
 def compare(calibration: Comparable, other: Comparable) -> Difference:
     """Return the step from `calibration` to `other`, and a χ² test whether their covariances explain the step.
 
-    The step is translation (m) and rotation vector (rad) along gripper axes. Each argument is a result, a Calibration,
-    a path (run folder, calibration.json, or a JSON file with gripper_from_camera), or a 4×4 gripper_from_camera. Raises
-    InputError if one of them has no gripper_from_camera.
+    Each argument is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with
+    gripper_from_camera), or a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
+
+    The step Δ is translation (m), then rotation vector (rad), along gripper axes. Its χ² is ΔᵀV⁻¹Δ, where V is the sum
+    of the covariances Pₖ of both by all causes of error k. The share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any
+    covariance, only the step is set.
     """
     ours, others = (_stated(one, "the calibration") for one in (calibration, other))
-    return difference(ours, others)
+    doubts = ours.doubt, others.doubt
+    step = step_between(ours.gripper_from_camera, others.gripper_from_camera)
+    nothing = np.zeros((6, 6))
+    parts = {
+        cause: ours.parts.get(cause, nothing) + others.parts.get(cause, nothing)
+        for cause in ours.parts | others.parts
+    }
+    together = sum(parts.values(), nothing)
+    if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
+        return Difference(translation_m=step[:3], rotation_vector=step[3:], doubts=doubts)
+    std = np.sqrt(np.diag(together))
+    weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
+    squared = float(step @ weighed)
+    shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items() if squared}
+    if abs(shares.get(OTHER, 1.0)) <= NOTHING:
+        del shares[OTHER]
+    return Difference(
+        translation_m=step[:3],
+        rotation_vector=step[3:],
+        doubts=doubts,
+        sigmas=np.abs(step) / std,
+        chi2=squared,
+        p_value=float(chi2.sf(squared, 6)),
+        explained_by=dict(sorted(shares.items(), key=lambda item: -item[1])),
+    )
 
 
 def _stated(one: Comparable, name: str) -> StatedTransform:
@@ -83,6 +113,8 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
 
     Raises InputError without a transform; `name` denotes the argument in the message.
     """
+    if isinstance(one, StatedTransform):
+        return one
     if isinstance(one, str | Path):
         return read_hand_eye(Path(one))
     record = getattr(one, "calibration", one)
@@ -125,34 +157,3 @@ def read_hand_eye(path: Path) -> StatedTransform:
         return StatedTransform(found.gripper_from_camera)
     std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
     return StatedTransform(found.gripper_from_camera, {OTHER: np.diag(std**2)})
-
-
-def difference(ours: StatedTransform, other: StatedTransform) -> Difference:
-    """Return the step Δ from `ours` to `other` and its χ² = ΔᵀV⁻¹Δ, where V is the sum of both covariances.
-
-    The step is translation (m), then rotation vector (rad), along gripper axes. V is the sum of the covariances Pₖ of
-    all causes of error k; the share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any covariance, only the step is set.
-    """
-    step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
-    nothing = np.zeros((6, 6))
-    parts = {
-        cause: ours.parts.get(cause, nothing) + other.parts.get(cause, nothing)
-        for cause in ours.parts | other.parts
-    }
-    together = sum(parts.values(), nothing)
-    if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
-        return Difference(translation_m=step[:3], rotation_vector=step[3:])
-    std = np.sqrt(np.diag(together))
-    weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
-    squared = float(step @ weighed)
-    shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items() if squared}
-    if abs(shares.get(OTHER, 1.0)) <= NOTHING:
-        del shares[OTHER]
-    return Difference(
-        translation_m=step[:3],
-        rotation_vector=step[3:],
-        sigmas=np.abs(step) / std,
-        chi2=squared,
-        p_value=float(chi2.sf(squared, 6)),
-        explained_by=dict(sorted(shares.items(), key=lambda item: -item[1])),
-    )

@@ -23,7 +23,7 @@ from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.point_uncertainty import with_given_intrinsics
+from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, rotation_angle
@@ -87,8 +87,10 @@ def calibrate_case(
     `robot` is the error prior of the registered images' gripper poses.
     """
     case = checked_case(capture, reconstruction, options, robot)
-    gripper, distance_m = case.base_from_gripper, case.scene_distance_m
-    found = advised(case.hand_eye, gripper, options, distance_m, case.scene_uncertainty)
+    gripper, distance_m, scene = case.base_from_gripper, case.scene_distance_m, None
+    if distance_m is not None and case.adjusted is not None:
+        scene = scene_uncertainty(scene_points(case.adjusted))
+    found = advised(case.hand_eye, gripper, options, distance_m, scene)
     return replace(case, hand_eye=found)
 
 

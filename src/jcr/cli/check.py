@@ -181,11 +181,10 @@ class CompareCommand:
 
         Return the exit status: 3 if the reported errors do not explain it or a calibration is rejected, else 0.
         """
-        from jcr.calibration.difference import difference, read_hand_eye
+        from jcr.calibration.difference import compare
 
-        known = {path: read_hand_eye(path) for path in (self.out, self.reference)}
-        found = difference(known[self.out], known[self.reference])
-        rejected = {str(path): one.doubt for path, one in known.items() if one.doubt is not None}
+        paths, found = (self.out, self.reference), compare(self.out, self.reference)
+        rejected = {str(path): doubt for path, doubt in zip(paths, found.doubts, strict=True) if doubt}
         mm, deg = 1e3 * found.translation_m, np.degrees(found.rotation_vector)
         facts: dict[str, object] = {
             "translation_mm": float(np.linalg.norm(mm)),
@@ -266,10 +265,11 @@ def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, A
 
     The lines are verdict, remedy, motion with its standard deviation, images and warnings.
     """
-    mm, mm_std = (1e3 * part[:3] for part in (found.offset, found.std))
-    deg, deg_std = (np.degrees(part[3:]) for part in (found.offset, found.std))
+    std = np.sqrt(np.diag(found.covariance))
+    mm, mm_std = (1e3 * part[:3] for part in (found.offset, std))
+    deg, deg_std = (np.degrees(part[3:]) for part in (found.offset, std))
     seen_mm, seen_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
-    drift = f"{1e3 * found.drift_m:.2f} mm, {np.degrees(found.drift_rad):.3f}° from the calibration"
+    drift = f"{np.linalg.norm(mm):.2f} mm, {np.linalg.norm(deg):.3f}° from the calibration"
     moved = f"{numbers(mm, 2)} ± {numbers(mm_std, 2)} mm, {numbers(deg, 3)} ± {numbers(deg_std, 3)}°"
     verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
     if warnings and not found.moved:

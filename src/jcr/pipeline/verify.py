@@ -46,24 +46,6 @@ class Verification(Drift):
     """Results for the fixed cameras of the run of which there are new images."""
 
     @property
-    def std(self) -> Float[ndarray, "6"]:
-        """Standard deviations of `offset`: translation x, y, z (m), rotation vector x, y, z (rad).
-
-        The axes are those of the gripper, or of the base for a fixed camera.
-        """
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def drift_m(self) -> float:
-        """Length (m) of the camera's translation relative to the gripper, or base if fixed, since the calibration."""
-        return float(np.linalg.norm(self.offset[:3]))
-
-    @property
-    def drift_rad(self) -> float:
-        """Angle (rad) of the camera's rotation relative to the gripper, or base if fixed, since the calibration."""
-        return float(np.linalg.norm(self.offset[3:]))
-
-    @property
     def verdict(self) -> Verdict:
         """Verdict on the old calibration: rejected if the camera moved, accepted with warnings if there are notes."""
         if self.moved:

@@ -429,21 +429,28 @@ class PaperResiduals:
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
 
-LengthName = Literal["board", "depth camera", "network"]
-"""Sources of known lengths that are compared with the robot."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class LengthCheck:
     """Comparison of a known length, such as a board's size, with its value in the scale of the robot's positions."""
 
-    name: LengthName
+    name: Literal["robot", "board", "depth camera", "network"]
+    """Source of the length; "robot": the robot's positions themselves, which no file contains."""
     robot_longer_percent: float
     """Length by the robot's positions minus stated length, in percent of the stated length."""
     std_percent: float
     """Standard deviation of the stated length in percent, without that of the robot."""
-    used: bool
+    used: bool = False
     """Whether the length is a prior of the scale; none is if two lengths contradict each other."""
+
+    @property
+    def off(self) -> float:
+        """Logarithm of the ratio: length by the robot's positions over stated length."""
+        return float(np.log1p(self.robot_longer_percent / 100))
+
+    @property
+    def std(self) -> float:
+        """Relative standard deviation of the stated length."""
+        return self.std_percent / 100
 
 
 @dataclass(frozen=True, kw_only=True)

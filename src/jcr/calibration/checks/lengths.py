@@ -5,7 +5,7 @@ of the robot, and a finding names both. Depth cameras have scale errors of a few
 square of the distance (Khoshelham and Elberink, Sensors 2012).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from jcr.estimation.problem import SCALE, LinearPrior, with_free
 from jcr.estimation.solve import Solution, size_of_boards, with_covariance
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse
-from jcr.records import Capture, DepthCheck, LengthCheck, LengthName, Reconstruction
+from jcr.records import Capture, DepthCheck, LengthCheck, Reconstruction
 from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
@@ -59,17 +59,6 @@ NORMAL = 1.4826
 """Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
 
 
-@dataclass(frozen=True)
-class Length:
-    """Ratio of a known length, such as a board's size, to the same length by the robot's positions."""
-
-    name: LengthName | Literal["robot"]
-    off: float
-    """Logarithm of the ratio: length by the robot's positions over stated length."""
-    std: float
-    """Relative standard deviation of the stated length."""
-
-
 def check_lengths(case: Case) -> Case:
     """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
 
@@ -78,9 +67,10 @@ def check_lengths(case: Case) -> Case:
     recorded in `Calibration.lengths`.
     """
     hand_eye, lengths = _measured(case)
-    converged, robot = hand_eye.converged, Length("robot", 0.0, float(hand_eye.uncertainty.std[6]))
+    converged, percent = hand_eye.converged, hand_eye.uncertainty.scale_std_percent
+    robot = LengthCheck(name="robot", robot_longer_percent=0.0, std_percent=percent)
 
-    def sigmas(pair: tuple[Length, Length]) -> float:
+    def sigmas(pair: tuple[LengthCheck, LengthCheck]) -> float:
         """Return the difference of two lengths, divided by its standard deviation."""
         return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
 
@@ -93,17 +83,7 @@ def check_lengths(case: Case) -> Case:
         for one in lengths
         if of_images and pair is None and one.std < WORTH * robot.std and sigmas((one, robot)) < AGREES
     ]
-    checks = [
-        LengthCheck(
-            name=name,
-            robot_longer_percent=100 * float(np.expm1(one.off)),
-            std_percent=100 * one.std,
-            used=one in weighed,
-        )
-        for one in lengths
-        if (name := one.name) != "robot"
-    ]
-    hand_eye = replace(hand_eye, lengths=tuple(checks))
+    hand_eye = replace(hand_eye, lengths=tuple(replace(one, used=one in weighed) for one in lengths))
     compared = any(one.name != "network" for one in lengths) or bool(case.priors)
     alone = not compared and case.reconstruction.metric_std is None
     findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
@@ -122,12 +102,9 @@ def check_lengths(case: Case) -> Case:
     return case.after(findings, hand_eye)
 
 
-def _measured(case: Case) -> tuple[Calibration, list[Length]]:
-    """Return the calibration with `depth_check` set, and a Length for each known length of the case.
-
-    `Length.off` is the logarithm of the length by the robot's positions over the stated length.
-    """
-    hand_eye, found = case.hand_eye, list[Length]()
+def _measured(case: Case) -> tuple[Calibration, list[LengthCheck]]:
+    """Return the calibration with `depth_check` set, and the comparison of each known length of the case."""
+    hand_eye, found = case.hand_eye, list[LengthCheck]()
     boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
     is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
     size_std = boards.size_std if boards is not None and is_known else None
@@ -135,20 +112,25 @@ def _measured(case: Case) -> tuple[Calibration, list[Length]]:
         off, by_unknown = size_of_boards(adjusted)
         together = float(by_unknown @ adjusted.covariance @ by_unknown)
         of_images = max(together - float(adjusted.covariance[SCALE, SCALE].item()), 0.0)
-        found.append(Length("board", off, float(np.hypot(np.sqrt(of_images), size_std))))
+        found.append(_length("board", off, float(np.hypot(np.sqrt(of_images), size_std))))
     if hand_eye.converged and (depth := depth_check(case.capture, case.reconstruction, hand_eye)) is not None:
         of_depth = max((depth.std_percent / 100) ** 2 - variance, 0.0)
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
-        found.append(Length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
+        found.append(_length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
         hand_eye = replace(hand_eye, depth_check=depth)
     # A metric unit with a standard deviation is a prior of the scale already, and no independent check.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A length of 1 m in the network's reconstruction is `scale` metres by the robot.
-        found.append(Length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
+        found.append(_length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
     return hand_eye, found
 
 
-def _contradiction(one: Length, other: Length, hand_eye: Calibration) -> Finding:
+def _length(name: Literal["board", "depth camera", "network"], off: float, std: float) -> LengthCheck:
+    """Return the comparison of a length from `LengthCheck.off` and `LengthCheck.std`."""
+    return LengthCheck(name=name, robot_longer_percent=100 * float(np.expm1(off)), std_percent=100 * std)
+
+
+def _contradiction(one: LengthCheck, other: LengthCheck, hand_eye: Calibration) -> Finding:
     """Return the finding that two lengths contradict each other; a length by the robot must be `one`.
 
     A board that contradicts the robot by up to MISPRINTED was printed or stated at a wrong size. The finding then
@@ -179,7 +161,7 @@ def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
 
 
 def _fused(
-    case: Case, hand_eye: Calibration, lengths: list[Length], fault: Float[ndarray, "7 7"]
+    case: Case, hand_eye: Calibration, lengths: list[LengthCheck], fault: Float[ndarray, "7 7"]
 ) -> tuple[Calibration, Solution]:
     """Return calibration and adjustment with the lengths as priors of the scale.
 
