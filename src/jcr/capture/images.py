@@ -103,15 +103,6 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
     return size
 
 
-def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
-    """Return the mean grey level (0 to 255) of an RGB image, and the variance of its Laplacian.
-
-    The variance falls as blur increases.
-    """
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
-
-
 def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
     """Return the width of an RGB image's strongest edges as a share of its long side, along the axis with more blur.
 
@@ -151,8 +142,9 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
     return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
 
 
-def exposure_fault(brightness: float) -> str | None:
+def exposure_fault(image: UInt8[ndarray, "h w 3"]) -> str | None:
     """Return "nearly black" (mean grey level up to 12 of 255) or "nearly white" (from 243); None if exposed well."""
+    brightness = float(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).mean())
     if DARK < brightness < BRIGHT:
         return None
     return "nearly black" if brightness <= DARK else "nearly white"
@@ -171,8 +163,11 @@ def encode_jpeg(pixels: UInt8[ndarray, "h w 3"]) -> bytes:
 
 
 def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
-    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 if the file cannot be decoded."""
-    if not isinstance(image, bytes):
-        return brightness_and_sharpness(image)[1]
-    bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
-    return 0.0 if bgr is None else brightness_and_sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))[1]
+    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 if the file cannot be decoded.
+
+    The variance falls as blur increases.
+    """
+    if isinstance(image, bytes):
+        bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+        return 0.0 if bgr is None else sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))
+    return float(cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_64F).var())

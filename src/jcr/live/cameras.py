@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
+from jcr.capture.images import BLURRED, exposure_fault, sharpness
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.records.capture_json import IntrinsicsEntry
@@ -290,7 +290,7 @@ class ImageSummary:
         size = GRID_PX, max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        return ImageSummary(coarse - coarse.mean(), brightness_and_sharpness(image)[1])
+        return ImageSummary(coarse - coarse.mean(), sharpness(image))
 
     def is_like(self, other: "ImageSummary") -> bool:
         """Test whether two images are the same view: equal size, and grey levels that differ by noise only.
@@ -322,7 +322,7 @@ def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patienc
             fault = "the size of the camera's images changes; fix it with --camera-size"
         elif not now.is_like(ImageSummary.of(earlier.image)):
             fault = "the image is not still; wait until the arm and everything in view is at rest"
-        elif (exposure := exposure_fault(brightness_and_sharpness(frame.image)[0])) is not None:
+        elif (exposure := exposure_fault(frame.image)) is not None:
             fault = f"the image is {exposure}; change light or exposure"
         elif now.sharpness < BLURRED * usual:
             fault = f"the image is blurred ({100 * now.sharpness / usual:.0f} % of the usual sharpness)"

@@ -16,7 +16,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
-from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
+from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
 from jcr.estimation.observability import observability
@@ -155,8 +155,7 @@ def _look(capture: Capture, views: tuple[Finding, ...]) -> tuple[Int[ndarray, " 
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
     clear, remarks = list[int](), list[str]()
     for row, name in enumerate(capture.images):
-        brightness, _ = brightness_and_sharpness(read_image(capture.folder / name))
-        if (fault := exposure_fault(brightness)) is not None:
+        if (fault := exposure_fault(read_image(capture.folder / name))) is not None:
             remarks.append(f"{name} is {fault}; expose it again")
         elif name not in blurred:
             clear.append(row)
