@@ -215,7 +215,6 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     labels = {"label": np.ones(200, int), "label_names": ("none", "cup")}
     cloud = cloud_of(draw.random((200, 3)), camera_centers_in_base=inverse(cameras)[:, :3, 3], **labels)
     write_cloud(folder / "cloud.ply", cloud)
-    write_cloud(folder / "points.ply", cloud)
     (folder / "points.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
     np.save(folder / "points.npy", draw.random((4, 3)))
     build_scene(cloud, MapOptions(cell=0.2, max_seconds=0.1)).save(folder / "map.safetensors")
@@ -226,7 +225,6 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         "map.safetensors": load_map,
         "points.csv": read_points,
         "points.npy": read_points,
-        "points.ply": read_points,
     }
     with np.load(folder / "reconstruction.npz") as stored:
         arrays = dict(stored)

@@ -120,8 +120,6 @@ class ModelsCommand:
     """For get: the back end whose weights are downloaded, or a hub id for --weights or --sam-weights."""
     accept_licence: bool = False
     """For get: accept a non-commercial licence."""
-    revision: str | None = None
-    """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
@@ -140,15 +138,15 @@ class ModelsCommand:
                 raise InputError(
                     f"{weights_command(row)}; its licence is {row.licence}; accept it with --accept-licence, or take da3"
                 )
-            folder = download(hub_id, self.revision or revision, self.output.quiet)
+            folder = download(hub_id, revision, self.output.quiet)
             lines = [f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}"]
             if row and not row.is_installed():
                 lines.append(f"its package is missing: {row.install}")
             facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
             self.output.result(lines, facts | {"folder": str(folder)})
             return 0
-        if self.name is not None or self.accept_licence or self.revision is not None:
-            raise InputError("jcr models: name, --accept-licence and --revision are for jcr models get NAME")
+        if self.name is not None or self.accept_licence:
+            raise InputError("jcr models: name and --accept-licence are for jcr models get NAME")
         lines, facts = [], []
         for row in BACKENDS.values():
             missing = [] if row.is_installed() else [row.install]

@@ -119,14 +119,14 @@ class QueryCommand:
 
     for example:
       jcr query out/table points.csv
-      jcr query out/table cloud.ply --write answers.csv
+      jcr query out/table points.npy --write answers.csv
       jcr query out/table points.npy --unknown occupied --json
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run, with its map.safetensors."""
     points: Annotated[Path, tyro.conf.Positional]
-    """.csv (three columns, header line optional), .npy of shape (n, 3), or .ply."""
+    """.csv (three columns, header line optional) or .npy of shape (n, 3)."""
     write: Path | None = None
     """File to write, .csv; by default points.answers.csv beside the points, or none with --json, which prints the
     answers."""
@@ -169,23 +169,19 @@ class QueryCommand:
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
-    """Read points x, y, z (n,3) in metres, base frame, from .csv (three columns), .npy (n,3) or .ply (vertices).
+    """Read points x, y, z (n,3) in metres, base frame, from .csv (three columns) or .npy (n,3).
 
     Raises InputError for another file, and for a point that is not finite.
     """
     from jcr.capture.plain_files import read_lines, read_npy, split_cells
 
     if not path.is_file():
-        raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
-    if path.suffix not in (".npy", ".ply", ".csv"):
-        raise InputError(f"{path}: points are read from .csv, .npy or .ply")
+        raise InputError(f"{path}: no such file of points (.csv or .npy)")
+    if path.suffix not in (".npy", ".csv"):
+        raise InputError(f"{path}: points are read from .csv or .npy")
     try:
         if path.suffix == ".npy":
             points = read_npy(path)
-        elif path.suffix == ".ply":
-            import trimesh
-
-            points = np.asarray(trimesh.load(path).vertices)  # pyright: ignore[reportAttributeAccessIssue]
         else:
             _, rows = split_cells(read_lines(path)[0], path)
             points = np.array(rows, float).reshape(len(rows), -1 if rows else 3)
