@@ -41,6 +41,7 @@ from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
 from jcr.segments.segments import _read_names
+from jcr.sfm.given import read_model
 from scenes import NO_TRACKS, capture_of, cloud_of, maps_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
@@ -147,7 +148,9 @@ def captures(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, T
         found[name] = Target(file, source(file))
     place = folder / "colmap"
     writers.write_colmap(place, capture, cameras)
-    found["cameras.bin"] = Target(place / "sparse" / "0" / "cameras.bin", source(place))
+    found["cameras.bin"] = Target(
+        place / "sparse" / "0" / "cameras.bin", lambda file: read_model(file.parent)
+    )
     (folder / "sample.json").write_text(json.dumps({"base_from_gripper": np.eye(4).tolist()}))
     found["sample.json"] = Target(folder / "sample.json", lambda file: sample_pose(file.read_bytes()))
     return found

@@ -20,7 +20,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
 from jcr.pipeline import selection
 from jcr.pipeline.stages import begun
-from jcr.reconstruct import BACKENDS, Backend, ReconstructOptions, candidates, tries, with_cameras_of
+from jcr.reconstruct import BACKENDS, Backend, ReconstructOptions, candidates, tries
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of, reconstruction_of
@@ -94,15 +94,6 @@ def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, fla
     capture = capture_of(np.eye(4)[None])
     with pytest.raises(InputError, match=f"--backend {name}: name the .* with {flag}[ ,]"):
         backends.reconstruct(capture, ReconstructOptions(backend=name))
-
-
-def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
-    capture = capture_of(np.eye(4)[None], folder=tmp_path, cameras=tmp_path / "sparse")
-    for options in (ReconstructOptions(), ReconstructOptions(backend="given"), ReconstructOptions(board="b")):
-        assert with_cameras_of(capture, options) == replace(options, cameras=tmp_path / "sparse")
-        assert candidates(with_cameras_of(capture, options))[0] == "given"
-    for options in (ReconstructOptions(backend="colmap"), ReconstructOptions(cameras=Path("mine"))):
-        assert with_cameras_of(capture, options) == options
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:

@@ -64,7 +64,6 @@ def lerobot(folder: Path, capture: Capture) -> Path:
 FORMATS: dict[str, Callable[[Path, Capture], Path]] = {
     "capture.json": lambda folder, capture: capture.folder,
     **writers.CORPUS,
-    "COLMAP model": lambda folder, capture: writers.write_colmap(folder, capture, PROBLEM.recon_from_camera),
     "bag": lambda folder, capture: write_bag(folder / "scan", capture, "mcap", 8.0, fps=10.0, tf_hz=50.0),
     "LeRobot": lerobot,
 }

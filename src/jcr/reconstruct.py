@@ -370,18 +370,6 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
     return made
 
 
-def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
-    """Return the options with `cameras` set to the COLMAP model that belongs to the capture.
-
-    They are unchanged if the capture has no model, or if the options name `cameras` or another back end.
-    """
-    if capture.cameras is None or options.cameras is not None:
-        return options
-    selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
-    free = not selecting if options.backend == "auto" else "cameras" in BACKENDS[options.backend].options
-    return replace(options, cameras=capture.cameras.resolve()) if free else options
-
-
 def network_weights(options: ReconstructOptions) -> Weights:
     """Return the weights for the network of the selected back end, from a given path or from the local cache.
 

@@ -8,7 +8,6 @@ import yaml
 from pydantic import TypeAdapter
 
 import jcr
-from jcr.capture.formats import colmap
 from jcr.capture.plain_files import validated_content
 from jcr.capture.ros import intrinsics_of_ros, read_camera_info
 from jcr.export import ros
@@ -42,6 +41,7 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration(intrinsics:
 def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
+    from jcr.sfm.given import read_model, shared_intrinsics
     from jcr.sfm.model import colmap_camera
 
     model = pycolmap.Reconstruction()
@@ -50,7 +50,7 @@ def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     image.frame_id = 1
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     model.write_text(str(tmp_path))
-    found = colmap.read_intrinsics(tmp_path, SIZE)
+    found = shared_intrinsics(read_model(tmp_path), [1], SIZE, "model")
     assert found.model == intrinsics.model and np.allclose(found.distortion, intrinsics.distortion)
     assert np.allclose(
         [found.fx, found.fy, found.cx, found.cy], [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]

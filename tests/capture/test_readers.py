@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 import capture_writers as writers
 import jcr
 from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
-from jcr.capture.formats import colmap
 from jcr.capture.formats.table import read_pose_table
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import PoseTable, stamp_ns
@@ -70,29 +69,6 @@ def test_formats_read_back_one_capture(name: str, tmp_path: Path, capture: Captu
     got = jcr.read_capture(tmp_path)
     assert_same(got, capture)
     assert_same_calibration(got.base_from_gripper, problem.recon_from_camera, problem)
-
-
-def test_given_cameras_read_back_with_a_capture(tmp_path: Path, capture: Capture, problem: HandEyeProblem):
-    path = writers.write_colmap(tmp_path, capture, problem.recon_from_camera)
-    assert format_of(path) == "colmap"
-    got = jcr.read_capture(path)
-    assert_same(got, capture)
-    _, cameras = colmap.read_registered_cameras(got.cameras)
-    assert np.allclose(cameras, problem.recon_from_camera, atol=1e-9)
-    assert_same_calibration(got.base_from_gripper, cameras, problem)
-    table = (path / "poses.csv").rename(path / "rows.csv")
-    with pytest.raises(jcr.InputError, match="holds no table of poses .*; name it with --poses"):
-        jcr.read_capture(path)
-    table.rename(path / "poses.csv")
-    # A name in the model is a path like any other.
-    file = path / "sparse" / "0" / "images.bin"
-    known = Path(capture.images[2]).name.encode() + b"\0"
-    file.write_bytes(file.read_bytes().replace(known, b"../../secret.png\0"))
-    with pytest.raises(jcr.InputError, match="leads out"):
-        jcr.read_capture(path)
-    (path / "sparse" / "0" / "cameras.bin").write_bytes(b"nonsense")
-    with pytest.raises(jcr.InputError, match="not a readable COLMAP model"):
-        jcr.read_capture(path)
 
 
 @pytest.mark.parametrize("name", ["moveit", "easy_handeye2"])

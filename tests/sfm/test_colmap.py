@@ -180,6 +180,9 @@ def test_the_same_cameras_give_the_same_points(tabletop: Path, tmp_path: Path):
         seen = apply(inverse(camera), tracks.points_in_recon[tracks.point[own]])
         off = np.linalg.norm(project(first.intrinsics, seen) - tracks.x_px[own], axis=1)
         assert np.median(off) < 1.0
+    (model / "cameras.bin").write_bytes(b"nonsense")
+    with pytest.raises(jcr.InputError, match="not a readable COLMAP model"):
+        reconstruct_given(capture, model)
 
 
 def off_mm(capture: Capture, found: LiveMap) -> float:

@@ -12,7 +12,7 @@ MAX_FRAMES = 1000
 """Largest number of frames; images are compared with each other, and so are the errors of all poses."""
 
 FormatName = Literal[
-    "auto", "capture", "table", "samples", "colmap", "bag", "lerobot",
+    "auto", "capture", "table", "samples", "bag", "lerobot",
 ]  # fmt: skip
 ConventionName = Literal[
     "auto", "matrix", "quat-xyzw", "quat-wxyz", "rotation-vector", "rpy", "ur", "franka", "xarm", "xarm-axis-angle",

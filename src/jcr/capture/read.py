@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture.checks import require_frames, require_motion
-from jcr.capture.formats import bag, capture_json, colmap, lerobot, samples, table
+from jcr.capture.formats import bag, capture_json, lerobot, samples, table
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pairing import image_names
 from jcr.errors import InputError
@@ -22,7 +22,6 @@ FORMATS: dict[str, Any] = {
     "bag": bag,
     "lerobot": lerobot,
     "samples": samples,
-    "colmap": colmap,
     "table": table,
 }
 """Reader module of each format, in the order in which the formats are tested."""

@@ -73,7 +73,7 @@ class RunCommand(CalibrateCommand):
     """Reconstruct, calibrate, map and report a capture.
 
     CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
-    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, depth.npz,
+    of poses, bags, LeRobot data sets … The run writes calibration.json, reconstruction.npz, depth.npz,
     cloud.ply, map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
 
     for example:

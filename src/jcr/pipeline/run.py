@@ -34,7 +34,7 @@ from jcr.pipeline.stages import (
     place,
 )
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BackendName, with_cameras_of
+from jcr.reconstruct import BackendName
 from jcr.records import Capture, PosePairs
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
@@ -75,7 +75,7 @@ def run(
         with locked(out):
             capture = read_capture(capture, into=out / CAPTURE)
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
-    options, missing = _possible(replace(options, reconstruct=with_cameras_of(capture, own)), capture)
+    options, missing = _possible(replace(options, reconstruct=own), capture)
     with locked(out):
         result = begun(out, kept(capture, out / CAPTURE), options)
         if is_unchanged(result):

@@ -125,8 +125,6 @@ class Capture:
     """Standard deviations of the given intrinsics, in the order of camera.parameters; NaN where none is stated."""
     source: Path | None = None
     """File or folder that the capture was read from; None: the capture.json in `folder`."""
-    cameras: Path | None = None
-    """COLMAP model with the camera poses of the images; None: the images are to be reconstructed."""
     notes: tuple[str, ...] = ()
     """Remarks of the reader, for example on the pairing of files and on skipped frames."""
     joints: Float[ndarray, "n dof"] | None = None

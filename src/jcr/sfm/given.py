@@ -1,19 +1,25 @@
 """The back end `given`: camera poses of a COLMAP model, with its own points or with triangulated features."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
-from jcr.capture.formats import colmap
+from jcr.camera import HALF_PIXEL
 from jcr.capture.images import read_image
+from jcr.capture.plain_files import validated_content
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
-from jcr.records import Capture, Reconstruction
+from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics, Reconstruction
+from jcr.records.capture_json import IntrinsicsEntry
 from jcr.sfm.colmap import matched_database
-from jcr.sfm.model import tracks_of, triangulated_model
+from jcr.sfm.model import poses_of, quiet_colmap, tracks_of, triangulated_model
 
 MIN_POINTS = 50
 """Least number of points of a reconstruction; with fewer in the model, features are triangulated."""
+_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+"""Camera models of COLMAP that a distortion model of jcr can represent."""
 
 
 def reconstruct_given(
@@ -26,23 +32,22 @@ def reconstruct_given(
     RejectedError when too few points can be triangulated.
     """
     report = progress or silent
-    names, recon_from_camera = colmap.read_registered_cameras(cameras)
+    model = read_model(cameras)
+    names = {model.image(image_id).name: image_id for image_id in sorted(model.reg_image_ids())}
     # An image's name with folders matches the end of its path; otherwise the file name alone must match.
-    by_path = {Path(name).parts: row for row, name in enumerate(names)}
-    by_file = {Path(name).name: row for row, name in enumerate(names)}
-    known, rows = list[int](), list[int]()
+    by_path = {Path(name).parts: image_id for name, image_id in names.items()}
+    by_file = {Path(name).name: image_id for name, image_id in names.items()}
+    known, ids = list[int](), list[int]()
     for k, parts in enumerate(Path(image).parts for image in capture.images):
         ends = (by_path[parts[j:]] for j in range(len(parts)) if parts[j:] in by_path)
-        if (row := next(ends, by_file.get(parts[-1]))) is not None:
+        if (image_id := next(ends, by_file.get(parts[-1]))) is not None:
             known.append(k)
-            rows.append(row)
+            ids.append(image_id)
     if len(known) < 3:
         raise InputError(f"{cameras}: knows {len(known)} of the capture's images; at least 3 are needed")
-    recon_from_camera = recon_from_camera[rows]
-    intrinsics = capture.intrinsics or colmap.read_intrinsics(cameras, capture.image_size)
-    model = colmap.read_model(cameras)
-    id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
-    tracks = tracks_of(model, [id_of[names[row]] for row in rows], capture.image_size)
+    recon_from_camera = poses_of(model, [image_id - 1 for image_id in ids])
+    intrinsics = capture.intrinsics or shared_intrinsics(model, ids, capture.image_size, str(cameras))
+    tracks = tracks_of(model, ids, capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         some = capture.of_rows(np.array(known))
         images = [read_image(some.folder / name) for name in some.images]
@@ -64,3 +69,42 @@ def reconstruct_given(
         backend="given",
         notes=notes,
     )
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model; raise InputError if it cannot be read."""
+    with quiet_colmap():
+        try:
+            return pycolmap.Reconstruction(folder)
+        except Exception as error:  # pycolmap passes on C++ exceptions of many types
+            reason = str(error).strip().splitlines()[-1:] or ["damaged"]
+            raise InputError(
+                f"{folder}: not a readable COLMAP model ({reason[0]}); export it again"
+            ) from None
+
+
+def shared_intrinsics(
+    model: pycolmap.Reconstruction, image_ids: Iterable[int], size: tuple[int, int], where: str
+) -> Intrinsics:
+    """Return the intrinsics that the images of a COLMAP model with these ids share.
+
+    Pixel (0, 0) is the centre of the top-left pixel, unlike in the model. Raises InputError, begun with `where`, if
+    intrinsics differ, are for images of another size than `size` (width, height), or have a distortion model that jcr
+    does not support.
+    """
+    cameras = [model.camera(model.image(image_id).camera_id) for image_id in image_ids]
+    kinds = {(c.model.name, c.params_info, c.width, c.height, *map(float, c.params)) for c in cameras}
+    if len(kinds) != 1:
+        raise InputError(
+            f"{where}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
+        )
+    ((name, names_of_params, width, height, *params),) = kinds
+    if name not in _MODELS:
+        raise InputError(f"{where}: unknown camera model {name}; run colmap image_undistorter")
+    value = dict(zip(names_of_params.split(", "), params, strict=True))
+    kind: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
+    value = {"fx": value.get("f"), "fy": value.get("f"), "k1": value.get("k", 0.0)} | value
+    entry = {"fx": value["fx"], "fy": value["fy"], "width": width, "height": height, "model": kind}
+    entry |= {key: value[key] - HALF_PIXEL for key in ("cx", "cy")}
+    entry["distortion"] = [value.get(key, 0.0) for key in COEFFICIENTS[kind]]
+    return validated_content(IntrinsicsEntry, entry, where).record(size, f"{where}: cameras")
