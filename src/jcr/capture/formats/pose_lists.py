@@ -15,7 +15,7 @@ from jcr.capture.pairing import IMAGE_SUFFIXES
 from jcr.capture.plain_files import read_json, read_yaml, shown
 from jcr.errors import InputError
 
-SUFFIXES = (".yaml", ".yml", ".json", ".samples")
+SUFFIXES = (".yaml", ".yml", ".json")
 PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
 """Keys of the gripper pose and the marker pose in a sample of MoveIt Calibration and of easy_handeye2."""
 _ALIASES = {

@@ -16,7 +16,7 @@ from jcr.records import PosePairs
 
 def recognises(path: Path) -> bool:
     """Test whether a path is a file with samples of MoveIt Calibration or easy_handeye2."""
-    is_list = path.is_file() and path.suffix.lower() in SUFFIXES
+    is_list = path.is_file() and path.suffix.lower() in (*SUFFIXES, ".samples")
     return is_list and pair_keys(read_yaml_or_json(path)) is not None
 
 

@@ -22,7 +22,7 @@ from jcr.records import Capture
 
 TEXTS = (".csv", ".tsv", ".txt")
 SUFFIXES = (*TEXTS, ".npy", *pose_lists.SUFFIXES)
-TABLES = tuple(f"{stem}{suffix}" for stem in ("poses", "gripper_poses", "robot_poses") for suffix in SUFFIXES)
+TABLES = tuple(f"poses{suffix}" for suffix in SUFFIXES)
 _IMAGE = (
     "image", "image_name", "image_path", "file", "filename", "file_name", "file_path", "name", "picture",
 )  # fmt: skip
