@@ -41,7 +41,7 @@ DARK, BRIGHT = 12, 243
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read an image as RGB; raise InputError if the file is not an image of 8 bits a channel, as the sensor sees it.
+    """Read an image as RGB; raise InputError if the file is not a readable image of 8 bits a channel.
 
     An image with an EXIF tag of rotation is refused, because viewers and other readers would turn its axes.
     """
