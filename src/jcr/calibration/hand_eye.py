@@ -19,7 +19,7 @@ from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, pose_residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
-from jcr.estimation.robust import robust_fit
+from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.findings.table import MISFIT
@@ -113,7 +113,21 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         )
     if systematic is None:
         systematic = _systematic(gripper, robot, joints)
-    fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, camera_covariance, systematic)
+    # Poses that occur twice count once, because an error that occurs twice would look like agreement. They are sorted,
+    # so that the result does not depend on their order.
+    pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
+    _, order, distinct = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    among = np.ix_(*[(6 * order[:, None] + np.arange(6)).ravel()] * 2)
+    agreeing = least_trimmed(gripper[order], camera[order])[0] if len(order) >= FEW else None
+
+    def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
+        """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
+        errors = None if covariance is None else covariance[among]
+        return robust_fit(
+            gripper[order], camera[order], robot_noise, priors, errors, systematic[among], agreeing
+        )
+
+    fit = fitted(camera_covariance)
     if camera_covariance is None and camera_errors != "none":
         assert fit.problem.used is not None
         start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
@@ -124,35 +138,9 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         errors = camera_error_covariance(
             gripper, camera, start, used, systematic, robot_noise, priors, adding_up
         )
-        if errors is not None:
-            fit, distinct = _fit_distinct(gripper, camera, robot_noise, priors, errors, systematic)
+        fit = fit if errors is None else fitted(errors)
     named = [f"pose {k}" for k in range(n)] if names is None else names
     return judged(_with_residuals(gripper, camera, fit, distinct, named))
-
-
-def _fit_distinct(
-    gripper: Poses,
-    camera: Poses,
-    noise: tuple[float, float] | None,
-    priors: tuple[LinearPrior, ...],
-    covariance: Float[ndarray, "r r"] | None,
-    systematic: Float[ndarray, "r r"],
-) -> tuple[Solution, Int[ndarray, " n"]]:
-    """Return the robust fit to the images without duplicates, and for each image its index in that fit.
-
-    `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `covariance` is that of
-    the camera poses (6n,6n; None: exact), `systematic` that of the systematic robot errors; both as in
-    `solve_hand_eye`. The fit sorts the images by their poses, so that the result does not depend on their order. Images
-    with the same pair of poses count once, because an error that occurs twice would look like agreement.
-    """
-    n = len(gripper)
-    pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
-    _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    rows = (6 * order[:, None] + np.arange(6)).ravel()
-    among = np.ix_(rows, rows)
-    if covariance is not None:
-        covariance = covariance[among]
-    return robust_fit(gripper[order], camera[order], noise, priors, covariance, systematic[among]), back
 
 
 def _with_residuals(
@@ -161,7 +149,7 @@ def _with_residuals(
     """Return the calibration that `fit` gives, with residuals of all images, before `judged` adds its findings.
 
     `gripper` (base_from_gripper) and `camera` (recon_from_camera) are the poses of all n images. `distinct` holds the
-    index of each image in the fit, which has no duplicates (_fit_distinct).
+    index of each image in the fit, which has no duplicates.
     """
     assert fit.problem.used is not None
     x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]

@@ -27,6 +27,9 @@ SHARE_RIGHT = 0.65
 """Share of the images that the least-trimmed-squares fit uses; the others may be wrong."""
 MAX_TRIPLES, MOST_TRIPLES = 1500, 30_000
 """Largest number of triples that are solved in closed form, and of triples to choose from (all, up to 57 images)."""
+MANY = 50
+"""Largest number of images of which some are removed from all in a second search; it needs a fit for each image that
+is wrong."""
 CONCENTRATED = 20
 """Number of best triples that start a trimmed fit; its cost is 0.1 % above the best known one, with 5 it is 2 %."""
 WRONG = 1e-5
@@ -43,11 +46,14 @@ def robust_fit(
     priors: tuple[LinearPrior, ...] = (),
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
+    agreeing: Images | None = None,
 ) -> Solution:
     """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
-    evidence of masks. Arguments are those of pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The
+    evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
+    they are more than MANY.
+    Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The
     problem is solved in a frame at the centre of the cameras with their extent as unit, for numerical reasons; the
     solution is in the given frame.
     """
@@ -83,9 +89,12 @@ def robust_fit(
 
     used = np.ones(n, dtype=bool)
     if n >= 5:
-        fewest = least_trimmed(base_from_gripper, recon_from_camera)[0]
-        searches = _improved(fitted, used, adding=False), _improved(fitted, fewest, adding=True)
-        used = max(searches, key=lambda found: found[1])[0]
+        if agreeing is None:
+            agreeing = least_trimmed(base_from_gripper, recon_from_camera)[0]
+        used, evidence = _improved(fitted, agreeing, adding=True)
+        if n <= MANY:
+            fewer, other = _improved(fitted, np.ones(n, dtype=bool), adding=False)
+            used = fewer if other >= evidence else used
     fit = solve(replace(every, used=used), fitted(used).most_likely)
     scale, z = fit.state.scale / unit, fit.state.z[0]
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))

@@ -81,6 +81,9 @@ START_NOISE = (1e-3, float(np.radians(0.2)))
 """Assumed random errors of gripper poses before their first estimate (m, rad)."""
 ROUNDS, STEPS = 25, 50
 """Largest number of rounds with observations, and of steps of the arms alone."""
+DIVERGING = 12
+"""Number of steps of the arms after which a step above one standard deviation shows that they diverge; converging ones
+need up to 6 until then. The scale can change by a factor of 400 in these steps."""
 STEP_SETTLED = 0.01
 """Largest step of an arm's unknown, in standard deviations, at which the rounds end."""
 ROUNDING = 1e-9
@@ -467,10 +470,11 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
 
     Given camera poses with a covariance move to their likeliest values, too. If they stayed, the scale would be too
     small: the regression on values with errors is attenuated (Fuller, Measurement error models, 1987, section 1.1). The
-    iteration ends when the squared step in units of standard deviations is below `settled`.
+    iteration ends when the squared step in units of standard deviations is below `settled`, or still above 1 after
+    DIVERGING steps.
     """
     arms = problem.arm_unknowns
-    for _ in range(STEPS):
+    for count in range(STEPS):
         poses = pose_equations(problem, state, images)
         equations = poses.equations
         sizes, _ = most_likely(equations, state.robot_log_sizes, SIZES_SETTLED / 3)
@@ -479,7 +483,8 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         step = share * solution.step[:arms]
         columns = share * poses.rig_step(solution) if images is None else None
         state = replace(stepped(problem, state, step, columns), robot_log_sizes=sizes)
-        if float(((step @ solution.information_root[:arms]) ** 2).sum()) < settled:
+        size = float(((step @ solution.information_root[:arms]) ** 2).sum())
+        if size < settled or (size > 1 and count >= DIVERGING):
             break
     return state
 
