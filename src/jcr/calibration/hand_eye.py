@@ -113,6 +113,31 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         )
     if systematic is None:
         systematic = _systematic(gripper, robot, joints)
+    if camera_covariance is not None:
+        camera_errors = "none"
+    fit, distinct = _fitted(
+        gripper, camera, robot_noise, priors, camera_covariance, systematic, camera_errors
+    )
+    named = [f"pose {k}" for k in range(n)] if names is None else names
+    return judged(_with_residuals(gripper, camera, fit, distinct, named))
+
+
+def _fitted(
+    gripper: Poses,
+    camera: Poses,
+    noise: tuple[float, float] | None,
+    priors: tuple[LinearPrior, ...],
+    camera_covariance: Float[ndarray, "r r"] | None,
+    systematic: Float[ndarray, "r r"],
+    camera_errors: Literal["none", "independent", "in sequence"],
+) -> tuple[Solution, Int[ndarray, " n"]]:
+    """Return the robust fit to the poses without duplicates, and for each pose its index in that fit.
+
+    `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `camera_covariance`
+    (6n,6n; None: exact) is that of the camera poses, `systematic` that of the systematic robot errors. Errors of the
+    camera poses of the kinds `camera_errors` are tested, and included if the poses show them.
+    """
+    n = len(gripper)
     # Poses that occur twice count once, because an error that occurs twice would look like agreement. They are sorted,
     # so that the result does not depend on their order.
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
@@ -123,24 +148,20 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
         """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
         errors = None if covariance is None else covariance[among]
-        return robust_fit(
-            gripper[order], camera[order], robot_noise, priors, errors, systematic[among], agreeing
-        )
+        return robust_fit(gripper[order], camera[order], noise, priors, errors, systematic[among], agreeing)
 
     fit = fitted(camera_covariance)
-    if camera_covariance is None and camera_errors != "none":
+    if camera_errors != "none":
         assert fit.problem.used is not None
         start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
         if not poses_agree(fit.noise):
             # The fit may have explained camera errors by systematic robot errors; the closed form has neither.
             start, used = initial_estimate(gripper, camera), np.ones(n, dtype=bool)
-        adding_up = camera_errors == "in sequence"
         errors = camera_error_covariance(
-            gripper, camera, start, used, systematic, robot_noise, priors, adding_up
+            gripper, camera, start, used, systematic, noise, priors, camera_errors == "in sequence"
         )
         fit = fit if errors is None else fitted(errors)
-    named = [f"pose {k}" for k in range(n)] if names is None else names
-    return judged(_with_residuals(gripper, camera, fit, distinct, named))
+    return fit, distinct
 
 
 def _with_residuals(
