@@ -10,7 +10,7 @@ from numpy import ndarray
 from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case, with_findings
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
-from jcr.calibration.checks.capture import check_registered, check_remarks
+from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
 from jcr.calibration.checks.convention import better_reading, check_convention
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
@@ -36,6 +36,7 @@ CHECKS = (
     check_pairing,
     check_board_shapes,
     check_effects,
+    check_pieces,
     check_predicted_focal,
     check_boards,
     check_lengths,

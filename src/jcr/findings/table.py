@@ -307,6 +307,11 @@ class FindingKind(StrEnum):
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
         explains=(*MISFIT, *TOO_FEW))
+    PIECES = "reconstruction in pieces", KindRow("reconstruction",
+        "the reconstruction is in pieces: {value:.0f} of {of:.0f} images, such as {images[0]}, agree with their gripper "
+        "poses among themselves and contradict the other images",
+        "avoid patterns that repeat, as of a board alone, or name the board (--board); let the views overlap more",
+        explains=MISFIT)
     POSES_SWAPPED = "gripper poses exchanged", KindRow("single",
         "{images} have each other's gripper poses", "correct the pairing of images and poses", explains=MISFIT)
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",

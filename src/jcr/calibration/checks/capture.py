@@ -7,16 +7,25 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.calibration.case import Case
+from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
+from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.observability import observability
+from jcr.estimation.pose_equations import predicted_gripper_poses
+from jcr.estimation.robust import least_trimmed
 from jcr.features.sift import FARTHEST, detect, grey_of
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import largest_motion
+from jcr.geometry import inverse, largest_motion, scale_translation, step_between
 from jcr.records import Capture
 
 SAME = (10e-3, float(np.radians(1.0)))
 """Largest difference (m, rad) of a reported from a predicted gripper pose for which both count as the same pose."""
+LEAST_OF_PIECE = 3
+"""Fewest images of a piece of a reconstruction apart from the largest one; two images agree by chance."""
+CONCENTRATED = 4
+"""Number of concentration steps of the least trimmed squares (Rousseeuw and Van Driessen 1999)."""
+MOST_IN_PIECES = 2 / 3
+"""Smallest fraction of the images outside the largest piece that must belong to other pieces."""
 STILL = (20e-3, np.radians(5.0))
 """Motion of the gripper (m, rad) from which the images of a wrist camera must differ."""
 REPETITIVE = 0.9
@@ -53,6 +62,38 @@ def check_registered(case: Case) -> Case:
         replace(one, concerns="reconstruction") if one in unseen else one for one in hand_eye.findings
     )
     return case.after((few,), replace(hand_eye, findings=findings))
+
+
+def check_pieces(case: Case) -> Case:
+    """Return the case with a finding if the reconstruction is in pieces: groups of images that contradict each other.
+
+    With the hand-eye transform of the largest group, each image gives a value of base_from_recon. The values agree
+    within a piece; wrong gripper poses give scattered values instead. Values agree if the gripper poses that they
+    predict differ by at most SAME. Accepted calibrations are not tested.
+    """
+    gripper, camera = case.base_from_gripper, case.recon_from_camera
+    if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
+        return case
+    agree, _ = least_trimmed(gripper, camera)
+    for _ in range(CONCENTRATED):
+        x, scale, z = initial_estimate(gripper[agree], camera[agree])
+        off = np.linalg.norm(
+            step_between(gripper, predicted_gripper_poses(x, scale, z, camera)) / np.repeat(SAME, 3), axis=1
+        )
+        agree = off <= np.sort(off)[max(MIN_IMAGES, len(off) // 2) - 1]
+    x, scale, z = initial_estimate(gripper[agree], camera[agree])
+    each = gripper @ x @ inverse(scale_translation(camera, scale))
+    predicted = each[:, None] @ scale_translation(camera, scale) @ inverse(x)
+    off = np.linalg.norm(step_between(gripper, predicted).reshape(*predicted.shape[:2], 2, 3), axis=-1)
+    near = (off < SAME).all(-1)
+    largest = near[int(near.sum(1).argmax())]
+    others = np.flatnonzero(~largest)
+    in_pieces = near[np.ix_(others, others)].sum(1) >= LEAST_OF_PIECE
+    if largest.sum() < MIN_IMAGES or in_pieces.sum() < max(LEAST_OF_PIECE, MOST_IN_PIECES * len(others)):
+        return case
+    names = [case.names[row] for row in others[in_pieces]]
+    counts = {"value": float(len(names)), "of": float(len(gripper))}
+    return case.after((Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts),))
 
 
 def check_remarks(case: Case) -> Case:
