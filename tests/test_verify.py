@@ -23,10 +23,9 @@ from jcr.estimation.robot_noise import smooth_errors
 from jcr.estimation.solve import solve
 from jcr.files import write_bytes
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
-from jcr.pipeline.options import VerifyOptions
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import touch
-from jcr.pipeline.verify import _judged, _of_two
+from jcr.pipeline.verify import TOLERANCE, _judged, _of_two
 from jcr.records import Capture
 from jcr.result import RunOptions, RunResult
 from scenes import reconstruction_of, reference_of
@@ -83,9 +82,7 @@ def drifts(
     fit = solve(*pose_problem(reported[:OLD], places[:OLD], start))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
     systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
-    return drift(
-        fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic, 1e-3
-    )
+    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic)
 
 
 def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):
@@ -224,13 +221,13 @@ def test_a_new_image_of_a_fixed_camera_shows_rotation(out: Path, capture: Captur
 @pytest.mark.parametrize(("std_mm", "is_blind"), [(0.5, False), (20.0, True)])
 def test_images_that_would_not_show_a_drift_that_matters_are_a_warning(std_mm: float, is_blind: bool):
     covariance = np.diag([*3 * [(1e-3 * std_mm) ** 2], *3 * [np.radians(0.05) ** 2]])
-    found = _of_two(np.zeros(6), covariance, VerifyOptions())
-    judged = _judged(found, VerifyOptions(), ["0.png"], ())
+    found = _of_two(np.zeros(6), covariance)
+    judged = _judged(found, TOLERANCE, ["0.png"], ())
     assert not judged.moved and (judged.verdict == "accepted with warnings") is is_blind
     assert any("would not be noticed" in note for note in judged.notes) is is_blind
     shift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    found = _of_two(shift, covariance, VerifyOptions())
-    assert _judged(found, VerifyOptions(), ["0.png"], ()).moved is not is_blind
+    found = _of_two(shift, covariance)
+    assert _judged(found, TOLERANCE, ["0.png"], ()).moved is not is_blind
 
 
 @pytest.fixture(scope="module")

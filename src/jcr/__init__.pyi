@@ -33,7 +33,6 @@ from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
 from .pipeline.check import Examination as Examination
 from .pipeline.check import check_capture as check_capture
-from .pipeline.options import VerifyOptions as VerifyOptions
 from .pipeline.run import add_camera as add_camera
 from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate

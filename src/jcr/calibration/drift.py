@@ -21,6 +21,8 @@ from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, inverse, retract
 
+ALPHA = 1e-3
+"""False-alarm rate: the probability of reporting a motion when nothing has moved."""
 CLEAR = 5.0
 """Difference of log p-values from which a motion of the camera is distinguished from one of the scene (150 to 1)."""
 KNOWN = 1e9
@@ -59,7 +61,6 @@ def drift(
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
-    alpha: float,
 ) -> Drift:
     """Estimate and test the motion of the camera on the gripper between a calibration and new images.
 
@@ -69,7 +70,7 @@ def drift(
     vector (rad), in recon axes.
 
     `systematic` (s,s), s = 6 (n + k), is the covariance of the systematic errors of old, then new gripper poses. Its
-    rows are m and rad in base axes, for an error size of 1 rad. `alpha` is the probability of a false alarm.
+    rows are m and rad in base axes, for an error size of 1 rad.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
     first, state = len(old[0]), calibrated.state
@@ -94,7 +95,7 @@ def drift(
         covariance=of_camera.covariance,
         p_value=float(np.exp(of_camera.log_p)),
         cause="either" if unclear else "camera" if difference < 0 else "scene",
-        detectable=detectable(of_camera.covariance, alpha),
+        detectable=detectable(of_camera.covariance),
         is_noisier=bool((now > NOISIER * then).any()),
     )
 
@@ -126,12 +127,12 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
             return test
 
 
-def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
-    """Return translation (m) and rotation (rad) that a χ² test at level `alpha` detects with probability 0.9.
+def detectable(covariance: Float[ndarray, "6 6"]) -> tuple[float, float]:
+    """Return translation (m) and rotation (rad) that a χ² test at level ALPHA detects with probability 0.9.
 
-    `alpha` is the probability of a false alarm. `covariance` is that of an estimated motion: translation (m), then
-    rotation vector (rad). The motions to detect have its least certain direction.
+    `covariance` is that of an estimated motion: translation (m), then rotation vector (rad). The motions to detect have
+    its least certain direction.
     """
-    length = np.sqrt(chndtrinc(chi2.isf(alpha, 6), 6, 1 - POWER))
+    length = np.sqrt(chndtrinc(chi2.isf(ALPHA, 6), 6, 1 - POWER))
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]
     return float(length * worst[0]), float(length * worst[1])

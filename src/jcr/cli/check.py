@@ -12,7 +12,6 @@ import tyro
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.findings import sentence, warnings_of
-from jcr.pipeline.options import VerifyOptions
 from jcr.progress import progress_bars
 from jcr.records import Capture, PosePairs
 from jcr.rounding import labelled, significant
@@ -48,8 +47,6 @@ class CheckCommand:
     """Register all images at full size. By default 8 are registered, in seconds, and all only if these show a fault."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Noise (1 sigma per axis) of the gripper poses; unset: estimated, or 0.5 mm and 0.1°."""
-    seed: int = 0
-    """Seed of the registration."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -67,7 +64,6 @@ class CheckCommand:
                 capture,
                 not self.poses_only,
                 options.robot_noise_m_rad,
-                self.seed,
                 progress,
                 self.thorough,
             )
@@ -238,7 +234,8 @@ class VerifyCommand:
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = (0.5, 0.05)
+    """Drifts smaller than both raise no alarm, however significant."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -251,7 +248,7 @@ class VerifyCommand:
 
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
             capture = read_capture(self.capture, self.read, into=scratch, progress=progress, at_least=1)
-            found = verify_run(self.out, capture, self.verify, progress)
+            found = verify_run(self.out, capture, self.tolerance, progress)
         cameras = (found, *found.others)
         drifts = [_drift(one, self.output.verbose) for one in cameras]
         (_, facts), *others = drifts

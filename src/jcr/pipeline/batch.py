@@ -17,6 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from jcr.calibration.difference import compare
+from jcr.calibration.drift import ALPHA
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -31,8 +32,6 @@ from jcr.result import CAPTURE, RunOptions, load_run
 
 MIN_EPISODES = 3
 """Smallest number of accepted episodes of a data set whose cameras are compared with each other."""
-MOVED_P = 1e-3
-"""p-value of the difference between two episodes' cameras below which the camera moved, as in `jcr verify`."""
 THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 """Environment variables from which numerical libraries read their number of threads when a process starts."""
 
@@ -170,7 +169,7 @@ def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
             mm = float(1e3 * np.linalg.norm(apart.translation_m))
             deg = float(np.degrees(np.linalg.norm(apart.rotation_vector)))
             found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg)
-            if apart.p_value is not None and apart.p_value < MOVED_P:
+            if apart.p_value is not None and apart.p_value < ALPHA:
                 reason = f"the camera differs by {mm:.1f} mm and {deg:.2f}° from that of most episodes"
                 found[k] = replace(found[k], reason=reason)
     return found

@@ -92,7 +92,6 @@ def check_capture(
     capture: Capture | PosePairs | str | Path,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
@@ -100,8 +99,8 @@ def check_capture(
 
     `look`: reconstruct the images from sparse features and compare the camera poses with the gripper poses. A few images
     of reduced size are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have
-    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad), `seed`
-    that of the reconstruction. Raises InputError if gripper poses and joint angles contradict each other.
+    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad). Raises
+    InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture, progress=progress)
@@ -114,14 +113,14 @@ def check_capture(
     camera, views, shown = None, (), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear = errors_of(given), np.arange(len(capture))
-        shown = _compare(capture, robot, options, seed, progress, thorough)
+        shown = _compare(capture, robot, options, progress, thorough)
     else:
         robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
         clear, remarks = _look(capture, views)
         notes += remarks
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         if look and verdict_of(views) != "rejected":
-            shown = _compare(capture, robot, options, seed, progress, thorough)
+            shown = _compare(capture, robot, options, progress, thorough)
     counted = clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
@@ -166,13 +165,12 @@ def _compare(
     capture: Capture | PosePairs,
     robot: RobotErrorPrior,
     options: CalibrateOptions,
-    seed: int,
     progress: Progress | None,
     thorough: bool,
 ) -> _Comparison:
     """Calibrate from gripper and camera poses, and return whether and how well both agree.
 
-    `robot` is the prior of the robot errors of all images, `seed` that of the reconstruction. The camera poses of
+    `robot` is the prior of the robot errors of all images. The camera poses of
     PosePairs are given, others are reconstructed from features: first those of QUICK images of reduced size; then those
     of all images if `thorough` is set, or if the first comparison fails, is rejected, or does not use all QUICK images.
     """
@@ -190,10 +188,10 @@ def _compare(
         rows, size_px = spread_rows(len(capture)), QUICK_SIZE_PX
         tried, of_tried = replace(capture.of_rows(rows), depths=None), robot.of(rows)
     try:
-        made = reconstruct_colmap(tried, "sift", seed, progress, size_px)
+        made = reconstruct_colmap(tried, "sift", 0, progress, size_px)
     except RejectedError as error:
         if is_quick:
-            return _compare(capture, robot, options, seed, progress, thorough=True)
+            return _compare(capture, robot, options, progress, thorough=True)
         return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
     hand_eye, assumptions, registered = case.hand_eye, None, made.image_index[case.hand_eye.inliers]
@@ -201,7 +199,7 @@ def _compare(
         assumptions = assumptions_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
     if is_quick and (verdict_of(hand_eye.findings) == "rejected" or len(registered) < QUICK):
-        return _compare(capture, robot, options, seed, progress, thorough=True)
+        return _compare(capture, robot, options, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,

@@ -1,4 +1,4 @@
-"""Options of `jcr batch` and `jcr verify`, separate from their modules so that the command-line help loads fast."""
+"""Options of `jcr batch`, separate from its module so that the command-line help loads fast."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,3 @@ class BatchOptions:
     """Cores that a capture takes, with --ray."""
     gpus_per_task: float = 0.0
     """GPUs that a capture takes, with --ray; 0.25 lets four share one."""
-
-
-@dataclass(frozen=True)
-class VerifyOptions:
-    """Options of the test for a moved camera."""
-
-    alpha: float = 1e-3
-    """False-alarm rate: the probability of reporting a movement when nothing has moved."""
-    tolerance: tuple[float, float] = (0.5, 0.05)
-    """MM DEG: drifts smaller than both raise no alarm, however significant."""

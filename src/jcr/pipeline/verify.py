@@ -3,13 +3,12 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.calibration.drift import Drift, detectable, drift
+from jcr.calibration.drift import ALPHA, Drift, detectable, drift
 from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
@@ -22,12 +21,13 @@ from jcr.estimation.problem import pose_problem
 from jcr.estimation.solve import solve
 from jcr.findings import Verdict, sentence
 from jcr.geometry import step_between
-from jcr.options import checked_options
-from jcr.pipeline.options import VerifyOptions
 from jcr.progress import Progress, silent
 from jcr.records import Capture, CellCamera
 from jcr.result import RunResult
 from jcr.sfm.register import register
+
+TOLERANCE = (0.5, 0.05)
+"""Default tolerance (mm, degrees): drifts smaller than both raise no alarm, however significant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,18 +78,17 @@ class Verification(Drift):
 def verify_run(
     out: str | Path,
     new: Capture | str | Path,
-    options: VerifyOptions | Mapping[str, Any] | None = None,
+    tolerance: tuple[float, float] = TOLERANCE,
     progress: Progress | None = None,
 ) -> Verification:
     """Test with the images of `new`, a capture or its path, whether the cameras of the run folder `out` have moved.
 
-    The new images are located in the reconstruction of the calibrated scene. Raises InputError if the run has no
-    accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
+    The new images are located in the reconstruction of the calibrated scene. Drifts smaller than both parts of
+    `tolerance` (mm, degrees) raise no alarm, however significant. Raises InputError if the run has no accepted
+    calibration or the images are of another camera. Raises RejectedError if no image shares enough features
     with the scene.
     """
-    report, options = progress or silent, checked_options(options, VerifyOptions)
-    if not 0 < options.alpha < 0.5:
-        raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
+    report = progress or silent
     if not isinstance(new, Capture):
         new = read_capture(new, at_least=1)
     run = RunResult(out)
@@ -113,8 +112,8 @@ def verify_run(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or calibrate images of "
             "another one (jcr calibrate) and compare both runs (jcr compare)"
         )
-    wrist = _in_old_scene(run, new, located, lost, options)
-    return replace(wrist, others=tuple(_fixed_cameras(run, new, options, progress)))
+    wrist = _in_old_scene(run, new, located, lost, tolerance)
+    return replace(wrist, others=tuple(_fixed_cameras(run, new, tolerance, progress)))
 
 
 def _new_images(
@@ -145,7 +144,11 @@ def _new_images(
 
 
 def _in_old_scene(
-    run: RunResult, new: Capture, located: Mapping[int, CameraPose], notes: list[str], options: VerifyOptions
+    run: RunResult,
+    new: Capture,
+    located: Mapping[int, CameraPose],
+    notes: list[str],
+    tolerance: tuple[float, float],
 ) -> Verification:
     """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
 
@@ -171,15 +174,14 @@ def _in_old_scene(
         old,
         (new.base_from_gripper[rows], cameras, np.stack([one.covariance for one in located.values()])),
         of_poses(robot.systematic, np.r_[used, len(capture) + np.array(rows)]),
-        options.alpha,
     )
     if robot.unused is not None:
         notes = [*notes, sentence(robot.unused)]
-    return _judged(found, options, [new.images[row] for row in rows], notes)
+    return _judged(found, tolerance, [new.images[row] for row in rows], notes)
 
 
 def _fixed_cameras(
-    run: RunResult, new: Capture, options: VerifyOptions, progress: Progress | None
+    run: RunResult, new: Capture, tolerance: tuple[float, float], progress: Progress | None
 ) -> Iterator[Verification]:
     """Yield the drift of each fixed camera of the run that has images in `new`.
 
@@ -216,31 +218,31 @@ def _fixed_cameras(
         before, after = (poses[one.name] for one in both)
         j = solution.derivative(after) - solution.derivative(before)
         offset = step_between(before(solution.state), after(solution.state))
-        found = _of_two(offset, j @ solution.covariance @ j.T, options)
+        found = _of_two(offset, j @ solution.covariance @ j.T)
         notes = [text for one in cell.cameras for text in one.warnings]
-        yield replace(_judged(found, options, now.images, notes), fixed=own.name)
+        yield replace(_judged(found, tolerance, now.images, notes), fixed=own.name)
 
 
-def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"], options: VerifyOptions) -> Drift:
+def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"]) -> Drift:
     """Return the drift of a camera from its old to its new pose, with a χ² test of the step between both.
 
     `offset` is that step (translation in m, then rotation vector in rad; axes of the gripper, or of the base for a fixed
-    camera), `covariance` its covariance. `options.alpha` is the probability of a false alarm.
+    camera), `covariance` its covariance.
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
-    noticed = detectable(covariance, options.alpha)
+    noticed = detectable(covariance)
     found = {"offset": offset, "covariance": covariance, "p_value": p_value, "detectable": noticed}
     return Drift(**found, cause="camera", is_noisier=False)
 
 
 def _judged(
-    found: Drift, options: VerifyOptions, images: Sequence[str], notes: Sequence[str]
+    found: Drift, tolerance: tuple[float, float], images: Sequence[str], notes: Sequence[str]
 ) -> Verification:
     """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
 
-    The drift is significant if its p-value is below `options.alpha`. The tolerance is exceeded if translation or
-    rotation is larger than in `options.tolerance` (mm, degrees). `notes` are warnings to include, and `images` are the
-    new images that were used.
+    The drift is significant if its p-value is below ALPHA. The tolerance is exceeded if translation or rotation is
+    larger than in `tolerance` (mm, degrees). `notes` are warnings to include, and `images` are the new images that were
+    used.
     """
     notes = list(notes)
     if found.is_noisier:
@@ -256,6 +258,6 @@ def _judged(
         )
     millimetres = 1e3 * float(np.linalg.norm(found.offset[:3]))
     degrees = float(np.degrees(np.linalg.norm(found.offset[3:])))
-    matters = millimetres > options.tolerance[0] or degrees > options.tolerance[1]
-    moved = found.p_value < options.alpha and matters
+    matters = millimetres > tolerance[0] or degrees > tolerance[1]
+    moved = found.p_value < ALPHA and matters
     return Verification(**vars(found), moved=moved, images=tuple(images), notes=tuple(notes))
