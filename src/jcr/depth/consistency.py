@@ -42,12 +42,14 @@ def agreement(sums, i, compared, others, a, b, centre, k, tolerance):
     _, h, w = compared.shape
     half, one, tolerance = np.float32(0.5), np.float32(1), np.float32(tolerance)
     nearer = np.float32(1 - SEEN_THROUGH)
+    pixels = np.empty((3, w), np.float32)
     for v in range(h):
         for n in range(len(others)):
             row, there = _row(v, n, a, b, k, w, h), compared[others[n]]
             for u in range(w):
-                here = abs(compared[i, v, u])
-                x, y, z = _pixel(u, here, row)
+                pixels[0, u], pixels[1, u], pixels[2, u] = _pixel(u, abs(compared[i, v, u]), row)
+            for u in range(w):
+                here, x, y, z = abs(compared[i, v, u]), pixels[0, u], pixels[1, u], pixels[2, u]
                 if x < 0:
                     continue
                 # Inverse depth there, interpolated; that of the nearest pixel if one of the four around is unknown.
@@ -133,11 +135,10 @@ def _pixel(u, inverse_depth, row):
     x is -1 if the inverse depth is 0, or if the point is behind the other camera or outside of its image.
     """
     (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = row
-    outside, ray = np.float32(-1), (np.float32(u) - cx) * per_fx
+    ray = (np.float32(u) - cx) * per_fx
     z = z0 * ray + z1 + bz * inverse_depth
-    if inverse_depth <= 0 or z <= 0:
-        return outside, outside, z
-    x, y = (x0 * ray + x1 + bx * inverse_depth) / z, (y0 * ray + y1 + by * inverse_depth) / z
-    if x < 0 or y < 0 or x >= right or y >= bottom:
-        return outside, outside, z
-    return x, y, z
+    ahead = (inverse_depth > 0) & (z > 0)
+    divisor = z if ahead else np.float32(1)
+    x, y = (x0 * ray + x1 + bx * inverse_depth) / divisor, (y0 * ray + y1 + by * inverse_depth) / divisor
+    inside = ahead & (x >= 0) & (y >= 0) & (x < right) & (y < bottom)
+    return x if inside else np.float32(-1), y, z
