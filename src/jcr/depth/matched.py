@@ -113,7 +113,8 @@ def match_depth(
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
         views = half.views(i, others, recon_from_camera)
-        found = random_planes(family, span, views[-1], h, blocks_of(w), random_state(i))
+        found = np.full((4, h, blocks_of(w)), UNKNOWN, np.float32)
+        random_planes(found, family, span, views[-1], random_state(i))
         for n, (size, tries) in enumerate(_COARSE):
             spread_planes(found, *views, (*span, size, tries), n, random_state(seed + n))
         found = full.enlarged(found)

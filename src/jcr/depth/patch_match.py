@@ -151,18 +151,16 @@ def _try_changed(found, v, u, k, search, halvings, state, tried):
 
 @compiled
 @no_type_check
-def random_planes(family, span, k, h, w, state):
-    """Return a random plane for each pixel, (4,h,w): rows 0 to 2 are the plane, and row 3 is the score UNKNOWN.
+def random_planes(found, family, span, k, state):
+    """Write a random plane for each pixel to rows 0 to 2 of `found` (4,h,w).
 
     Planes are vectors p in the camera frame with p·x = 1; `k` is fx, fy, cx, cy. About half of the planes are random
     mixtures of the two planes in `family` (2,3). The others have random normals and an inverse depth in `span`. `state`
     is the state of the random generator `uniform`, which is updated.
     """
     lowest, highest = span
-    found = np.empty((4, h, w), np.float32)
-    found[3] = UNKNOWN
-    for v in range(h):
-        for u in range(w):
+    for v in range(found.shape[1]):
+        for u in range(found.shape[2]):
             rx, ry = _ray(v, u, k)
             t = uniform(state)
             for c in range(3):
@@ -176,7 +174,6 @@ def random_planes(family, span, k, h, w, state):
                     n0, n1, facing = 0.0, 0.0, 1.0
                 scale = inverse_depth / facing
                 found[0, v, u], found[1, v, u], found[2, v, u] = n0 * scale, n1 * scale, n2 * scale
-    return found
 
 
 @compiled
