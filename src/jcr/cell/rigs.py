@@ -36,6 +36,8 @@ MAP_STD = (4e-3, np.radians(0.25))
 """Standard deviations (m, rad) of a localised pose by errors of map and intrinsics, not in its covariance."""
 APART = float(chi2.isf(1e-6, 6))
 """Squared Mahalanobis distance above which two poses of a camera differ."""
+AT_A_FRAME = (0.01, np.radians(1.0))
+"""Distance (m, rad) to a pose of the wrist camera below which a camera stated as fixed is likely the wrist camera."""
 EXACT_SCALE = 1e-4
 """Assumed relative standard deviation of the scale between two cameras of one reconstruction."""
 LEAST_POSES = 3
@@ -161,8 +163,14 @@ class Rigs:
         if seen.camera.mount == "gripper":
             return self._on_same_gripper(seen)
         place = seen.places[int(np.trace(seen.covariances, axis1=1, axis2=2).argmin())]
+        apart = np.linalg.norm(step_between(self.known.recon_from_camera, place).reshape(-1, 2, 3), axis=-1)
+        seen = replace(seen, rig=np.full(len(seen.used), len(self.poses)))
         self.poses.append(place)
-        return replace(seen, rig=np.full(len(seen.used), len(self.poses) - 1))
+        if not len(near := np.flatnonzero((apart < AT_A_FRAME).all(1))):
+            return seen
+        image, own = self.case.capture.images[self.rows[near[0]]], self.case.capture.camera_name
+        at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
+        return replace(seen, findings=(*seen.findings, at_own))
 
     def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Return the views of another camera on the own gripper; each image gets the rig of the own image taken with it.

@@ -289,6 +289,9 @@ class FindingKind(StrEnum):
         "the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°",
         help="intrinsics, or more images")
+    AT_ANOTHER_CAMERA = "camera stands where another was", KindRow("cell",
+        "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
+        "not fixed", help="check that the image is its own")
     STATIC_IMAGES = "images show no motion", KindRow("images",
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
         "by {rotation_deg:.0f}°",
