@@ -28,7 +28,8 @@ from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.estimation.prediction import predict
-from jcr.estimation.solve import adjust_wrist, recon_frame, uncertainty_of
+from jcr.estimation.problem import wrist_arm, wrist_problem
+from jcr.estimation.solve import recon_frame, solve, uncertainty_of
 from jcr.geometry import step_between
 from jcr.pipeline.check import assumptions_of, spread_rows
 from jcr.records import Capture, Intrinsics, Reconstruction, Uncertainty
@@ -90,8 +91,8 @@ def measure_robots(arms: Sequence[str]) -> list[RobotRow]:
     rows: list[RobotRow] = []
     for preset, count in product(get_args(PresetName), COUNTS):
         problems = [bent_problem(arm_named(arm), preset, count, 0) for arm in arms]
-        for known, solve in SOLVERS.items():
-            answers = [solve(p) for p in problems]
+        for known, method in SOLVERS.items():
+            answers = [method(p) for p in problems]
             off = _errors(problems, [(one.gripper_from_camera, one.scale) for one in answers])
             accepted = np.array([one.converged for one in answers])
             shares = []
@@ -191,7 +192,8 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
         fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
         start = known.start(rng)
         free = camera_with_prior(start) if known.is_given else camera_with_prior(start, ESTIMATED)
-        found = adjust_wrist(problem.base_from_gripper, fit, problem.recon_from_camera, free, tracks)
+        arm = wrist_arm(problem.base_from_gripper)
+        found = solve(*wrist_problem(arm, fit, problem.recon_from_camera, free, tracks))
         scale, camera = recon_frame(found, tracks)[0], found.problem.intrinsics(found.state)[0]
         # Errors of points in axes of the estimated camera, and their stated covariance.
         x, x_px = found.state.x[0], nine_pixels(known.camera)

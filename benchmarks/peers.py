@@ -18,7 +18,9 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
-from jcr.estimation.solve import adjust_wrist, recon_frame
+from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
+from jcr.estimation.problem import wrist_arm, wrist_problem
+from jcr.estimation.solve import recon_frame, solve
 from jcr.geometry import (
     Similarity,
     fit_similarity,
@@ -126,10 +128,11 @@ def _answers(problem: HandEyeProblem, seed: int) -> Iterator[tuple[str, Answer |
     used = solved.inliers
     tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
     fit = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
-    adjusted = adjust_wrist(gripper[used], fit, camera[used], INTRINSICS, tracks)
+    exact = camera_with_prior(INTRINSICS, FIXED)
+    adjusted = solve(*wrist_problem(wrist_arm(gripper[used]), fit, camera[used], exact, tracks))
     yield "jcr, bundle adjustment", (adjusted.state.x[0], recon_frame(adjusted, tracks)[0])
-    for name, solve in PAPER_SOLVERS.items():
-        yield name, solve(gripper, camera)
+    for name, method in PAPER_SOLVERS.items():
+        yield name, method(gripper, camera)
     for name in OPENCV_METHODS:
         try:
             answer = opencv(name, gripper, camera, problem.scale)

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from jcr.camera import parameter_names, parameters, project, unproject, with_parameters, zoomed
 from jcr.estimation.intrinsics_prior import ESTIMATED, FIXED, camera_with_prior
 from jcr.estimation.pose_equations import fit_known_scale, predicted_gripper_poses
-from jcr.estimation.solve import adjust_wrist
+from jcr.estimation.problem import wrist_arm, wrist_problem
+from jcr.estimation.solve import solve
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from simulation.arms import EFFECTIVE_NOISE, EFFECTIVE_POSES
@@ -249,7 +250,7 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     cameras, m = found.base_from_camera, len(found.base_from_camera)
     start = np.eye(4), 1.0, np.eye(4)
     free = camera_with_prior(found.intrinsics, ESTIMATED if estimated else FIXED)
-    sfm = adjust_wrist(cameras, start, cameras, free, found.tracks, noise=LOOSE)
+    sfm = solve(*wrist_problem(wrist_arm(cameras), start, cameras, free, found.tracks, noise=LOOSE))
     state = sfm.state
     intrinsics, x = sfm.problem.intrinsics(state)[0], state.x[0]
     rigs = predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig)

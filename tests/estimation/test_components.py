@@ -5,10 +5,10 @@ import pytest
 
 import jcr
 from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.robot_errors import errors_of
 from jcr.distributions import chi2
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import joint_offsets
-from jcr.estimation.inverse_kinematics import posed
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
@@ -113,12 +113,11 @@ def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, r
 def examined(preset: PresetName, seed: int):
     problem = bent_problem(arm_named("ur5e"), preset, 12, seed)
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
-    arm, joints = posed(problem.bent.arm, problem.joints, gripper)
-    systematic = arm_errors(arm, joints)
-    solved = solve_hand_eye(gripper, camera, systematic=systematic)
+    robot = errors_of(gripper, problem.bent.arm, problem.joints)
+    solved = solve_hand_eye(gripper, camera, systematic=robot.systematic)
     start = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
-    poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=systematic), None)
-    return problem.bent.errors[:6], joint_offsets(poses, arm, joints)
+    poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=robot.systematic), None)
+    return problem.bent.errors[:6], joint_offsets(poses, robot.arm, robot.joints)
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def test_what_is_not_known_of_the_camera_is_in_the_expectation():
     exact = typical_camera(given, (640, 480), np.zeros(9))
     systematic = errors_of(gripper).systematic
     known, measured, unknown = (
-        predict(assumed(gripper, camera), gripper, systematic)
+        predict(assumed(gripper, camera, None), gripper, systematic)
         for camera in (exact, typical_camera(given, (640, 480)), typical_camera(None, (640, 480)))
     )
     assert 1.5 * known.std[3] < measured.std[3] < unknown.std[3]

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.robot_errors import errors_of
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm, posed
+from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm
 from jcr.estimation.kinematics import error_jacobian, error_std, forward_kinematics, with_tool
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from simulation.arms import BentArm
@@ -174,7 +175,7 @@ def test_poses_of_another_arm_are_refused_in_one_line():
     large = arm_named("ur10e")
     poses = forward_kinematics(large, postures(large, 8, spread=0.3))
     with pytest.raises(InputError, match=r"poses do not fit a so101: \d+ mm, .*° off; name another robot"):
-        posed(arm_named("so101"), None, poses)
+        errors_of(poses, arm_named("so101"))
     with pytest.raises(InputError, match="robot ur6: not known; choose one of ur3e, .*so101"):
         arm_named("ur6")
 

@@ -17,6 +17,7 @@ from jcr.estimation.elimination import Derivatives, Sightings, with_fixed_points
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
+    FIXED,
     MEASURED,
     TYPICAL,
     CameraPrior,
@@ -36,26 +37,32 @@ from jcr.estimation.problem import (
     State,
     stepped,
     with_observations,
+    wrist_arm,
+    wrist_problem,
 )
 from jcr.estimation.projection import derivatives, view_of
-from jcr.estimation.solve import Solution, adjust_wrist, uncertainty_of
+from jcr.estimation.solve import Solution, solve, uncertainty_of
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 from simulation.cells import CellProblem, Kind, cell_problem
 from simulation.problems import INTRINSICS, HandEyeProblem, bent_problem, error, hand_eye_problem, observed
 
+EXACT_CAMERA = camera_with_prior(INTRINSICS, FIXED)
+
 
 def solved(
-    problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics | CameraPrior = INTRINSICS, **options
+    problem: HandEyeProblem, tracks: Tracks, camera: CameraPrior = EXACT_CAMERA, **options
 ) -> Solution:
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    return adjust_wrist(
-        problem.base_from_gripper,
-        (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
-        problem.recon_from_camera,
-        intrinsics,
-        tracks,
-        **options,
+    return solve(
+        *wrist_problem(
+            wrist_arm(problem.base_from_gripper),
+            (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
+            problem.recon_from_camera,
+            camera,
+            tracks,
+            **options,
+        )
     )
 
 
@@ -273,14 +280,7 @@ DISTANCE_M = 0.45
 def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Solution, Tracks, Calibration]:
     tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3)
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    found = adjust_wrist(
-        problem.base_from_gripper,
-        (start.gripper_from_camera, start.scale, start.base_from_recon.rigid),
-        problem.recon_from_camera,
-        camera_with_prior(INTRINSICS, ESTIMATED),
-        tracks,
-    )
-    return found, tracks, start
+    return solved(problem, tracks, camera_with_prior(INTRINSICS, ESTIMATED)), tracks, start
 
 
 @cache

@@ -21,9 +21,9 @@ from jcr.estimation.pose_equations import (
     predicted_gripper_poses,
     reported_poses,
 )
-from jcr.estimation.problem import pose_problem, wrist_arm
+from jcr.estimation.problem import pose_problem, transferred, wrist_arm, wrist_problem
 from jcr.estimation.projection import view_of
-from jcr.estimation.solve import START_NOISE, Solution, adjust_wrist, recon_frame, solve, uncertainty_of
+from jcr.estimation.solve import START_NOISE, Solution, recon_frame, solve, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import (
     apply,
@@ -113,7 +113,7 @@ def adjust_case(
     fit = case.pose_fit
     arm = wrist_arm(case.base_from_gripper[case.used], case.systematic)
     metres, radians = fit.robot_noise.together
-    return adjust_wrist(
+    problem, state = wrist_problem(
         replace(arm, carries=case.carries, confirmed_errors=confirmed_errors),
         (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
         case.recon_from_camera[case.used],
@@ -121,9 +121,11 @@ def adjust_case(
         case.tracks,
         noise=case.options.robot_noise_m_rad,
         combinations=combinations,
-        near=case.adjusted,
-        start_noise=(max(START_NOISE[0], metres), max(START_NOISE[1], radians)),
     )
+    if (near := case.adjusted) is not None:
+        state = transferred(near.problem, near.state, problem)
+    noise = max(START_NOISE[0], metres), max(START_NOISE[1], radians)
+    return solve(problem, state, start_noise=noise)
 
 
 def with_intrinsics_considered(case: Case) -> Calibration:

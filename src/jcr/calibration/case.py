@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import RobotErrorPrior, of_poses
+from jcr.calibration.robot_errors import RobotErrorPrior
 from jcr.camera import usable_intrinsics
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
@@ -22,6 +22,7 @@ from jcr.estimation.intrinsics_prior import (
     camera_with_prior,
 )
 from jcr.estimation.problem import LinearPrior
+from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, is_explained, verdict_of
 from jcr.records import Capture, Reconstruction, Tracks
@@ -46,7 +47,7 @@ class Case:
     options: CalibrateOptions
     robot: RobotErrorPrior
     """Prior covariance of the systematic errors of the registered images' gripper poses."""
-    priors: tuple[LinearPrior, ...]
+    priors: tuple[LinearPrior, ...] = ()
     """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
     hand_eye: Calibration
     """Current calibration; its images are the registered ones."""

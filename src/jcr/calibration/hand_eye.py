@@ -19,6 +19,7 @@ from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, pose_residuals
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
+from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, strongest_first
@@ -142,13 +143,12 @@ def _fitted(
     # so that the result does not depend on their order.
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, distinct = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    among = np.ix_(*[(6 * order[:, None] + np.arange(6)).ravel()] * 2)
     agreeing = least_trimmed(gripper[order], camera[order])[0] if len(order) >= FEW else None
 
     def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
         """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
-        errors = None if covariance is None else covariance[among]
-        return robust_fit(gripper[order], camera[order], noise, priors, errors, systematic[among], agreeing)
+        errors, of_robot = None if covariance is None else of_poses(covariance, order), of_poses(systematic, order)
+        return robust_fit(gripper[order], camera[order], noise, priors, errors, of_robot, agreeing)
 
     fit = fitted(camera_covariance)
     if camera_errors != "none":

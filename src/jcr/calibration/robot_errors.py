@@ -10,9 +10,9 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.inverse_kinematics import LengthError, posed
-from jcr.estimation.kinematics import Arm, Joints
-from jcr.estimation.robot_noise import arm_errors, smooth_errors
+from jcr.estimation.inverse_kinematics import REFUSED, LengthError, inverse_kinematics, mounted_arm
+from jcr.estimation.kinematics import Arm, Joints, with_tool
+from jcr.estimation.robot_noise import arm_errors, of_poses, smooth_errors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses
 from jcr.records import Capture
@@ -69,19 +69,20 @@ def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = No
     """Return the prior covariance of systematic errors of gripper poses, for an arm or (None) an unknown robot.
 
     The covariance is that for an error size of 1 rad (`RobotErrorPrior.systematic`). `gripper` holds base_from_gripper
-    (m). `joints` (n,dof) are the joint angles (rad); None: inverse kinematics computes them. Raises InputError if the
-    poses do not fit the arm and the angles.
+    (m). `joints` (n,dof) are the joint angles (rad), to which base and tool of the arm are fitted; None: inverse
+    kinematics computes angles and tool. Raises InputError if the poses do not fit the arm and the angles.
     """
     if arm is None:
         return RobotErrorPrior(smooth_errors(gripper))
-    arm, joints = posed(arm, joints, gripper)
+    if joints is not None:
+        arm = mounted_arm(arm, joints, gripper)
+    else:
+        posture = inverse_kinematics(arm, gripper)
+        metres, radians = posture.misfit.max(0)
+        if metres > REFUSED[0] * arm.reach or radians > REFUSED[1]:
+            raise InputError(
+                f"poses do not fit a {arm.name}: {1e3 * metres:.0f} mm, {np.degrees(radians):.1f}° off; name another "
+                "robot, or leave it out"
+            )
+        arm, joints = with_tool(arm, posture.flange_from_tool), posture.joints
     return RobotErrorPrior(arm_errors(arm, joints), arm, joints)
-
-
-def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """Return the part of a covariance of poses for the poses of these indices, in their order.
-
-    Both matrices have six rows and columns per pose.
-    """
-    rows = (6 * poses[:, None] + np.arange(6)).ravel()
-    return covariance[np.ix_(rows, rows)]

@@ -11,6 +11,7 @@ from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
 from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.problem import Observations, Problem, State
+from jcr.estimation.robot_noise import of_poses
 from jcr.findings import FindingKind
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
@@ -90,6 +91,5 @@ def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:
         unit = np.tile(np.repeat([rigs.case.hand_eye.scale, 1.0], 3), len(rows))
-        among = (6 * rows[:, None] + np.arange(6)).ravel()
-        covariance += unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
+        covariance += unit[:, None] * of_poses(evidence.covariance, rows) * unit
     return rigs.known.recon_from_camera, covariance

@@ -79,13 +79,13 @@ def _franka(name: str, limits: Limits) -> Arm:
     return _arm(name, rows, limits, (0.0, -pi / 4, 0.0, -3 * pi / 4, 0.0, pi / 2, pi / 4))
 
 
-def _iiwa(name: str, base: float, upper: float, forearm: float) -> Arm:
+def _iiwa(name: str, base: float, upper: float) -> Arm:
     """Return a KUKA LBR iiwa 7 R800 or 14 R820, by its lengths (m); the gripper is the media flange "basic".
 
     Source: KUKA, "LBR iiwa: Specification" (lengths and limits); iiwa_description/urdf/iiwa7.xacro and iiwa14.xacro of
     IFL-CAMP/iiwa_stack (signs and the 126 mm from wrist to flange).
     """
-    d, alpha = (0, base, 0, upper, 0, forearm, 0, 0.126), (0, -90, 90, 90, -90, -90, 90, 0)
+    d, alpha = (0, base, 0, upper, 0, 0.4, 0, 0.126), (0, -90, 90, 90, -90, -90, 90, 0)
     limits = [(-limit, limit) for limit in np.radians([170, 120, 170, 120, 170, 120, 175])]
     return _arm(name, _dh([0] * 8, d, alpha), limits, (0.0, 0.4, 0.0, -1.6, 0.0, 1.1, 0.0))
 
@@ -153,8 +153,8 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
     "ur10e": lambda: _ur("ur10e", 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
     "panda": lambda: _franka("panda", _PANDA),
     "fr3": lambda: _franka("fr3", _FR3),
-    "iiwa7": lambda: _iiwa("iiwa7", 0.34, 0.4, 0.4),
-    "iiwa14": lambda: _iiwa("iiwa14", 0.36, 0.42, 0.4),
+    "iiwa7": lambda: _iiwa("iiwa7", 0.34, 0.4),
+    "iiwa14": lambda: _iiwa("iiwa14", 0.36, 0.42),
     "xarm6": lambda: _arm("xarm6", XARM6, _XARM6, (0.0, -0.3, -0.9, 0.0, 1.2, 0.0)),
     "xarm7": lambda: _arm("xarm7", XARM7, _XARM7, (0.0, -0.3, 0.0, 0.9, 0.0, 1.2, 0.0)),
     "z1": lambda: replace(

@@ -66,7 +66,10 @@ def posterior(
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
         """Return the covariance of the unknowns by systematic robot errors, which differ at other poses."""
         part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
-        second_moment = blocks_of_poses(part)
+        # The diagonal block (6,6) of each pose.
+        poses, each = part.shape[-1] // 6, np.arange(part.shape[-1] // 6)
+        blocks = part.reshape(*part.shape[:-2], poses, 6, poses, 6)[..., each, :, each, :]
+        second_moment = np.moveaxis(blocks, 0, -3)
         if expected:
             return region.spread(second_moment)
         # E[e eᵀ] of each pose's systematic error e, given the residuals of all poses, minus its prior value.
@@ -75,7 +78,6 @@ def posterior(
         for sign, whitened in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
             columns = np.moveaxis(whitened.reshape(*whitened.shape[:-1], -1, 6), -2, -3)
             learned = learned + sign * np.swapaxes(columns, -1, -2) @ columns
-        poses = learned.shape[-3]
         return region.spread(second_moment + poses / (poses + PRIOR_POSES) * learned)
 
     found = over_sizes(equations, mode, information, density)
@@ -99,13 +101,6 @@ def _whitened_and_fitted(
     """
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ matrix)
     return lower(solution.root, matrix), fitted
-
-
-def blocks_of_poses(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
-    """Return the diagonal block (6,6) of each of m poses from a covariance (s,s) of all poses, s = 6m."""
-    m = covariance.shape[-1] // 6
-    each = np.arange(m)
-    return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
 
 
 def _widening(

@@ -8,7 +8,6 @@ effect. The confirmation estimates the sizes again together with the effect (Seb
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -439,8 +438,6 @@ TESTED_IF_GIVEN = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 """Intrinsics that are tested if they were given."""
 TESTED_IF_ESTIMATED = ("fx", "p1", "p2")
 """Intrinsics that are tested of estimated ones, for which fx = fy and p1 = p2 = 0 was assumed."""
-OfImage = Literal["focal", "shear"]
-"""Names of the OF_IMAGE parameters of each image, in the order of the rows of `Problem.directions`."""
 
 
 def tested_intrinsics(model: Adjustment) -> list[str]:
@@ -470,18 +467,12 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     problem, view = model.solution.problem, model.solution.images.view
     observations = problem.observations
     assert observations is not None and model.camera is not None
-    camera, mine = (
-        problem.cameras[model.camera].intrinsics,
-        np.flatnonzero(observations.camera == model.camera),
-    )
+    camera = problem.cameras[model.camera].intrinsics
+    mine = np.flatnonzero(observations.camera == model.camera)
     names, m = parameter_names(camera), len(mine)
     every = np.eye(len(names) + OF_IMAGE * m + PRISM)
-
-    def of_images(parameter: OfImage, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
-        """Return the directions that change one parameter of the m images by the columns of `shares`."""
-        first = len(names) + get_args(OfImage).index(parameter) * m
-        return every[:, first : first + m] @ shares
-
+    # Directions of the focal length and of the shear of each image.
+    focal, shear = np.split(every[:, len(names) : -PRISM], OF_IMAGE, axis=1)
     tested = every[:, [names.index(name) for name in tested_intrinsics(model)]]
     yield Row(kind=FindingKind.INTRINSICS, columns=tested)
     if m < min_images:
@@ -492,18 +483,19 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     distance = np.array([np.median(view.depth[observations.image == k]) if (observations.image == k).any() else np.nan
                          for k in mine])  # fmt: skip
     far = np.log(np.where(np.isfinite(distance), distance, np.nanmedian(distance)))
-    by_distance = of_images("focal", (far - far.mean())[:, None])
-    unit, each = float(np.ptp(far)), of_images("focal", differences(m))
+    by_distance, unit = focal @ (far - far.mean())[:, None], float(np.ptp(far))
+    # An orthonormal basis of the vectors whose sum is 0.
+    each = focal @ np.linalg.svd(np.eye(m) - 1 / m)[0][:, : m - 1]
     yield Row(kind=FindingKind.FOCUS_BY_DISTANCE, columns=by_distance, nuisance=common, unit=unit)
     yield Row(kind=FindingKind.FOCUS_BY_IMAGE, columns=each, nuisance=common)
     for kind, shares in (
         (FindingKind.ROLLING_SHUTTER, np.ones((m, 1))),
         (FindingKind.ROLLING_SHUTTER_BY_IMAGE, np.eye(m)),
     ):
-        yield Row(kind=kind, columns=of_images("shear", shares), nuisance=common, unit=camera.fx)
+        yield Row(kind=kind, columns=shear @ shares, nuisance=common, unit=camera.fx)
     places = range(LEAST_ZOOMED, m - LEAST_ZOOMED + 1)
     for k in places:
-        after = of_images("focal", ((np.arange(m) >= k) - (m - k) / m)[:, None])
+        after = focal @ ((np.arange(m) >= k) - (m - k) / m)[:, None]
         yield Row(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
     if len(problem.cameras) == 1:  # all images have the same lens
         yield Row(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
@@ -520,8 +512,3 @@ def _dispersion(images: ImageEvidence) -> float:
     taken = 3 * len(images.state.points_in_world) + 6 * len(problem.seen.rows)
     expected = 2 * weight.sum() * max(1 - taken / (2 * len(weight)), 0.1)
     return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / expected
-
-
-def differences(count: int) -> Float[ndarray, "n d"]:
-    """Return an orthonormal basis (columns) of the vectors of length n = `count` whose sum is 0; d = n − 1."""
-    return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]

@@ -303,7 +303,7 @@ def _normal_equations(
     The points are eliminated. `weight` (1/px²) is that of each of k observations in `view`; `known` is information
     about rigs. `damping` increases the diagonal by this share, as in `without_points`.
     """
-    first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[3]
+    first, std, seen = problem.columns.first_rig, problem.prior_std(state), problem.rows[2]
     weighted = derivatives(problem, state, view, weight)
     hessian, right = with_fixed_points(weighted, seen)
     hessian[range(len(std)), range(len(std))] += std**-2.0

@@ -217,24 +217,6 @@ def _with_tool(
     ).unknowns[1]
 
 
-def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
-    """Return the arm with base and tool fitted to the poses, and the joint angles (n,dof; rad).
-
-    If `joints` is None, inverse kinematics computes angles and tool, and the base stays. Raises InputError if poses,
-    joints and arm do not agree.
-    """
-    if joints is not None:
-        return mounted_arm(arm, joints, base_from_gripper), joints
-    posture = inverse_kinematics(arm, base_from_gripper)
-    metres, radians = posture.misfit.max(0)
-    if metres > REFUSED[0] * arm.reach or radians > REFUSED[1]:
-        raise InputError(
-            f"poses do not fit a {arm.name}: {1e3 * metres:.0f} mm, {np.degrees(radians):.1f}° off; name another robot, "
-            "or leave it out"
-        )
-    return with_tool(arm, posture.flange_from_tool), posture.joints
-
-
 NOISE = (1e-3, 1e-3 / ARM)
 """Position and rotation errors (m, rad) that have equal weight in the fit of base and tool."""
 AGREE = (0.015, np.radians(1.5))

@@ -19,7 +19,7 @@ from jcr.estimation.pose_equations import pose_by_pose, reported_poses
 from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
 from jcr.estimation.solve import Solution
-from jcr.geometry import across_lines, apply, by_similarity, retract, skew
+from jcr.geometry import Transform, across_lines, apply, by_similarity, retract, skew
 from jcr.records import (
     GivenIntrinsicsResult,
     Intrinsics,
@@ -30,7 +30,6 @@ from jcr.records import (
     Uncertainty,
 )
 
-Transform = Float[ndarray, "4 4"]
 Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
 Covariances = Float[ndarray, "*points 3 3"]
@@ -204,7 +203,7 @@ def scene_points(solution: Solution) -> ScenePoints:
     some = np.sort(np.random.default_rng(0).permutation(len(images.state.points_in_world))[:SCENE_POINTS])
     base_from_world, scale, count = likely.z[0][:3, :3], likely.scale, len(some)
     # Each point follows from its observations, given the columns (cameras, boards, rigs) of `Problem.columns`.
-    _, rows_point, rows_rig, _ = problem.rows
+    _, rows_point, seen = problem.rows
     rows = np.flatnonzero(np.isin(rows_point, some))
     starts = np.flatnonzero(np.diff(rows_point[rows], prepend=-1))
     by = derivatives(problem, images.state, images.view, images.weight)
@@ -212,7 +211,7 @@ def scene_points(solution: Solution) -> ScenePoints:
     blocks = point_blocks(by_point, starts)
     columns = np.zeros((len(rows), 2, problem.columns.count))
     columns[:, :, :first] = by.shared[rows]
-    own = first + 6 * rows_rig[rows][:, None] + np.arange(6)
+    own = first + 6 * seen.image[rows][:, None] + np.arange(6)
     columns[np.arange(len(rows))[:, None, None], np.arange(2)[:, None], own[:, None]] = by.own[rows]
     coupling = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ columns, starts)
     by_column = -scale * base_from_world @ np.linalg.solve(blocks, coupling)

@@ -78,31 +78,25 @@ class Assumptions:
 
 
 def assumed(
-    base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None = None
+    base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None
 ) -> Assumptions:
     """Return assumptions before any calibration: typical robot errors, and a camera at the gripper's origin.
 
     The recorded or planned poses `base_from_gripper` determine the axis along which the camera looks
     (`assumed_camera`) and the median distance of the scene. `camera` None: camera poses are given and exact. `noise`
-    (m, rad) is a lower bound on the random errors of the robot.
+    (m, rad) is a lower bound on the random errors of the robot; None: no bound.
     """
-    x = assumed_camera(base_from_gripper)
+    x, sizes = assumed_camera(base_from_gripper), np.array(TYPICAL)
+    if noise is not None:
+        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(noise)
+    metres, radians, systematic = sizes.tolist()
     return Assumptions(
         gripper_from_camera=x,
         distance_m=median_distance(base_from_gripper @ x),
-        noise=typical_noise(noise),
+        noise=RobotNoise(
+            translation=metres, rotation=radians, estimated=False, given=noise, systematic=systematic
+        ),
         camera=camera,
-    )
-
-
-def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
-    """Return typical errors of a robot; `given` is a lower bound (m, rad) on the random errors; None: no bound."""
-    sizes = np.array(TYPICAL)
-    if given is not None:
-        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
-    metres, radians, systematic = sizes.tolist()
-    return RobotNoise(
-        translation=metres, rotation=radians, estimated=False, given=given, systematic=systematic
     )
 
 
@@ -213,25 +207,19 @@ SCENE_DISTANCE = (0.1, 2.0)
 """Smallest and largest distance of a scene (m)."""
 
 
-def scene_of(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
-    """Return the scene centre, the point nearest to all optical axes, and the distance (m) of each camera from it.
+def median_distance(camera: Poses) -> float:
+    """Return the median distance (m) of the cameras from the scene centre, the point nearest to all optical axes.
 
-    `camera` are poses base_from_camera; the centre (m) is in the base frame. If the median distance is not between 0.1
-    and 2 m (nearly parallel axes), the centre is the mean of the points 0.5 m ahead of the cameras.
+    `camera` are poses base_from_camera. If the median distance is not between 0.1 and 2 m (nearly parallel axes), the
+    centre is the mean of the points 0.5 m ahead of the cameras.
     """
     axis, center = camera[:, :3, 2], camera[:, :3, 3]
-    scene = nearest_to_lines(center, axis)
-    distance = np.linalg.norm(center - scene, axis=1)
+    distance = np.median(np.linalg.norm(center - nearest_to_lines(center, axis), axis=1))
     # Parallel axes have no common point; the scene is then taken half a metre away.
-    if not SCENE_DISTANCE[0] < np.median(distance) < SCENE_DISTANCE[1]:
+    if not SCENE_DISTANCE[0] < distance < SCENE_DISTANCE[1]:
         scene = (center + 0.5 * axis).mean(0)
-        distance = np.linalg.norm(center - scene, axis=1)
-    return scene, distance
-
-
-def median_distance(camera: Poses) -> float:
-    """Return the median distance (m) of the cameras (poses base_from_camera) from the scene centre of `scene_of`."""
-    return float(np.median(scene_of(camera)[1]))
+        distance = np.median(np.linalg.norm(center - scene, axis=1))
+    return float(distance)
 
 
 def assumed_camera(base_from_gripper: Poses) -> Transform:

@@ -262,8 +262,8 @@ class Problem:
         return Sightings.of(self.observations.point, rig, self.n_rigs)
 
     @cached_property
-    def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
-        """Order, points and rigs of the r rows of the image equations after sorting by point and rig, and their index.
+    def rows(self) -> tuple[Int[ndarray, " r"], Int[ndarray, " r"], Sightings]:
+        """Order and points of the r rows of the image equations after sorting by point and rig, and their index.
 
         A row has two residuals. Before sorting, the rows are the observations, then two rows for each board corner; the
         order holds their numbers before sorting.
@@ -271,12 +271,12 @@ class Problem:
         assert self.observations is not None
         point, rig = self.observations.point, self.observations.rig[self.observations.image]
         if self.boards is None:
-            return np.arange(len(point)), point, rig, self.seen
+            return np.arange(len(point)), point, self.seen
         both = np.stack([point, rig])
         both = np.concatenate([both, np.repeat([self.boards.point, self.boards.rig], 2, axis=1)], axis=1)
         order = np.lexsort(both[::-1])
         point, rig = both[:, order]
-        return order, point, rig, Sightings.of(point, rig, self.n_rigs)
+        return order, point, Sightings.of(point, rig, self.n_rigs)
 
     @cached_property
     def displacements(self) -> Float[ndarray, "k 2 e"]:
@@ -576,8 +576,6 @@ def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarr
 
 Start = tuple[Transform, float, Transform]
 """Initial estimate of gripper_from_camera, scale (metres per unit) and base_from_recon."""
-NO_ARM: Start = np.eye(4), 1.0, np.eye(4)
-"""Initial estimate for a problem without arms."""
 
 
 def wrist_arm(

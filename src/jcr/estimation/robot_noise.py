@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -57,6 +56,15 @@ def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
     columns = error_jacobian(arm, joints) * error_std(arm, 1.0, LINK_PER_JOINT)
     stacked = columns.reshape(-1, columns.shape[2])
     return stacked @ stacked.T
+
+
+def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
+    """Return the part of a covariance of poses for the poses of these indices, in their order.
+
+    Both matrices have six rows and columns per pose.
+    """
+    rows = (6 * poses[:, None] + np.arange(6)).ravel()
+    return covariance[np.ix_(rows, rows)]
 
 
 NOISE_FLOOR = (2e-5, np.radians(0.002))
@@ -147,18 +155,14 @@ class Equations:
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
         """Return the equations of k of the n poses; `poses` are their numbers."""
         rows = (6 * poses[:, None] + np.arange(6)).ravel()
-
-        def part(of: Covariance | None) -> Any:
-            return None if of is None else of[np.ix_(rows, rows)]
-
         return replace(
             self,
             residual=self.residual[rows],
             jacobian=self.jacobian[rows],
-            systematic=part(self.systematic),
-            known=part(self.known),
-            camera_errors=tuple(map(part, self.camera_errors)),
-            confirmed=part(self.confirmed),
+            systematic=of_poses(self.systematic, poses),
+            known=None if self.known is None else of_poses(self.known, poses),
+            camera_errors=tuple(of_poses(one, poses) for one in self.camera_errors),
+            confirmed=None if self.confirmed is None else of_poses(self.confirmed, poses),
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
@@ -255,10 +259,6 @@ class LinearSolution:
         V is the covariance of the residuals, J the Jacobian and C the covariance of the unknowns.
         """
         return self.weight - self.weighed @ self.gain
-
-
-Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]
-"""Groups of grid points of the log sizes: posterior weights (sum over all groups: 1), log sizes, solutions."""
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
@@ -360,7 +360,7 @@ def over_sizes(
     mode: LogSizes,
     information: Information,
     density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
-) -> Weighed:
+) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]:
     """Return a grid of log sizes about their mode: groups of posterior weights, log sizes and solutions.
 
     All weights together sum to 1. `density` returns the log posterior of the sizes of a solution, up to a constant;

@@ -29,7 +29,7 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.intrinsics_prior import FIXED, CameraPrior, camera_with_prior, unmodelled
+from jcr.estimation.intrinsics_prior import unmodelled
 from jcr.estimation.pose_equations import (
     PoseEquations,
     pose_by_pose,
@@ -41,16 +41,11 @@ from jcr.estimation.pose_equations import (
 from jcr.estimation.problem import (
     SCALE,
     Problem,
-    ReportedPoses,
-    Start,
     State,
     full_step,
     similarities_of_rigs,
     step_to,
     stepped,
-    transferred,
-    wrist_arm,
-    wrist_problem,
 )
 from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import (
@@ -64,12 +59,11 @@ from jcr.estimation.robot_noise import (
     score,
     solve_equations,
 )
-from jcr.geometry import Poses, Transform, apply, fit_similarity, step_between
+from jcr.geometry import Transform, apply, fit_similarity, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
     COVARIANCE_ORDER,
     Budget,
-    Intrinsics,
     JointCovariance,
     ModelError,
     RobotNoise,
@@ -243,35 +237,6 @@ def solve(
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
 
 
-def adjust_wrist(  # noqa: PLR0913 (each is a fact about the capture)
-    arm: ReportedPoses | Poses,
-    start: Start,
-    recon_from_camera: Poses,
-    camera: CameraPrior | Intrinsics,
-    tracks: Tracks,
-    *,
-    noise: tuple[float, float] | None = None,
-    combinations: Float[ndarray, "e p"] | None = None,
-    near: Solution | None = None,
-    start_noise: tuple[float, float] = START_NOISE,
-) -> Solution:
-    """Return the bundle adjustment of a wrist camera's images together with the reported poses.
-
-    Arguments are those of `wrist_problem` and `solve`. `arm` may be base_from_gripper of each image, with the
-    systematic errors `smooth_errors`; `camera` may be intrinsics, which are then exact. The iteration begins at `near`,
-    a solution for the same poses and the same or more points; None: at `start`.
-    """
-    arm = arm if isinstance(arm, ReportedPoses) else wrist_arm(arm)
-    if isinstance(camera, Intrinsics):
-        camera = camera_with_prior(camera, FIXED)
-    problem, state = wrist_problem(
-        arm, start, recon_from_camera, camera, tracks, noise=noise, combinations=combinations
-    )
-    if near is not None:
-        state = transferred(near.problem, near.state, problem)
-    return solve(problem, state, start_noise=start_noise)
-
-
 def uncertainty_of(found: Solution) -> Uncertainty:
     """Return the uncertainty of the first arm's X (gripper_from_camera), the scale and the first camera's intrinsics.
 
@@ -292,10 +257,8 @@ def uncertainty_of(found: Solution) -> Uncertainty:
     by_unknown = np.eye(7 + len(directions), len(found.covariance))
     by_unknown[7:] = 0.0
     by_unknown[7:, cameras] = directions
-    together, order = (
-        by_unknown @ found.covariance @ by_unknown.T,
-        (*COVARIANCE_ORDER, *parameter_names(known)),
-    )
+    together = by_unknown @ found.covariance @ by_unknown.T
+    order = *COVARIANCE_ORDER, *parameter_names(known)
     return Uncertainty(
         covariance=together[:7, :7],
         budget=found.budget,
@@ -358,7 +321,9 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
         state = replace(state, robot_log_sizes=log_sizes)
         change = np.inf if known_sizes is None else float(np.abs(log_sizes - known_sizes).max())
-        arms, columns, std = _joint_step(problem, poses, log_sizes)
+        solution, columns = solve_equations(equations, log_sizes), np.zeros(problem.columns.count)
+        columns[problem.free], columns[problem.by_arm] = solution.step[robots:], poses.rig_step(solution)
+        arms, std = solution.step[:robots], np.sqrt(solution.covariance.diagonal())
         last_step = float(np.abs(arms / std[:robots]).max())
         assert before.pixel_noise is not None and state.pixel_noise is not None
         growth = np.log(state.pixel_noise.sigma_px / before.pixel_noise.sigma_px)
@@ -388,21 +353,6 @@ def _rounds(problem: Problem, start: State) -> tuple[State, ImageEvidence, bool,
             ends, steps = [], []
     state = replace(state, robot_log_sizes=log_sizes)
     return state, image_evidence(problem, state), False, ROUNDS, last_step
-
-
-def _joint_step(
-    problem: Problem, poses: PoseEquations, log_sizes: LogSizes
-) -> tuple[Float[ndarray, " u"], Float[ndarray, " d"], Float[ndarray, " p"]]:
-    """Return the Gauss-Newton steps of the arms' u unknowns and of the d columns, and the std of p unknowns.
-
-    `poses` are the equations of the reported poses, `log_sizes` the log sizes of the robot's errors. The columns
-    (cameras, boards, rigs) are those of `Problem.columns`. The p unknowns are those of the arms, then the columns
-    `Problem.free`.
-    """
-    solution, arms = solve_equations(poses.equations, log_sizes), problem.arm_unknowns
-    columns = np.zeros(problem.columns.count)
-    columns[problem.free], columns[problem.by_arm] = solution.step[arms:], poses.rig_step(solution)
-    return solution.step[:arms], columns, np.sqrt(solution.covariance.diagonal())
 
 
 def _accelerated(

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from jcr.calibration.drift import ALPHA, Drift, detectable, drift
 from jcr.calibration.options import GRASPING
-from jcr.calibration.robot_errors import of_poses, robot_errors
+from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -18,6 +18,7 @@ from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.problem import pose_problem
+from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.solve import solve
 from jcr.findings import Verdict, sentence
 from jcr.geometry import step_between
