@@ -156,9 +156,8 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     seen, reconstruction = reconstructed(found, estimated=False)
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
     assert np.allclose(eye_to_hand(capture).base_from_gripper, seen.base_from_gripper)
-    hand_eye = refined(
-        capture, reconstruction, calibrate_reconstruction(eye_to_hand(capture), reconstruction)
-    )
+    found = calibrate_reconstruction(eye_to_hand(capture), reconstruction)
+    hand_eye = refined(capture, reconstruction, found, CalibrateOptions())
     assert hand_eye.converged and hand_eye.uncertainty.budget is not None
     parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)

@@ -70,14 +70,13 @@ def refined(
     capture: Capture,
     reconstruction: Reconstruction,
     found: Calibration,
-    options: CalibrateOptions | None = None,
+    options: CalibrateOptions,
 ) -> Calibration:
     """Return the calibration of a fixed camera, refined from `found`, with the gripper poses as reported.
 
     `found` was computed with inverse gripper poses (`eye_to_hand`). A rejected calibration is not refined; it gets the
     finding WRONG_MOUNT if the camera turns out to be on the gripper.
     """
-    options = options or CalibrateOptions()
     rows = reconstruction.image_index
     if not found.is_sound:
         on_gripper = solve_hand_eye(
@@ -90,7 +89,6 @@ def refined(
         reconstruction=reconstruction,
         options=options,
         robot=robot_errors(capture, options).of(rows),
-        priors=(),
         hand_eye=found,
         carries="scene",
     )

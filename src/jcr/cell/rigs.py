@@ -6,7 +6,7 @@ camera. A camera whose images contradict its stated mount is rejected here, befo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -21,9 +21,8 @@ from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses, State, scale_prior
-from jcr.estimation.robot_noise import smooth_errors
-from jcr.findings import Concerns, Finding, FindingKind
+from jcr.estimation.problem import ReportedPoses, State, scale_prior, wrist_arm
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
 from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registrations
@@ -112,16 +111,9 @@ class CameraViews:
         used = {k: one for k, one in self.used.items() if k not in reasons}
         return replace(self, used=used, reasons={**self.reasons, **reasons})
 
-    def refused(
-        self, why: FindingKind | Sequence[Finding], concerns: Concerns = "none", *images: str, **numbers: Any
-    ) -> CameraPlacement:
-        """Return a rejected placement of the camera with the findings `why`.
-
-        If `why` is one kind of finding, the other arguments are those of Finding.of; else they are not used.
-        """
-        if isinstance(why, FindingKind):
-            why = (Finding.of(why, "rejects", concerns, *images, **numbers),)
-        return CameraPlacement.of(self.camera, why, self.points, self.reasons)
+    def refused(self, *findings: Finding) -> CameraPlacement:
+        """Return a rejected placement of the camera; at least one of the findings must reject."""
+        return CameraPlacement.of(self.camera, findings, self.points, self.reasons)
 
     def parent_from_camera(self, state: State) -> Float[ndarray, "4 4"]:
         """Return base_from_camera of a fixed camera, else gripper_from_camera, for a state of the solution."""
@@ -157,7 +149,8 @@ class Rigs:
         if not seen.used:
             most = int(np.argmax(seen.points))
             best, count = seen.camera.images[most], float(seen.points[most])
-            return seen.refused(FindingKind.FEW_POINTS_SHARED, "images", best, value=count)
+            kind = FindingKind.FEW_POINTS_SHARED
+            return seen.refused(Finding.of(kind, "rejects", "images", best, value=count))
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         if seen.camera.mount == "gripper":
@@ -188,13 +181,13 @@ class Rigs:
             }
         )
         if not seen.used:
-            return seen.refused(FindingKind.NO_COMMON_POSE, "images")
+            return seen.refused(Finding.of(FindingKind.NO_COMMON_POSE, "rejects", "images"))
         rig = np.array([rig_of[frame[k]] for k in seen.used])
         moved = ()
         if len(seen.used) >= MIN_IMAGES:
             moved = fit_views(seen, self.known.recon_from_camera[rig], EXACT_SCALE)[1]
         if any(one.severity == "rejects" for one in moved):
-            return seen.refused(moved)
+            return seen.refused(*moved)
         for one in moved:
             if one.kind is FindingKind.SLIP:
                 first, before = seen.names.index(one.images[1]), one.details["longer"] == "before"
@@ -204,7 +197,7 @@ class Rigs:
         wrist = self.known.recon_from_camera[rig]
         apart = np.linalg.norm(step_between(wrist[:, None], wrist).reshape(-1, 2, 3), axis=-1)
         if (apart <= SAME_PLACE).all():
-            return seen.refused(FindingKind.ONE_GRIPPER_POSE, "images", *seen.names)
+            return seen.refused(Finding.of(FindingKind.ONE_GRIPPER_POSE, "rejects", "images", *seen.names))
         on_rig = inverse(wrist) @ seen.places
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -212,8 +205,8 @@ class Rigs:
         covariance = seen.covariances + seen.covariances[middle] + 2 * np.diag(np.repeat(MAP_STD, 3) ** 2)
         astray = (step * np.linalg.solve(covariance, step[..., None])[..., 0]).sum(-1) > APART
         if astray.mean() > 0.4:
-            most_m, own = float(np.linalg.norm(step[:, :3], axis=1).max()), capture.camera_name
-            return seen.refused(FindingKind.NOT_RIGID, "mount", value=most_m, camera=own)
+            size = {"value": float(np.linalg.norm(step[:, :3], axis=1).max()), "camera": capture.camera_name}
+            return seen.refused(Finding.of(FindingKind.NOT_RIGID, "rejects", "mount", **size))
         why = "its place on the gripper is not that of its other images"
         kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
@@ -225,16 +218,16 @@ class Rigs:
         """
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused(FindingKind.SECOND_ON_ARM, arm=arm)
+            return seen.refused(Finding.of(FindingKind.SECOND_ON_ARM, "rejects", arm=arm))
         if len(seen.used) < LEAST_POSES:
             counts = {"value": float(len(seen.used)), "needed": float(LEAST_POSES)}
-            return seen.refused(FindingKind.FEW_LOCALISED, "images", **counts)
+            return seen.refused(Finding.of(FindingKind.FEW_LOCALISED, "rejects", "images", **counts))
         gripper = seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self.case.hand_eye.covariance[6, 6])), 1e-4)
         found, effects = fit_views(seen, gripper, std)
         if not found.converged:
-            explained = tuple(replace(one, severity="rejects") for one in effects)
-            return seen.refused(explained or found.findings)
+            explained = [replace(one, severity="rejects") for one in effects]
+            return seen.refused(*(explained or found.findings))
         used = found.inliers
         kept = seen.without({int(seen.rows[k]): str(found.images[k].reason) for k in np.flatnonzero(~used)})
         rig = len(self.poses) + np.arange(used.sum())
@@ -249,18 +242,9 @@ class Rigs:
         poses = case.capture.base_from_gripper[self.rows]
         kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
         bent = [row.unit * row.columns for row in arm_rows(poses) if row.kind in kinds]
-        arms = [
-            ReportedPoses(
-                rigs=np.arange(len(poses)),
-                base_from_gripper=poses,
-                error_covariance=case.systematic,
-                confirmed_errors=np.concatenate(bent, axis=1) if bent else None,
-            )
-        ]
-        for rigs, gripper, _ in self._of_arms:
-            arms.append(
-                ReportedPoses(rigs=rigs, base_from_gripper=gripper, error_covariance=smooth_errors(gripper))
-            )
+        confirmed = np.concatenate(bent, axis=1) if bent else None
+        arms = [replace(wrist_arm(poses, case.systematic), confirmed_errors=confirmed)]
+        arms += [replace(wrist_arm(gripper), rigs=rigs) for rigs, gripper, _ in self._of_arms]
         found = [case.hand_eye, *(one for _, _, one in self._of_arms)]
         return arms, [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
 

@@ -30,13 +30,12 @@ from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.problem import Problem, State, freed, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import apply, inverse, step_between
+from jcr.geometry import Transform, apply, inverse, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 
-PoseOfState = Callable[[State], Float[ndarray, "4 4"]]
 CONTRADICTS = 5.0
 """Reprojection error of an image, as a multiple of the median of all images, from which it contradicts the pose."""
 LEAST_PX = 1.0
@@ -51,7 +50,7 @@ def place_cameras(
     hand_eye: Calibration,
     options: CalibrateOptions | None = None,
     progress: Progress | None = None,
-) -> tuple[CamerasFile, Solution | None, Mapping[str, PoseOfState]]:
+) -> tuple[CamerasFile, Solution | None, Mapping[str, Callable[[State], Transform]]]:
     """Return the poses of the cameras `others` of the cell; `hand_eye` is the calibration of the capture's own camera.
 
     `reconstruction` is that of the own camera. The first result is the content of cameras.json; a camera that cannot be
@@ -69,7 +68,6 @@ def place_cameras(
         reconstruction=reconstruction,
         options=options,
         robot=robot,
-        priors=(),
         hand_eye=hand_eye,
     )
     rigs = Rigs(case)
@@ -89,7 +87,7 @@ def place_cameras(
         )
         moved = _moved(rigs, views) if camera.mount == "base" and len(views.used) > 1 else ()
         refused = any(one.severity == "rejects" for one in moved)
-        views = views.refused(moved) if refused else rigs.add(replace(views, findings=moved))
+        views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
         if isinstance(views, CameraPlacement):
             cameras[camera.name] = views
         else:
@@ -209,16 +207,13 @@ def _placement(
     # by the correlation of both poses.
     own = solution.covariance[:7, :7]
     follows = solution.derivative(views.parent_from_camera) @ np.linalg.solve(own, solution.covariance[:7]).T
-    covariance = (
-        covariance + follows @ positive_part(hand_eye.covariance - own, hand_eye.covariance) @ follows.T
-    )
+    added = positive_part(hand_eye.covariance - own, hand_eye.covariance)
+    covariance = covariance + follows @ added @ follows.T
     covariance = covariance + sum(fault.covariance[:6, :6] for fault in views.findings)
     of_all = median_reprojection_px(problem, solution.images.view)
     px = dict(zip(views.used, of_all[problem.observations.camera == c].tolist(), strict=True))
-    intrinsics, std = (
-        problem.intrinsics(solution.state)[c],
-        np.sqrt(np.diag(solution.intrinsics_covariance(c))),
-    )
+    intrinsics = problem.intrinsics(solution.state)[c]
+    std = np.sqrt(np.diag(solution.intrinsics_covariance(c)))
     findings = list(views.findings)
     worst = max(px, key=lambda k: px[k])
     limit_px = max(
