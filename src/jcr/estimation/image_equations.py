@@ -64,15 +64,12 @@ class ImageEvidence:
     state: State
     view: ProjectedObservations
     """Observations as the state projects them."""
+    weight: Float[ndarray, " k"]
+    """Weight (1/px²) of each of k observations at `state`, by the pixel noise and the Cauchy loss."""
     information: Float[ndarray, "d d"]
     """Information matrix with the priors of the cameras, and small information along the similarity of the world."""
     gradient: Float[ndarray, " d"]
     """Gradient of half the cost (squared standard deviations) at the state."""
-
-    @cached_property
-    def weight(self) -> Float[ndarray, " k"]:
-        """Weight (1/px²) of each of k observations at `state`, by the pixel noise and the Cauchy loss."""
-        return weights_of(self.problem, self.state, self.view)
 
     @cached_property
     def rigs(self) -> tuple[Float[ndarray, "s e"], Float[ndarray, " s"], Float[ndarray, "s s"]]:
@@ -193,7 +190,12 @@ def linearised(problem: Problem, state: State, view: ProjectedObservations) -> t
                 by_similarity[columns.start : columns.start + 3, SCALE] = mount[:3, 3, None]
         information += information_along(by_similarity, float(information.diagonal()[rigs].mean()))
     found = ImageEvidence(
-        problem=problem, state=state, view=view, information=information, gradient=-normal.right
+        problem=problem,
+        state=state,
+        view=view,
+        weight=weight,
+        information=information,
+        gradient=-normal.right,
     )
     return found, normal
 

@@ -118,9 +118,7 @@ def seen_points(
     The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
     gripper_from_camera. `camera` None (given camera poses): a point on the optical axis, without errors of intrinsics.
     """
-    if camera is None:
-        at_centre = bounds_at(x, uncertainty, NORMALIZED, np.zeros(2), distance_m)
-        return PointUncertaintyOverImage(**vars(at_centre), corners=at_centre)
+    camera = camera or NORMALIZED  # whose image is one pixel, on the optical axis
     right, bottom = camera.width - 1.0, camera.height - 1.0
     centre, *corners = (
         bounds_at(x, uncertainty, camera, np.array(x_px), distance_m)

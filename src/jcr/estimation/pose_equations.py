@@ -57,21 +57,11 @@ class Region:
     """
 
     by_unknown: Float[ndarray, "s u"]
-    """J: derivative of the residuals by the u unknowns X and Z, 12 for each arm."""
+    """J: derivative of the residuals (m, then rad, pose by pose) by the u unknowns X and Z, 12 for each arm."""
     fit: Float[ndarray, "u s"]
     """A = (JᵀWJ)⁻¹JᵀW: change of X and Z per error of the poses, W being EFFECTIVE_WEIGHT²; zero for unused poses."""
-    unknowns: int = 13
+    unknowns: int
     """Number p of all unknowns of the problem, which begin with X, log λ and Z."""
-
-    @staticmethod
-    def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
-        """Return the fit for residuals with the derivative `by_unknown` (s,u) by X and Z of each arm.
-
-        The s = 6n rows are m, then rad, pose by pose. `unknowns` counts all unknowns, with scale and cameras.
-        """
-        root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
-        fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
-        return Region(by_unknown, fit, unknowns)
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
@@ -311,10 +301,10 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         shared = pose_by_pose(by_rig, pose_by_pose(by_rig, covariance).T)
         shared = (shared + shared.T) / 2
     by_unknown = np.delete(by_arms.reshape(6 * n, arms), SCALE, axis=1)
-    region = Region.of_unknowns(by_unknown[rows], jacobian.shape[1])
-    fit = np.zeros((by_unknown.shape[1], 6 * n))
-    fit[:, rows] = region.fit
-    everywhere = replace(region, by_unknown=by_unknown, fit=fit)
+    root, fit = np.tile(EFFECTIVE_WEIGHT, len(rows) // 6), np.zeros((by_unknown.shape[1], 6 * n))
+    fit[:, rows] = np.linalg.pinv(root[:, None] * by_unknown[rows], rcond=1e-9) * root
+    everywhere = Region(by_unknown, fit, problem.unknowns)
+    region = replace(everywhere, by_unknown=by_unknown[rows], fit=fit[:, rows])
     systematic = np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms)))
     confirmed = (
         np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors

@@ -64,7 +64,7 @@ def view_of(problem: Problem, state: State) -> ProjectedObservations:
         from_centre[rows] = project(camera, in_camera[rows]) - centre[rows]
     off = problem.displacement(state)[problem.parameters_of[-1].stop :]
     of_images = off[:-PRISM].reshape(OF_IMAGE, -1)[:, observations.image]
-    per_height = _of_camera(problem, [camera.fx / camera.height for camera in cameras])
+    per_height = _focal_per_height(problem, cameras)
     own_map = np.stack([np.exp(of_images[0]), of_images[1] * per_height], axis=1)
     projected = centre + _mapped(own_map, from_centre[..., None])[..., 0]
     projected += problem.prism @ off[-PRISM:]
@@ -159,7 +159,7 @@ def _by_cameras(problem: Problem, state: State, view: ProjectedObservations) -> 
     columns = _slice(directions[first:])
     about, of_images, by_image = view.from_centre_px, directions[first:, columns], out[:, :, columns]
     focal, sheared = of_images[:-PRISM].reshape(OF_IMAGE, problem.n_images, -1)
-    shear_px = _of_camera(problem, [camera.fx / camera.height for camera in view.cameras]) * about[:, 1]
+    shear_px = _focal_per_height(problem, view.cameras) * about[:, 1]
     # Each parameter is added in turn: with hundreds of images one term takes hundreds of megabytes.
     by_image += (own_map[:, :1] * about)[..., None] * focal[image][:, None]
     by_image[:, 0] += shear_px[:, None] * sheared[image]
@@ -181,9 +181,9 @@ def _mapped(own_map: Float[ndarray, "k 2"], v: Float[ndarray, "k 2 p"]) -> Float
     return out
 
 
-def _of_camera(problem: Problem, values: list[float] | list[int]) -> Float[ndarray, " k"]:
-    """Return for each of k observations the value of its camera; `values` has one per camera."""
-    return np.array(values, float)[problem.layout.camera]
+def _focal_per_height(problem: Problem, cameras: tuple[Intrinsics, ...]) -> Float[ndarray, " k"]:
+    """Return for each of k observations the focal length fx of its camera over the height of the image (px/px)."""
+    return np.array([camera.fx / camera.height for camera in cameras])[problem.layout.camera]
 
 
 def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:

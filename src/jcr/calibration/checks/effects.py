@@ -35,8 +35,7 @@ from jcr.estimation.hypotheses import (
     squared_length,
     tested_intrinsics,
 )
-from jcr.estimation.pose_equations import Region
-from jcr.estimation.problem import OF_IMAGE, SCALE, UNKNOWNS, pose_problem
+from jcr.estimation.problem import OF_IMAGE, SCALE, pose_problem
 from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
@@ -535,9 +534,8 @@ def with_effects(
                 straight = straight_shift(adjusted, bent)[:7]
             if one.kind is FindingKind.LENGTHS and one.value is not None:
                 # One of three axes has another scale; no image shows which scale is the true metre.
-                jacobian = adjusted.equations.jacobian[:, :UNKNOWNS]
-                region = Region.of_unknowns(np.delete(jacobian, SCALE, axis=1), UNKNOWNS)
-                metre = abs(one.value) / 3 * np.r_[-(region.fit @ jacobian[:, SCALE])[:6, 0], 1.0]
+                by_scale = adjusted.equations.jacobian[:, SCALE]
+                metre = abs(one.value) / 3 * np.r_[-(adjusted.poses.region.fit @ by_scale)[:6, 0], 1.0]
                 straight = straight + metre * (1 if straight[:6] @ metre[:6] >= 0 else -1)
             one = replace(one, shift=tuple(straight.tolist()))
         remaining.append(one)
