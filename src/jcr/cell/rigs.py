@@ -138,8 +138,8 @@ class Rigs:
             known = KnownImages(found.intrinsics, places, own)
         self.known = known
         self.poses = list(known.recon_from_camera)
-        self.arms: list[str] = []
-        self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = []
+        # Rigs, gripper poses and hand-eye fit of the camera of each further arm, by the name of the arm.
+        self.arms: dict[str, tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = {}
 
     def add(self, seen: CameraViews) -> CameraViews | CameraPlacement:
         """Return the views with a rig (cameras that move together) for each used image; new rigs are added if needed.
@@ -232,8 +232,7 @@ class Rigs:
         kept = seen.without({int(seen.rows[k]): str(found.images[k].reason) for k in np.flatnonzero(~used)})
         rig = len(self.poses) + np.arange(used.sum())
         self.poses += list(kept.places)
-        self.arms.append(arm)
-        self._of_arms.append((rig, gripper[used], found))
+        self.arms[arm] = rig, gripper[used], found
         return replace(kept, rig=rig, arm=len(self.arms))
 
     def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
@@ -244,8 +243,8 @@ class Rigs:
         bent = [row.unit * row.columns for row in arm_rows(poses) if row.kind in kinds]
         confirmed = np.concatenate(bent, axis=1) if bent else None
         arms = [replace(wrist_arm(poses, case.systematic), confirmed_errors=confirmed)]
-        arms += [replace(wrist_arm(gripper), rigs=rigs) for rigs, gripper, _ in self._of_arms]
-        found = [case.hand_eye, *(one for _, _, one in self._of_arms)]
+        arms += [replace(wrist_arm(gripper), rigs=rigs) for rigs, gripper, _ in self.arms.values()]
+        found = [case.hand_eye, *(one for _, _, one in self.arms.values())]
         return arms, [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
 
 

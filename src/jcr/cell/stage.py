@@ -62,12 +62,11 @@ def place_cameras(
         rejected = [CameraPlacement.of(one, why) for one in others]
         return CamerasFile(cameras=rejected, arms=[], version=__version__), None, {}
     options = options or CalibrateOptions()
-    robot = robot_errors(capture, options).of(reconstruction.image_index)
     case = Case(
         capture=capture,
         reconstruction=reconstruction,
         options=options,
-        robot=robot,
+        robot=robot_errors(capture, options).of(reconstruction.image_index),
         hand_eye=hand_eye,
     )
     rigs = Rigs(case)
