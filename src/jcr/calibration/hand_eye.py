@@ -147,7 +147,10 @@ def _fitted(
 
     def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
         """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
-        errors, of_robot = None if covariance is None else of_poses(covariance, order), of_poses(systematic, order)
+        errors, of_robot = (
+            None if covariance is None else of_poses(covariance, order),
+            of_poses(systematic, order),
+        )
         return robust_fit(gripper[order], camera[order], noise, priors, errors, of_robot, agreeing)
 
     fit = fitted(camera_covariance)

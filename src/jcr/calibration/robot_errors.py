@@ -10,12 +10,15 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
-from jcr.estimation.inverse_kinematics import REFUSED, LengthError, inverse_kinematics, mounted_arm
+from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm
 from jcr.estimation.kinematics import Arm, Joints, with_tool
 from jcr.estimation.robot_noise import arm_errors, of_poses, smooth_errors
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses
 from jcr.records import Capture
+
+REFUSED = (0.01, np.radians(1.0))
+"""Largest misfit of poses to the named robot, as a share of its reach and in rad; above, InputError is raised."""
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,6 @@ MOST = 30
 """Largest number of poses from which an unknown tool is estimated."""
 FITS = (1e-4, 1e-3)
 """Largest misfit (m, rad) of a pose that counts as reached."""
-REFUSED = (0.01, np.radians(1.0))
-"""Largest misfit of poses to the named robot, as a share of its reach and in rad; above, InputError is raised."""
 TO_REST = 3e-4
 """Weight (m/rad) of the distance from the rest posture; it changes determined angles by only 1e-6 rad."""
 MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
