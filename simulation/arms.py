@@ -223,16 +223,13 @@ def effective_fit(
     bent: BentArm,
     joints: Joints,
     start: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]],
-    exchanged: bool = False,
 ) -> Fit:
     """Fit the pair of transforms by which reported poses best predict the camera, from the true pair `start`.
 
-    The pair is gripper_from_camera and base_from_recon; exchanged, base_from_camera and gripper_from_object.
+    The pair is gripper_from_camera and base_from_recon; for a fixed camera gripper_from_object and base_from_camera.
     """
     x, z = start
-    true = bent.true(joints)
-    cameras = inverse(true @ z) @ x if exchanged else inverse(z) @ true @ x
-    return fit_known_scale(bent.reported(joints), cameras, start, EFFECTIVE_NOISE, exchanged=exchanged)
+    return fit_known_scale(bent.reported(joints), inverse(z) @ bent.true(joints) @ x, start, EFFECTIVE_NOISE)
 
 
 def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:

@@ -86,10 +86,10 @@ def cell_problem(
         base_from_camera = looking_at(middle + away, middle, rng)
         elsewhere = about_posture(bent.arm, bent.arm.rest, EFFECTIVE_POSES, rng)
         pair = base_from_camera, gripper_from_object
-        fit = effective_fit(bent, elsewhere, pair, exchanged=True)
+        fit = effective_fit(bent, elsewhere, (gripper_from_object, base_from_camera))
         reported = disturbed(bent.reported(joints), white, rng)
         cell.add_arm(inverse(carried) @ base_from_camera, reported, pair, FIXED_CAMERA)
-        cell.truth = {"base_from_camera": fit.gripper_from_camera, "gripper_from_object": fit.base_from_recon}
+        cell.truth = {"base_from_camera": fit.base_from_recon, "gripper_from_object": fit.gripper_from_camera}
         x_in_object, normal = _box(points, rng)
         return _seen(cell, x_in_object, normal, noise_px, rng)
     own = motion_over_table(bent, count, np.zeros(3), (rng, rng))

@@ -122,14 +122,11 @@ def pose_residuals(
     z: Transform,
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-    exchanged: bool = False,
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
     """Return steps (m, rad; base axes) from reported to predicted gripper poses, and derivatives by X, log scale, Z.
 
     Six components of a step are translation, then rotation vector; the 13 columns are steps of X (6), log scale, Z (6).
-    X is gripper_from_camera, Z is base_from_recon. `exchanged`: the camera is fixed and the gripper carries the scene.
-    X is then base_from_camera, Z is gripper_from_recon, and the predicted gripper_from_base is inverted before it is
-    compared.
+    X is gripper_from_camera, Z is base_from_recon.
     """
     predicted = predicted_gripper_poses(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
@@ -142,8 +139,6 @@ def pose_residuals(
     j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
     j[:, 3:, ROTATION] = -rotation
     j[:, 3:, BASE_ROTATION] = np.eye(3)
-    if exchanged:
-        return step_between(base_from_gripper, inverse(predicted)), by_inverse(predicted) @ j
     return step_between(base_from_gripper, predicted), j
 
 
@@ -245,22 +240,25 @@ def reported_poses(
     derivatives are by the u unknowns of the arms (X, log scale and Z, as in `weak_prior`). The second are by a step of
     the rig (camera pose) that belongs to each pose.
     """
-    each, begin = [], 0
+    each, begin, of_x, of_z = [], 0, slice(0, 6), slice(7, 13)
     jacobian = np.zeros((sum(len(arm.rigs) for arm in problem.arms), 6, problem.arm_unknowns))
     for k, arm in enumerate(problem.arms):
-        at, rigs = (state.x[k], state.scale, state.z[k]), state.world_from_rig[arm.rigs]
-        exchanged = arm.carries == "scene"
-        residual, by_unknown = pose_residuals(*at, arm.base_from_gripper, rigs, exchanged)
+        x, z, rigs = state.x[k], state.z[k], state.world_from_rig[arm.rigs]
         # X, then the scale that all arms share, then Z.
-        jacobian[begin : begin + len(rigs), :, np.insert(columns_of_arm(k), 6, SCALE.start)] = by_unknown
+        columns, is_carried = np.insert(columns_of_arm(k), 6, SCALE.start), arm.carries == "scene"
+        if is_carried:
+            # base_from_gripper · Z = X · S_λ(world_from_rig⁻¹): X and Z exchange their roles.
+            x, z, rigs = z, x, inverse(rigs)
+            columns = np.r_[columns[of_z], SCALE.start, columns[of_x]]
+        residual, by_unknown = pose_residuals(x, state.scale, z, arm.base_from_gripper, rigs)
+        jacobian[begin : begin + len(rigs), :, columns] = by_unknown
         # Derivative of the residuals by a step of each rig.
-        base_from_world, x = state.z[k][:3, :3], state.x[k]
         by_pose = np.zeros((len(rigs), 6, 6))
-        by_pose[:, :3, :3] = state.scale * base_from_world
-        by_pose[:, :3, 3:] = base_from_world @ skew(rigs[:, :3, :3] @ x[:3, :3].T @ x[:3, 3])
-        by_pose[:, 3:, 3:] = base_from_world
-        if exchanged:
-            by_pose = by_inverse(predicted_gripper_poses(*at, rigs)) @ by_pose
+        by_pose[:, :3, :3] = state.scale * z[:3, :3]
+        by_pose[:, :3, 3:] = z[:3, :3] @ skew(rigs[:, :3, :3] @ x[:3, :3].T @ x[:3, 3])
+        by_pose[:, 3:, 3:] = z[:3, :3]
+        if is_carried:
+            by_pose = by_pose @ by_inverse(state.world_from_rig[arm.rigs])
         each.append((residual, by_pose))
         begin += len(rigs)
     residual, by_rig = (np.concatenate(part) for part in zip(*each, strict=True))
@@ -338,23 +336,20 @@ def fit_known_scale(
     recon_from_camera: Poses,
     start: tuple[Transform, Transform],
     noise: tuple[float, float],
-    exchanged: bool = False,
 ) -> Fit:
     """Return the least-squares fit of X and Z from the initial estimate `start` (X, Z), for camera poses in metres.
 
-    The inverse of `noise` (m, rad) weighs position and rotation residuals; `exchanged` is that of `pose_residuals`.
-    Directions that the motions do not determine stay as in `start`.
+    The inverse of `noise` (m, rad) weighs position and rotation residuals. Directions that the motions do not determine
+    stay as in `start`.
     """
     weight, columns = 1 / np.repeat(noise, 3), columns_of_arm(0)
 
     def linearised(at: tuple[Transform, Transform]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 12"]]:
-        residual, jacobian = pose_residuals(
-            at[0], 1.0, at[1], base_from_gripper, recon_from_camera, exchanged
-        )
+        residual, jacobian = pose_residuals(at[0], 1.0, at[1], base_from_gripper, recon_from_camera)
         return weight * residual, weight[:, None] * jacobian[:, :, columns]
 
     def moved(at: tuple[Transform, Transform], step: Float[ndarray, "12"]) -> tuple[Transform, Transform]:
         return retract(at[0], step[:6]), retract(at[1], step[6:])
 
     x, z = minimise(linearised, start, moved).unknowns
-    return Fit(x, z, pose_residuals(x, 1.0, z, base_from_gripper, recon_from_camera, exchanged)[0])
+    return Fit(x, z, pose_residuals(x, 1.0, z, base_from_gripper, recon_from_camera)[0])
