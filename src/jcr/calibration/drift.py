@@ -73,16 +73,15 @@ def drift(
     rows are m and rad in base axes, for an error size of 1 rad.
     """
     gripper, camera = (np.concatenate(pair) for pair in zip(old, new[:2], strict=True))
-    first, state = len(old[0]), calibrated.state
-    problem, _ = pose_problem(
+    first, fit = len(old[0]), calibrated.state
+    problem, state = pose_problem(
         gripper,
         camera,
-        (state.x[0], state.scale, state.z[0]),
+        (fit.x[0], fit.scale, fit.z[0]),
         camera_covariance=np.asarray(block_diag(np.zeros((6 * first, 6 * first)), *new[2])),
         error_covariance=systematic,
         noise_floor=calibrated.noise.given,
     )
-    state = State(x=state.x, scale=state.scale, z=state.z, world_from_rig=camera)
     of_camera, of_scene = (
         _motion(problem, state, first, kind) for kind in (FindingKind.SLIP, FindingKind.BASE_MOVED)
     )
