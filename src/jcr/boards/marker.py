@@ -18,7 +18,7 @@ from jcr.errors import RejectedError
 from jcr.estimation.absolute_pose import absolute_pose
 from jcr.estimation.image_equations import adjust_images
 from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
-from jcr.estimation.problem import wrist_problem
+from jcr.estimation.problem import wrist_arm, wrist_problem
 from jcr.geometry import apply, inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -71,8 +71,10 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
     cameras, tracks = np.stack([recon_from_camera[row] for row in rows]), _tracks(sightings, recon_from_body)
     if len(recon_from_body) > 1:
+        # Images are adjusted alone: the arm's poses, which a problem has, are not used.
         start, camera = (np.eye(4), 1.0, np.eye(4)), camera_with_prior(intrinsics, FIXED)
-        cameras = adjust_images(*wrist_problem(None, start, cameras, camera, tracks)).world_from_rig
+        problem, state = wrist_problem(wrist_arm(cameras), start, cameras, camera, tracks)
+        cameras = adjust_images(problem, state).world_from_rig
     return Reconstruction(
         image_index=rows,
         recon_from_camera=cameras,

@@ -620,7 +620,7 @@ def pose_problem(
 
 
 def wrist_problem(
-    arm: ReportedPoses | None,
+    arm: ReportedPoses,
     start: Start,
     recon_from_camera: Poses,
     camera: CameraPrior,
@@ -631,20 +631,18 @@ def wrist_problem(
 ) -> tuple[Problem, State]:
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
-    The world is the frame of the reconstruction, scaled by the initial scale. `arm` has one pose per image; None:
-    images alone, without boards. `start` is the initial (gripper_from_camera, scale, base_from_recon). `tracks` has
-    points and observations in the images of `recon_from_camera`. `noise` is a lower bound on the random errors of the
-    poses (m, rad). `combinations` are additional free parameters of the camera, as in `freed`.
+    The world is the frame of the reconstruction, scaled by the initial scale. `arm` has one pose per image. `start` is
+    the initial (gripper_from_camera, scale, base_from_recon). `tracks` has points and observations in the images of
+    `recon_from_camera`. `noise` is a lower bound on the random errors of the poses (m, rad). `combinations` are
+    additional free parameters of the camera, as in `freed`.
     """
-    x, scale, z = start
-    arms, n = () if arm is None else (arm,), len(recon_from_camera)
+    (x, scale, z), n = start, len(recon_from_camera)
     points_in_world = scale * tracks.points_in_recon.astype(float)
     twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
-    bodies = None if arm is None else tracks.boards
-    boards, world_from_board = shapes_of(bodies, points_in_world, twice, n)
+    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, n)
     each = np.arange(n)
     problem = Problem(
-        arms=arms,
+        arms=(arm,),
         n_rigs=n + len(world_from_board),
         cameras=(camera,),
         observations=Observations(
@@ -659,9 +657,9 @@ def wrist_problem(
         robot_noise_floor=noise,
     )
     state = State(
-        x=x[None][: len(arms)],
+        x=x[None],
         scale=1.0,
-        z=z[None][: len(arms)],
+        z=z[None],
         world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
         points_in_world=points_in_world,
     )
