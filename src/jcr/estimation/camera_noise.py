@@ -17,7 +17,6 @@ from jcr.estimation.pose_equations import pose_by_pose, pose_equations, reported
 from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, LinearPrior, Start, pose_problem
 from jcr.estimation.robot_noise import (
     Equations,
-    LinearSolution,
     LogSizes,
     log_evidence,
     most_likely,
@@ -27,8 +26,6 @@ from jcr.geometry import Poses, by_similarity, nearest_to_lines
 
 FEWEST, MOST = 8, 50
 """Smallest number of poses for a test of camera errors, and largest number used; more are sampled evenly."""
-CONFIRMED = 2
-"""Number of components with the largest score statistic whose evidence is computed."""
 CLEAR = 3.0
 """Gain of the log evidence from which a component is included: odds of 20 to 1."""
 SETTLED = 0.03
@@ -103,22 +100,17 @@ def camera_error_covariance(
         components[parts] = [pose_by_pose(by_camera, pose_by_pose(by_camera, one).T) for one in of_cameras]
     equations, adopted = pose_equations(problem, state, None).equations, list[Part]()
     sizes, information = most_likely(equations)
-    solution = solve_equations(equations, sizes)
-    best = log_evidence(equations, solution, information)
+    best = log_evidence(equations, solve_equations(equations, sizes), information)
     while True:
-        found: list[tuple[float, Equations, LogSizes, LinearSolution, tuple[Part, ...]]] = []
-        for parts in sorted(components, key=lambda parts, at=solution: -_shown(components[parts], at))[
-            :CONFIRMED
-        ]:
-            covariances = components[parts]
+        found: list[tuple[float, Equations, LogSizes, tuple[Part, ...]]] = []
+        for parts, covariances in components.items():
             tried = replace(equations, camera_errors=(*equations.camera_errors, *covariances))
             at, information = most_likely(tried, np.r_[sizes, np.zeros(len(covariances))], SETTLED)
-            solved = solve_equations(tried, at)
-            found.append((log_evidence(tried, solved, information), tried, at, solved, parts))
+            found.append((log_evidence(tried, solve_equations(tried, at), information), tried, at, parts))
         likeliest = max(found, key=lambda one: one[0], default=None)
         if likeliest is None or likeliest[0] < best + CLEAR:
             break
-        best, equations, sizes, solution, parts = likeliest
+        best, equations, sizes, parts = likeliest
         adopted += parts
         del components[parts]
     every, out = np.arange(len(recon_from_camera)), None
@@ -126,18 +118,6 @@ def camera_error_covariance(
         covariance = variance * camera_error_part(part, recon_from_camera, fit[1], every)
         out = covariance if out is None else out + covariance
     return out
-
-
-def _shown(covariances: list[Float[ndarray, "s s"]], solution: LinearSolution) -> float:
-    """Return the score statistic of a further component of the errors: how much the residuals of `solution` show it.
-
-    It is the derivative of the restricted log likelihood by the component's variance at 0, over its standard deviation
-    without the component (Searle, Casella and McCulloch, 1992, section 6.6). `covariances` are those of its parts.
-    """
-    covariance = np.sum(covariances, axis=0)
-    weighed = solution.projection @ covariance
-    gradient = solution.weighed_left @ covariance @ solution.weighed_left - np.trace(weighed)
-    return float(gradient / np.sqrt(2 * (weighed * weighed.T).sum()))
 
 
 def camera_error_part(
