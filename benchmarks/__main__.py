@@ -43,8 +43,8 @@ BENCHES = {
 }
 """Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
-SHARE, LEFT_OUT = 4, "kinhec"
-"""`all` takes one case in SHARE of the benches with many, and leaves out the bench that takes an hour."""
+SHARE = 4
+"""`all` takes one case in SHARE of the benches with many."""
 COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of commands that are no bench and take arguments of their own, by name."""
 CLAIM = "> "
@@ -70,7 +70,7 @@ class Arguments:
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
-    """Bench to run; `all`: all but KinHEC, which takes an hour, with every fourth case of those that have many."""
+    """Bench to run; `all`: all benches, with every fourth case of those that have many."""
     out: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OUT]")] = None
     """Folder into which NAME.md and the index README.md are written, too (unset: of `all` docs/results)."""
     captures: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("data")
@@ -121,11 +121,8 @@ def run_all(arguments: Arguments) -> int:
     def is_done(name: str) -> bool:
         """Run one bench and report it on stderr."""
         taken, begun = signature(import_module(f"benchmarks.{name}").run).parameters, time.perf_counter()
-        reason = "takes an hour" if name == LEFT_OUT else ""
         if "captures" in taken and not arguments.captures.is_dir():
-            reason = f"there is no folder {arguments.captures}"
-        if reason:
-            sys.stderr.write(f"{name}: left out, {reason}\n")
+            sys.stderr.write(f"{name}: left out, there is no folder {arguments.captures}\n")
             return True
         words = [word for option, pair in options.items() if option in taken for word in pair]
         done = subprocess.run(
@@ -153,8 +150,8 @@ def write_index(out: Path) -> None:
         "# Results",
         "",
         "Written by `python -m benchmarks`; each page has its command, commit and machine. `python -m benchmarks all` "
-        "takes 20 minutes of two cores: without KinHEC, which takes an hour, and with one case in "
-        f"{SHARE} where the command has `--every {SHARE}`. `python -m benchmarks NAME docs/results` takes all of "
+        f"takes 20 minutes of two cores, with one case in {SHARE} where the command has `--every {SHARE}`. "
+        "`python -m benchmarks NAME docs/results` takes all of "
         "one bench.",
     ]
     for part in PARTS:
