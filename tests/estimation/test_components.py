@@ -8,6 +8,7 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.robot_errors import errors_of
 from jcr.distributions import chi2
 from jcr.estimation.arms import arm_named
+from jcr.estimation.camera_noise import TYPICAL_RAD, camera_error_part
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.pose_equations import pose_equations
 from jcr.estimation.problem import pose_problem
@@ -34,6 +35,18 @@ def test_smooth_errors_are_a_covariance_that_the_choice_of_the_base_does_not_cha
     np.testing.assert_allclose(
         smooth_errors(other @ base_from_gripper), rotated @ alike @ rotated.T, atol=1e-9
     )
+
+
+def test_a_step_of_the_scale_lengthens_all_ways_after_it():
+    cameras, step = poses(np.random.default_rng(1), 7), 1e-6
+    ways = np.diff(cameras[:, :3, 3], axis=0)
+    moved = np.zeros((7, 6, 6))
+    for k in range(6):
+        longer = np.where(np.arange(6) >= k, 1 + step, 1.0)[:, None] * ways
+        moved[1:, :3, k] = np.cumsum(longer - ways, axis=0) / step
+    half = TYPICAL_RAD * moved.reshape(42, 6)
+    found = camera_error_part("walk of scale", cameras, 1.0, np.arange(7))
+    np.testing.assert_allclose(found, half @ half.T, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -55,7 +55,12 @@ def test_the_order_of_images_does_not_matter_to_the_last_bit():
 
 @pytest.mark.parametrize(
     ("count", "wrong"),
-    [(10, 3), pytest.param(20, 6, marks=pytest.mark.slow)],
+    [
+        (10, 3),
+        pytest.param(20, 6, marks=pytest.mark.slow),
+        # More poses than robust.MANY: images only join those that agree.
+        pytest.param(60, 15, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
 def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
