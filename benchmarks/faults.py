@@ -301,7 +301,7 @@ def _claim(what: str, rows: Rows, clean: Sequence[Outcome]) -> str:
 
 
 def _cells(case: Case, row: Sequence[Outcome]) -> list[object]:
-    kinds = Counter(str(kind) for one in row for kind in one.kinds).most_common(3)
+    kinds = Counter(sorted(str(kind) for one in row for kind in one.kinds)).most_common(3)
     has_name = case.named_by or (isinstance(case.fault, ImageFault) and case.fault.wrong)
     silent = sum(one.is_silent for one in row)
     kept = [(one.mm, one.deg, one.sigmas) for one in row if np.isfinite(one.mm)]

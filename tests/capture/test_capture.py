@@ -112,9 +112,9 @@ def animate(file: Path) -> None:
     frames[0].save(file, format="GIF", save_all=True, append_images=frames[1:])
 
 
-def turn(file: Path) -> None:
+def turn(file: Path, orientation: int = 6) -> None:
     exif = Image.Exif()
-    exif[0x0112] = 6
+    exif[0x0112] = orientation
     Image.open(file).save(file, exif=exif)
 
 
@@ -156,6 +156,7 @@ FRAME_FAULTS = {
     "16 bits": (second(lambda p: cv2.imwrite(str(p.with_suffix(".png")), np.ones((480, 640, 3), np.uint16))
         and p.with_suffix(".png").rename(p)), "more than 8 bits"),
     "EXIF tag": (second(turn), "EXIF orientation 6, .*remove the tag"),
+    "EXIF tag of a mirrored image": (second(lambda file: turn(file, 2)), "EXIF orientation 2, .*remove the tag"),
     "image truncated": (truncate, r"01\.jpg: not a readable image"),
     "wrong size": (second(lambda p: Image.open(p).resize((320, 240)).save(p)),
         r"01\.jpg: image of 320x240 pixels, images/00\.jpg of 640x480"),

@@ -12,6 +12,7 @@ import tyro
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.findings import sentence, warnings_of
+from jcr.pipeline.options import TOLERANCE
 from jcr.progress import progress_bars
 from jcr.records import Capture, PosePairs
 from jcr.rounding import labelled, significant
@@ -234,7 +235,7 @@ class VerifyCommand:
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = (0.5, 0.05)
+    tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = TOLERANCE
     """Drifts smaller than both raise no alarm, however significant."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 

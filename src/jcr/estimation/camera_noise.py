@@ -20,6 +20,7 @@ from jcr.estimation.robot_noise import (
     LogSizes,
     log_evidence,
     most_likely,
+    of_poses,
     solve_equations,
 )
 from jcr.geometry import Poses, by_similarity, nearest_to_lines
@@ -29,7 +30,8 @@ FEWEST, MOST = 8, 50
 CLEAR = 3.0
 """Gain of the log evidence from which a component is included: odds of 20 to 1."""
 SETTLED = 0.03
-"""Step of the log sizes at which the search of their mode ends; the log evidence changes by less than 0.01 beyond."""
+"""Step of the log sizes at which the search of their mode ends; the log evidence changed by at most 0.011 beyond,
+in 42 searches."""
 TYPICAL_M, TYPICAL_RAD, TYPICAL_WALK_M = 1e-3, 1e-3, 3e-4
 """Typical sizes of camera pose errors: position (m), rotation (rad; also relative scale), growth of position (m)."""
 Part = Literal[
@@ -82,12 +84,11 @@ def camera_error_covariance(
     if len(rows) < FEWEST:
         return None
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).round().astype(int))]
-    some = (6 * rows[:, None] + np.arange(6)).ravel()
     problem, state = pose_problem(
         base_from_gripper[rows],
         recon_from_camera[rows],
         fit,
-        error_covariance=error_covariance[np.ix_(some, some)],
+        error_covariance=of_poses(error_covariance, rows),
         noise_floor=noise_floor,
         priors=priors,
     )

@@ -52,10 +52,9 @@ def robust_fit(
 
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
     evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
-    they are more than MANY.
-    Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`: error_covariance). The
-    problem is solved in a frame at the centre of the cameras with their extent as unit, for numerical reasons; the
-    solution is in the given frame.
+    they are more than MANY. Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`:
+    error_covariance). The problem is solved in a frame at the centre of the cameras with their extent as unit, for
+    numerical reasons; the solution is in the given frame.
     """
     n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)

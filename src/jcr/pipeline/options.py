@@ -1,6 +1,9 @@
-"""Options of `jcr batch`, separate from its module so that the command-line help loads fast."""
+"""Options of `jcr batch` and `jcr verify`, separate from their modules so that the command-line help loads fast."""
 
 from dataclasses import dataclass
+
+TOLERANCE = (0.5, 0.05)
+"""Default tolerance of `jcr verify` (mm, degrees): drifts smaller than both raise no alarm, however significant."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,13 +22,11 @@ from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.solve import solve
 from jcr.findings import Verdict, sentence
 from jcr.geometry import step_between
+from jcr.pipeline.options import TOLERANCE
 from jcr.progress import Progress, silent
 from jcr.records import Capture, CellCamera
 from jcr.result import RunResult
 from jcr.sfm.register import register
-
-TOLERANCE = (0.5, 0.05)
-"""Default tolerance (mm, degrees): drifts smaller than both raise no alarm, however significant."""
 
 
 @dataclass(frozen=True, kw_only=True)
