@@ -43,8 +43,8 @@ class CaptureCommand:
     """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
-    camera_size: tuple[int, int] | None = None
-    """Resolution in pixels, WIDTH HEIGHT; unset: the camera's default (RealSense: 1280 720)."""
+    camera_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
+    """Resolution in pixels; unset: the camera's default (RealSense: 1280 720)."""
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, or http (a program posts
     them, jcr docs http)."""
