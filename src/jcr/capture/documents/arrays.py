@@ -158,14 +158,10 @@ def _tables_of(file: Path, arrays: dict[str, Any]) -> list[Table]:
             equal[len(rows)].setdefault(name, rows)
     for named in equal.values():
         if len(named) > 1:
-            rows = [
-                {
-                    f"{name}.{column}": cell
-                    for name, row in zip(named, parts, strict=True)
-                    for column, cell in row.items()
-                }
-                for parts in zip(*named.values(), strict=True)
-            ]
+            rows = [dict[str | int, Cell]() for _ in next(iter(named.values()))]
+            for name, parts in named.items():
+                for row, part in zip(rows, parts, strict=True):
+                    row.update({f"{name}.{column}": cell for column, cell in part.items()})
             tables.append(table_of(file, rows))
     return [table for table in tables if table][:MAX_TABLES]
 
@@ -187,9 +183,8 @@ def _row_views(array: ndarray) -> list[ndarray]:
 
 def _rows(array: ndarray) -> list[dict[str | int, Cell]]:
     """Return the cells of each row of an array, by their indices where a row has two or more sides."""
-    texts = array.dtype.kind == "U"
     flat = array.reshape(len(array), -1)
     columns = [".".join(map(str, place)) for place in np.ndindex(array.shape[1:])]
     names = columns if array.ndim > 2 else range(flat.shape[1])
-    cells = flat.tolist() if texts else flat.astype(float).tolist()
+    cells = flat.tolist() if array.dtype.kind == "U" else flat.astype(float).tolist()
     return [dict(zip(names, row, strict=True)) for row in cells]

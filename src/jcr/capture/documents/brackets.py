@@ -11,12 +11,13 @@ from jcr.capture.documents.nested import is_container, leaves
 from jcr.capture.documents.plain import MAX_DEPTH
 from jcr.capture.documents.table import Cell, cell_of
 
-NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
 GLUED = re.compile(rf"({NUMBER})(mm|cm|m|deg|degrees|°|rad|s|ms)")
 """Number with its unit, such as 298.8mm."""
 _TOKEN = re.compile(
-    r"""(?P<open>[\[({])|(?P<close>[\])}])|(?P<text>"[^"\n\[\](){}]*"|'[^'\n\[\](){}]*')|(?P<assign>:=|[:=])"""
-    r"""|(?P<mark>[;,\n])|(?P<word>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?"""
+    r"""(?P<open>[\[({])|(?P<close>[\])}])|(?P<assign>:=|[:=])"""
+    r"""|(?P<text>"(?![,;])[^"\n\[\](){}]*"|'(?![,;])[^'\n\[\](){}]*')"""
+    r"""|(?P<mark>[;,\n])|(?P<call>[A-Za-z_][\w.]*(?=\())|(?P<word>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?"""
     r"""|(?:[^\s,;=:\[\](){}"']|(?<=\d):(?=\d))+)"""
 )
 _VALUE = re.compile(r"\d.*|.*\.[A-Za-z]\w{2,4}")
@@ -90,6 +91,8 @@ class _Bracket:
         if kind == "mark":
             self.end_word()
             self.breaks.append((len(self.entries), token))
+        elif kind == "call":
+            self.words.append(token)
         elif kind == "assign":
             if not self.word and self.entries and self.entries[-1] == (None, cell_of(self.last)):
                 self.entries.pop()  # a number or a text before : or = is a name
@@ -175,11 +178,11 @@ def _close(outer: _Bracket, inner: _Bracket) -> None:
 def _statement(line: _Bracket, lines: tuple[int, int]) -> Statement | None:
     """Return a line as a statement; None if it has neither two numbers in brackets nor only numbers with names."""
     line.end_word()
-    entries, key = line.entries, None
+    entries, key = list[Entry](line.entries), None
     inside = [cell for _, value in entries if is_container(value) for cell in leaves(value).values()]
     named = bool(entries) and all(name and not is_container(value) for name, value in entries)
     if len(entries) == 1 and inside and entries[0][0]:
-        key, entries = entries[0][0], [(None, entries[0][1])]
+        key, entries[0] = entries[0][0], (None, entries[0][1])
     if sum(isinstance(cell, float) for cell in inside) < 2 and not named and not (key and len(inside) > 2):
         return None
     return Statement(lines=lines, key=key, words=" ".join(line.words), entries=entries)

@@ -1,5 +1,6 @@
 """Plain data (maps, lists, numbers, texts) of YAML, JSON and OpenCV's FileStorage, without objects and references."""
 
+import io
 import json
 import math
 import re
@@ -33,7 +34,6 @@ _CONSTANTS = {
     "": None, "~": None, "null": None, "true": True, "false": False,
     ".nan": math.nan, ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf,
 }  # fmt: skip
-_SHAPES = ("rows", "cols"), ("sizes",)
 
 
 def read_content(file: Path) -> Any:
@@ -148,16 +148,12 @@ def _parse_xml(file: Path, text: str) -> list[Any]:
     """Return the content of a FileStorage of OpenCV in XML, in a list; raise InputError for other XML."""
     if "<!DOCTYPE" in text.upper() or "<!ENTITY" in text.upper():
         _refuse(file, "XML with a document type or entities; remove them")
-    parser = ElementTree.XMLPullParser(("start", "end"))
-    depth, root = 0, None
     _limit(file, text.count("<"), 0)
-    for start in range(0, len(text), 4096):  # in pieces, so that a deep tree is refused before it is built
-        parser.feed(text[start : start + 4096])
-        for event, element in parser.read_events():
-            root = element if root is None else root
-            depth += 1 if event == "start" else -1
-            _limit(file, 0, depth)
-    parser.close()
+    depth, root = 0, None
+    for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):  # nosec B314: no entities
+        root = element if root is None else root
+        depth += 1 if event == "start" else -1
+        _limit(file, 0, depth)
     if root is None or root.tag != "opencv_storage":
         _refuse(file, "XML that is not OpenCV's FileStorage; give the numbers as YAML or CSV")
     return [_element(file, root)]
@@ -187,13 +183,11 @@ def _map_of(file: Path, pairs: Sequence[tuple[Any, Any]]) -> Any:
         if key in content:
             _refuse(file, f"the key {shown(key)} appears twice in one map; keep one")
         content[key] = value
-    for names in _SHAPES:
-        shape, data = [content.get(name) for name in names], content.get("data")
-        sizes = shape[0] if isinstance(shape[0], list) else shape
-        if isinstance(data, list) and all(
-            isinstance(size, float) and 1 <= size <= MAX_ITEMS for size in sizes
-        ):
-            return _nested(data, [int(size) for size in sizes]) or content
+    shape = content.get("sizes") or [content.get("rows"), content.get("cols")]
+    data = content.get("data")
+    if isinstance(data, list) and isinstance(shape, list):
+        sizes = [int(size) for size in shape if isinstance(size, float) and 1 <= size <= MAX_ITEMS]
+        return (_nested(data, sizes) if len(sizes) == len(shape) else None) or content
     return content
 
 

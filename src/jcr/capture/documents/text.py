@@ -16,6 +16,8 @@ from jcr.errors import InputError
 
 _FEWEST = 5
 """Smallest number of rows of a section that is a table of its own beside that of all sections; a capture has five."""
+_LONGEST_HEADER = 10_000
+"""Largest length of a line with names of columns, in characters."""
 _SECTIONS = 16
 """Largest number of lengths of rows, and of sections of each, that are tried."""
 _HEADER = re.compile(r"\"[^\"]*\"|[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
@@ -69,7 +71,8 @@ def _bracket_tables(file: Path, lines: list[str], comments: dict[int, str]) -> l
     for group in group_statements(rows):
         names = [one.key for one in group if one.key]
         keys = names if len(set(names)) == len(group) else _keys(texts, [one.lines[0] for one in group])
-        header = _header(texts, group[0].lines[0], len(group[0].entries), None)
+        entries = len(group[0].entries)
+        header = _header(texts, group[0].lines[0], entries, None) if entries > 1 else None
         words = " ".join([group[0].words, *dict.fromkeys(names[:3]), around])
         if table := table_of(file, [one.row(header) for one in group], keys=keys, words=words):
             tables.append(table)
@@ -89,7 +92,9 @@ def _without_counts(table: Table) -> Table:
 
 def _header(texts: dict[int, str], line: int, width: int, separator: str | None) -> list[str] | None:
     """Return the names of columns in the text above a line; None if it does not hold one name for each column."""
-    text = next((texts[k] for k in range(line - 1, max(line - 3, -1), -1) if k in texts), "")
+    text = next((texts[k] for k in range(line - 1, max(line - 3, -1), -1) if k in texts), "")[
+        :_LONGEST_HEADER
+    ]
     for mark in (separator, ";", ",", "\t", None):
         cells = [cell.strip().strip("\"'") for cell in (text.split(mark) if mark else _HEADER.findall(text))]
         if len(cells) == width and any(cells) and not any(isinstance(cell_of(cell), float) for cell in cells):
@@ -106,7 +111,7 @@ def _keys(texts: dict[int, str], firsts: Sequence[int]) -> list[str] | None:
     for k in sorted(texts):
         patterns[re.sub(r"\d+", "#", texts[k])].append(k)
     for places in patterns.values():
-        if len(places) == len(firsts) and any(
+        if len(places) == len(firsts) > 1 and any(
             all(a < b for a, b in pairwise(one for pair in zip(first, second, strict=True) for one in pair))
             for first, second in ((places, firsts), (firsts, places))
         ):
@@ -162,18 +167,24 @@ def _line_tables(file: Path, lines: Sequence[str], comments: dict[int, str]) -> 
         if 2 * sum(map(_is_number, cells)) >= len(cells) - cells.count(None) > 0:
             widths[len(cells)].append((k, cells))
     texts, tables = {k: lines[k].strip() for k in parsed} | comments, list[Table]()
-    for width, rows in sorted(widths.items(), key=lambda item: -len(item[1]) * item[0])[:_SECTIONS]:
-        header = _header({k: texts[k] for k in texts if k not in dict(rows)}, rows[0][0], width, separator)
+    for width in sorted(widths, key=lambda width: -width * len(widths[width]))[:_SECTIONS]:
+        rows = widths[width]
+        header = _header(texts, rows[0][0], width, separator) if rows else None
         if header and separator and not tables:  # rows with missing or wrong cells stay rows
+            first = rows[0][0]
+            full = [
+                (k, cells) for k, cells in parsed.items() if k >= first and cells.count(None) < len(cells)
+            ]
             rows = [
                 (k, cells + [None] * (width - len(cells)))
-                for k, cells in parsed.items()
-                if k >= rows[0][0]
-                and 1 < len(cells) <= width
-                and cells != header
-                and cells.count(None) < len(cells)
+                for k, cells in full
+                if 1 < len(cells) <= width and cells != header
             ]
-        others = {k: texts[k] for k in texts.keys() - dict(rows)}
+            widths = {other: [row for row in widths[other] if row[0] < first] for other in widths}
+        if not rows:
+            continue
+        numbered = {k for k, _ in rows}
+        others = {k: texts[k] for k in texts if k not in numbered}
         tables.append(_table_of_rows(file, rows, others, separator))
         tables += _matrices(file, rows, others) if header is None else []
         breaks = [
@@ -192,7 +203,7 @@ def _line_tables(file: Path, lines: Sequence[str], comments: dict[int, str]) -> 
 
 def _is_number(cell: Cell) -> bool:
     """Test whether a cell is a number, or a number with its unit."""
-    return isinstance(cell, float) or bool(cell and GLUED.fullmatch(cell))
+    return isinstance(cell, float) or (isinstance(cell, str) and GLUED.fullmatch(cell) is not None)
 
 
 def _table_of_rows(file: Path, rows: Sequence[Row], texts: dict[int, str], separator: str | None) -> Table:
