@@ -15,6 +15,7 @@ NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
 GLUED = re.compile(rf"({NUMBER})(mm|cm|m|deg|degrees|°|rad|s|ms)")
 """Number with its unit, such as 298.8mm."""
 _TOKEN = re.compile(
+    rf"""(?P<flat>[\[(][ \t]*{NUMBER}(?:[ \t,]+{NUMBER})+[ \t]*[\])])|"""
     r"""(?P<open>[\[({])|(?P<close>[\])}])|(?P<assign>:=|[:=])"""
     r"""|(?P<text>"(?![,;])[^"\n\[\](){}]*"|'(?![,;])[^'\n\[\](){}]*')"""
     r"""|(?P<mark>[;,\n])|(?P<call>[A-Za-z_][\w.]*(?=\())|(?P<word>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?"""
@@ -61,6 +62,8 @@ class Statement:
 
 class _Bracket:
     """Open bracket, or the line outside of all brackets, whose content is being read."""
+
+    __slots__ = "opening", "glued", "entries", "words", "breaks", "word", "assigned", "last"
 
     def __init__(self, opening: str = "", glued: bool = False) -> None:
         self.opening, self.glued = opening, glued
@@ -120,13 +123,11 @@ class _Bracket:
         parts = [value for name, value in self.entries if not (inner and name) or is_container(value)]
         if inner:
             return parts[0] if len(parts) == 1 else parts
-        for mark, fewest in (
-            ((";", 2), ("\n", 3)) if self.opening == "[" else ()
-        ):  # rows of a matrix in MATLAB
-            ends = [0, *(at for at, which in self.breaks if which == mark), len(parts)]
-            rows = [parts[a:b] for a, b in pairwise(ends) if b > a]
-            if len(rows) >= fewest and len(set(map(len, rows))) == 1 < len(rows[0]):
-                return rows
+        fewest = 2 if any(mark == ";" for _, mark in self.breaks) else 3
+        ends = [0, *(at for at, mark in self.breaks if mark != ","), len(parts)]
+        rows = [parts[a:b] for a, b in pairwise(ends) if b > a]  # as MATLAB writes a matrix
+        if self.opening == "[" and len(rows) >= fewest and len(set(map(len, rows))) == 1 < len(rows[0]):
+            return rows
         return parts
 
 
@@ -135,7 +136,9 @@ def read_statements(lines: Sequence[str], across_lines: bool = True) -> list[Sta
     statements, stack, first, line, before = list[Statement](), [_Bracket()], 0, 0, -1
     for match in _TOKEN.finditer("\n".join(lines) + "\n"):
         kind, token = match.lastgroup or "", match[0]
-        if kind == "open":
+        if kind == "flat":
+            stack[-1].add(list(map(cell_of, token[1:-1].replace(",", " ").split())))
+        elif kind == "open":
             stack.append(_Bracket(token, match.start() == before))
         elif kind == "close" and len(stack) > 1:
             _close(stack[-2], stack.pop())
@@ -201,8 +204,7 @@ def _append(statements: list[Statement], new: Statement) -> None:
 
 def group_statements(statements: Sequence[Statement]) -> list[list[Statement]]:
     """Return the statements with the same columns and the same words, apart from numbers, as groups."""
-    groups = defaultdict[Any, list[Statement]](list)
+    groups = defaultdict[object, list[Statement]](list)
     for one in statements:
-        words = re.sub(r"\d+", "#", one.words.lower())
-        groups[tuple(one.row()), words].append(one)
+        groups[tuple(one.row()), re.sub(r"\d+", "#", one.words.lower())].append(one)
     return list(groups.values())

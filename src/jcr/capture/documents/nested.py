@@ -47,10 +47,10 @@ def leaves(value: Any) -> dict[str | int, Cell]:
             start = f"{path}." if path else ""
             for key, child in parts:
                 descend(child, f"{start}{key}")
-        elif isinstance(part, str):
-            found[path] = cell_of(part)
+        elif isinstance(part, bool):
+            found[path] = str(part).lower()
         else:
-            found[path] = str(part).lower() if isinstance(part, bool) else part
+            found[path] = cell_of(part) if isinstance(part, str) else part
 
     descend(value, "")
     return found

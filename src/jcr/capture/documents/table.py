@@ -83,10 +83,10 @@ def cell_of(text: str) -> Cell:
     An integer of more than 15 digits, such as nanoseconds, stays a text, because a float would lose digits of it.
     """
     text = text.strip()
-    if len(text) > _LONGEST_NUMBER or "_" in text or (len(text) > 15 and text.lstrip("+-").isdigit()):
+    if len(text) > 15 and (len(text) > _LONGEST_NUMBER or text.lstrip("+-").isdigit()):
         return text
     try:
-        return float(text)
+        return float(text) if "_" not in text else text
     except ValueError:
         return text or None
 
