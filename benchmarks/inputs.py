@@ -48,6 +48,8 @@ OPTIONS = re.compile(rf"{_OPTION}(?: {_OPTION})*")
 Kind = Literal["right", "in part", "refused", "rejected", "left out", "accepted"]
 """What reading gives: all poses right, those of some images, none; or wrong poses, by what a calibration does with them:
 it is rejected, it leaves the wrong poses out, or it is accepted with wrong poses."""
+LONGEST = 220
+"""Number of characters of a message in a table."""
 WRONG: tuple[Kind, ...] = ("rejected", "left out", "accepted")
 
 
@@ -84,7 +86,7 @@ def run(captures: Path, every: int = 1) -> str:
     """Return the page in Markdown: all layouts of one in `every` of the captures and of the simulated recordings."""
     with tempfile.TemporaryDirectory(prefix="jcr-inputs-") as folder:
         place = Path(folder)
-        recordings = [_real(one) for one in folders_with_captures(captures, every)]
+        recordings = [_real(one, place) for one in folders_with_captures(captures, every)]
         recordings += simulated_recordings(place / "simulated", range(0, len(MOTIONS), every))
         observed = {one.name for one in recordings if _is_observed(one)}
         read = [
@@ -96,8 +98,11 @@ def run(captures: Path, every: int = 1) -> str:
     return "\n".join(_page(recordings, observed, read, faulty)) + "\n"
 
 
-def _real(folder: Path) -> Recording:
-    """Return a real capture as a recording, with camera poses that are reconstructed without its gripper poses."""
+def _real(folder: Path, place: Path) -> Recording:
+    """Return a real capture as a recording, with camera poses that are reconstructed without its gripper poses.
+
+    Its images are copied below the folder `place`.
+    """
     capture = read_capture(folder)
     capture = capture.of_rows(sorted(range(len(capture)), key=lambda k: natural(capture.images[k])))
     try:
@@ -105,9 +110,13 @@ def _real(folder: Path) -> Recording:
         camera, image = made.recon_from_camera, made.image_index
     except RejectedError:
         camera, image = np.zeros((0, 4, 4)), np.zeros(0, int)
+    files = tuple(place / folder.name / Path(name).name for name in capture.images)
+    files[0].parent.mkdir()
+    for name, file in zip(capture.images, files, strict=True):
+        shutil.copy(folder / name, file)
     return Recording(
         name=folder.name,
-        files=tuple(folder / name for name in capture.images),
+        files=files,
         base_from_gripper=capture.base_from_gripper,
         camera_from_board=board_seen(capture.base_from_gripper, MOUNTED),
         joints=angles_of_joints(len(capture), np.random.default_rng(len(capture))),
@@ -177,9 +186,9 @@ def _cameras_of(capture: Capture, recording: Recording) -> tuple[Float[ndarray, 
 
 
 def _images_of(capture: Capture, recording: Recording) -> list[int]:
-    """Return the index in the recording of each image of the capture; the images in the capture are links."""
-    index = {file.resolve(): k for k, file in enumerate(recording.files)}
-    return [index[(capture.folder / name).resolve()] for name in capture.images]
+    """Return the index in the recording of each image of the capture; both are hard links to one file."""
+    index = {file.stat().st_ino: k for k, file in enumerate(recording.files)}
+    return [index[(capture.folder / name).stat().st_ino] for name in capture.images]
 
 
 def _judged(capture: Capture, recording: Recording) -> tuple[Kind, str]:
@@ -288,13 +297,14 @@ def _page(
     )
     yield (
         f"> Wrong on purpose: of {len(faulty)} {by_fault['refused']} are refused, {by_fault['rejected']} rejected, "
-        f"{by_fault['accepted']} accepted with wrong poses, {sum('accepted' in one.by_option for one in faulty)} with an "
-        "option that a message names."
+        f"{by_fault['accepted']} accepted with wrong poses, {sum('accepted' in one.by_option for one in faulty)} with "
+        "an option that a message names."
     )
     yield from ("", *_legend(), "")
     for title, part in (("observed", seen), ("not observed", others)):
         yield from (f"## Motion: reading {title}", "", *_totals(part), "")
     yield from ("## Layouts", "", *_by_layout(seen, others), "")
+    yield from ("## Refused although the motion observes the reading", "", *_refused(seen), "")
     yield from ("## Captures", "", *_by_recording(recordings, observed, read), "")
     yield from ("## Wrong on purpose", "", *_by_fault(faulty), "")
     yield from _wrongly_read([*read, *faulty])
@@ -311,8 +321,8 @@ def _legend() -> list[str]:
         "",
         "The motion observes the reading where the true poses and the camera poses give an accepted calibration. "
         "Camera poses of real captures are reconstructed without the robot, with the stored intrinsics; those of "
-        f"simulated recordings have noise of {1e3 * CAMERA_NOISE[0]:.1f} mm and {np.degrees(CAMERA_NOISE[1]):.2f}° on an "
-        "axis.",
+        f"simulated recordings have noise of {1e3 * CAMERA_NOISE[0]:.1f} mm and {np.degrees(CAMERA_NOISE[1]):.2f}° on "
+        "an axis.",
     ]
 
 
@@ -355,6 +365,22 @@ def _by_layout(seen: Sequence[Outcome], others: Sequence[Outcome]) -> list[str]:
     return table(f"layout | names fix | by images | {' | '.join(COLUMNS)} | {unobserved}", rows)
 
 
+def _refused(seen: Sequence[Outcome]) -> list[str]:
+    """Return the table of layouts that are refused, with the message of one capture."""
+    rows = []
+    for layout in LAYOUTS:
+        some = [one for one in seen if one.layout is layout and one.column == "refused"]
+        if some:
+            rows.append((layout.name, len(some), some[0].recording.name, _cell(some[0].message)))
+    return table("layout | captures | for example | message", rows)
+
+
+def _cell(message: str) -> str:
+    """Return the beginning of a message for a cell of a table."""
+    text = message.replace("|", "/").replace("\n", " ")
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
 def _by_recording(recordings: Sequence[Recording], observed: Set[str], read: Sequence[Outcome]) -> list[str]:
     """Return the table of captures."""
     rows = []
@@ -381,7 +407,7 @@ def _by_fault(faulty: Sequence[Outcome]) -> list[str]:
 def _wrongly_read(outcomes: Sequence[Outcome]) -> list[str]:
     """Return the table of outcomes that must not be: wrong poses without a fault, and all that are accepted."""
     rows = [
-        (one.layout.name, one.recording.name, one.fault, one.kind, one.message.replace("|", "/")[:200])
+        (one.layout.name, one.recording.name, one.fault, one.kind, _cell(one.message))
         for one in outcomes
         if one.is_wrongly_accepted or (one.kind in WRONG and not one.fault)
     ]

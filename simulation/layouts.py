@@ -89,7 +89,7 @@ def write_layout(
 ) -> None:
     """Write the recording's images and the poses (n,4,4; base_from_gripper) into a new folder, as the layout says.
 
-    `rows` are the indices of the images that have a pose in the file; None: all. Images are links.
+    `rows` are the indices of the images that have a pose in the file; None: all. Images are hard links.
     """
     rows = list(range(len(recording))) if rows is None else list(rows)
     stamps = [
@@ -99,7 +99,7 @@ def write_layout(
     (folder / layout.images).mkdir(parents=True)
     for file, stamp in zip(recording.files, stamps, strict=True):
         names.append(layout.stem.format(stem=file.stem, **_times(stamp)) + file.suffix)
-        os.symlink(file.resolve(), folder / layout.images / names[-1])
+        os.link(file, folder / layout.images / names[-1])
     length, angle = layout.units.split("-")
     stored = inverse(poses) if layout.inverted else poses.copy()
     stored[:, :3, 3] *= {"m": 1.0, "cm": 100.0, "mm": 1000.0}[length]

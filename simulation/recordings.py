@@ -22,6 +22,8 @@ STEMS = ("img_{:04d}", "{}", "color_{:02d}", "Ansicht_Tür_{}", "pose-{:03d}", "
 """Names of the images by their number. Files have them in the decomposed form, as on macOS."""
 SMALL = 0.12
 """Share of the rotations of a varied motion that remains in a motion with little rotation: 5° to 10°."""
+AROUND = 0.07
+"""Largest change (m) of the radius of an orbit; at a constant radius the scale is not observed."""
 MOTIONS: tuple[Pattern | Literal["small"], ...] = (
     *("varied", "orbit", "varied", "planar", "varied", "orbit", "varied", "one-axis", "varied", "small"),
     *("varied", "orbit", "varied", "translation", "varied", "orbit", "varied", "pivot", "varied", "small"),
@@ -84,6 +86,9 @@ def _simulated(folder: Path, number: int) -> Recording:
     target = np.array([rng.uniform(0.4, 0.6), rng.uniform(-0.15, 0.15), rng.uniform(-0.05, 0.1)])
     pattern = "varied" if motion == "small" else motion
     true = gripper_poses(pattern, count, target, gripper_from_camera, rng)
+    if motion == "orbit":
+        nearer = transform(np.eye(3), rng.uniform(-AROUND, AROUND, (count, 1)) * [0.0, 0.0, 1.0])
+        true = true @ gripper_from_camera @ nearer @ inverse(gripper_from_camera)
     if motion == "small":
         turned = rotation_exp(SMALL * rotation_log(true[:, :3, :3] @ true[0, :3, :3].T)) @ true[0, :3, :3]
         true = transform(turned, true[:, :3, 3])
