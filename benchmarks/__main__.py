@@ -32,6 +32,7 @@ BENCHES = {
     "real": (ROBOTS, "Real captures"),
     "features": (ROBOTS, "Features on real captures"),
     "cameras": (ROBOTS, "Several cameras"),
+    "inputs": (ROBOTS, "Files as people hold them"),
     "coverage": (HONEST, "Is ± true?"),
     "faults": (HONEST, "Faults"),
     "live": (HONEST, "Live calibration"),
