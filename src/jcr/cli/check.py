@@ -102,7 +102,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"
     lines = [f"{verdict}: {outcome}. {about}"]
-    if undecided:
+    if isinstance(capture, Capture) and capture.candidates:
         readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
         lines += labelled("Poses", f"{readings} (jcr check without --poses-only, or jcr run)")
     elif isinstance(capture, Capture) and capture.reading is not None:
