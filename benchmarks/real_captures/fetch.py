@@ -21,8 +21,8 @@ from numpy import ndarray
 from PIL import Image
 from scipy.io import loadmat
 
-from jcr.capture.controllers import poses_from_numbers
 from jcr.capture.formats import capture_json
+from jcr.capture.notations import poses_of_rows
 from jcr.capture.options import UnitsName
 from jcr.errors import InputError
 from jcr.estimation.arms import RobotName, arm_named
@@ -54,7 +54,7 @@ class Recipe:
     """Places in the doubles of a MATLAB table: first rotation, step to the next, count, position after a rotation."""
     convention: str = "matrix"
     units: UnitsName = "auto"
-    """Notation and units of the numbers, as in jcr.capture.controllers."""
+    """Notation and units of the numbers, as in jcr.capture.notations."""
     robot: RobotName | None = None
     """Arm whose joint angles (rad) are stored in place of poses."""
     joints: list[int] = field(default_factory=list)
@@ -202,7 +202,7 @@ def _poses(recipe: Recipe, files: dict[str, bytes]) -> Float[ndarray, "n 4 4"]:
     numbers = np.array(_chosen(rows, recipe.use_poses))
     if recipe.robot:
         return forward_kinematics(arm_named(recipe.robot), numbers[:, recipe.joints])
-    return poses_from_numbers(numbers, recipe.convention, recipe.units, recipe.poses)
+    return poses_of_rows(numbers, recipe.convention, recipe.units, recipe.poses)
 
 
 def _numbers(recipe: Recipe, content: bytes, width: int, alone: bool) -> list[list[float]]:

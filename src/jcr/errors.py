@@ -9,6 +9,8 @@ if TYPE_CHECKING:
 
 LONGEST_SHOWN = 80
 """Largest number of characters of a value that a message quotes in full."""
+NAMED, LONGEST_NAME = 10, 255
+"""Largest number of names that a message lists, and of characters of each; the other names are counted."""
 
 
 def printable(text: str) -> str:
@@ -23,6 +25,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """
     like = get_close_matches(word.lower(), known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first ten names as text, separated by commas, and the number of the remaining ones."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(name[:LONGEST_NAME] for name in names[:NAMED]) + more
 
 
 def shown(value: object) -> str:

@@ -22,8 +22,7 @@ from pydantic import (
 )
 
 import jcr
-from jcr.capture.plain_files import read_json, shown
-from jcr.errors import InputError, RejectedError, first_fault
+from jcr.errors import InputError, RejectedError, first_fault, shown
 from jcr.estimation.point_uncertainty import point_in_base
 from jcr.files import write_text
 from jcr.findings import (
@@ -60,6 +59,7 @@ from jcr.records import (
     Uncertainty,
 )
 from jcr.records.json_fields import Matrix, Positive, rounded
+from jcr.records.json_file import read_json
 
 FORMAT = "jcr.calibration/2"
 NAMES = {

@@ -11,7 +11,7 @@ from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case, with_findings
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
 from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
-from jcr.calibration.checks.convention import better_reading, check_convention
+from jcr.calibration.checks.convention import better_reading, check_convention, inverted_pair
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
@@ -24,6 +24,7 @@ from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_error
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
+from jcr.estimation.pose_misfit import pose_misfit
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, rotation_angle
@@ -228,6 +229,9 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
             return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
         return hand_eye.with_findings(*better_reading(gripper, camera, hand_eye.observability.observable))
+    if pairs.is_inverted:
+        errors = f"{1e3 * hand_eye.robot_noise.together[0]:.1f} mm per axis"
+        return hand_eye.with_findings(inverted_pair(pose_misfit(gripper, camera), errors))
     if pairs.is_metric and not is_one(hand_eye):
         std = hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6]))
         size = {"value": hand_eye.scale - 1, "std": std, "marker": 1.0}

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from jcr.capture.folder import require_decided
 from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_json, shown
 from jcr.capture.read import read_capture
-from jcr.errors import InputError
+from jcr.errors import InputError, shown
 from jcr.files import write_bytes
 from jcr.records import Capture
 from jcr.records.capture_json import other_size
+from jcr.records.json_file import read_json
 
 FOLDER, OWNER = "added", "added_to"
 
@@ -44,7 +45,7 @@ def with_added_images(added: Capture, path: Path, options: ReadOptions | None = 
     InputError for images of another size than the run's, and for images that were added before.
     """
     with tempfile.TemporaryDirectory(prefix="jcr-added-") as scratch:
-        new = read_capture(path, options, into=scratch, at_least=1)
+        new = require_decided(read_capture(path, options, into=scratch, at_least=1))
         if new.image_size != added.image_size:
             raise other_size(f"{path}: images", new.image_size, added.image_size, "the run has images")
         names = list(added.images)

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.controllers import far_faults, tolerated
 from jcr.capture.images import read_image
+from jcr.capture.notations import far_faults, tolerated
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
-from jcr.capture.plain_files import contained, first_few
-from jcr.errors import InputError
+from jcr.capture.plain_files import contained
+from jcr.errors import InputError, first_few
 from jcr.geometry import step_between
 from jcr.records import Capture
 from jcr.records.capture_json import other_size

@@ -1,23 +1,20 @@
 """Options of reading a capture, on the command line and in Python."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from jcr.errors import InputError
+
 MIN_FRAMES = 3
 """Smallest number of frames that can be calibrated."""
 MAX_FRAMES = 1000
 """Largest number of frames; images are compared with each other, and so are the errors of all poses."""
 
-FormatName = Literal[
-    "auto", "capture", "table", "samples", "bag", "lerobot",
-]  # fmt: skip
-ConventionName = Literal[
-    "auto", "matrix", "quat-xyzw", "quat-wxyz", "rotation-vector", "rpy", "ur", "franka", "xarm", "xarm-axis-angle",
-    "kuka", "fanuc", "yaskawa", "abb", "unitree", "realman",
-]  # fmt: skip
+FormatName = Literal["auto", "capture", "table", "samples", "bag", "lerobot"]
 UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-deg"]
 
 
@@ -25,16 +22,20 @@ UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-
 class ReadOptions:
     """Options of reading a capture; a capture.json needs none of these."""
 
-    pose_convention: ConventionName = "auto"
-    """Notation of the gripper poses (base_from_gripper) in a table; auto: from the names of its columns."""
+    pose_convention: str = "auto"
+    """Notation of the rotations in a pose file: matrix, matrix:columns, quat:xyzw, quat:wxyz, rotvec, euler:SEQUENCE
+    (xyz about fixed axes, ZYX about moving ones), or a maker: ur, franka, kuka, fanuc, abb, … (jcr docs captures).
+    auto: by names and numbers, else by the images."""
     pose_units: UnitsName = "auto"
-    """Units of a table's positions and angles, or of joint angles; auto: those of the convention or of the columns."""
+    """Units of positions and angles in a pose file, or of joint angles; auto: by names and sizes of the numbers."""
     pose_inverted: bool = False
     """The poses are gripper_from_base, the base in the gripper frame: invert them."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of gripper poses; unset: poses.csv, .tsv, .txt, .npy, .yaml or .json beside the images."""
+    """File of gripper poses, or folder with one file for each image; unset: found among all files of the capture."""
+    pose_columns: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """First part of the names of the columns that hold the gripper poses, where a file has several poses."""
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there is one."""
+    """File with the intrinsics (OpenCV, ROS, Kalibr, RealSense, COLMAP, a 3x3 matrix); unset: found in the capture."""
     format: FormatName = "auto"
     """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
@@ -54,3 +55,17 @@ class ReadOptions:
     episode: tuple[int, ...] = (0,)
     """LeRobot: the episode to take frames from. `jcr batch` takes several, each as a capture of its own, and names those
     whose camera moved."""
+
+
+def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:
+    """Return the topic, key or frame `asked` by the user; if that is None, the only entry of `usual`, the likely names.
+
+    Raises InputError that lists all `names` if `asked` is not one of them, or if `usual` has not one entry. In the
+    message, `what` describes the choice and `option` is its command-line option.
+    """
+    if asked in names:
+        return str(asked)
+    if asked is None and len(usual) == 1:
+        return usual[0]
+    wrong = "" if asked is None else f"{asked} is not there; "
+    raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(names) or 'there are none'}")

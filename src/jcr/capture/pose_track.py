@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.capture.plain_files import chosen_name
+from jcr.capture.options import chosen_name
 from jcr.errors import InputError
 from jcr.geometry import inverse, motion_length, transform
 

@@ -7,22 +7,23 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from jcr.capture import folder as folders
+from jcr.capture import samples
 from jcr.capture.checks import require_frames, require_motion
-from jcr.capture.formats import bag, capture_json, lerobot, samples, table
+from jcr.capture.formats import bag, capture_json, lerobot
 from jcr.capture.options import MIN_FRAMES, ReadOptions
-from jcr.capture.pairing import image_names
 from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
-from jcr.records import Capture, PosePairs
+from jcr.records import Capture, PosePairs, Reading
 
 FORMATS: dict[str, Any] = {
     "capture": capture_json,
     "bag": bag,
     "lerobot": lerobot,
     "samples": samples,
-    "table": table,
+    "table": folders,
 }
 """Reader module of each format, in the order in which the formats are tested."""
 RECORDINGS = ("bag", "lerobot")
@@ -67,7 +68,7 @@ def read_source(
         raise InputError(f"{path}: no such capture; name a folder with a capture.json, or another format")
     if options.frames < MIN_FRAMES:
         raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed, 8 to 15 are good")
-    name = format_of(path, options) if options.format == "auto" else options.format
+    name = format_of(path) if options.format == "auto" else options.format
     if name not in RECORDINGS:
         folder, origin, found = None, [], FORMATS[name].read(path, options)
     elif into is None:
@@ -79,40 +80,31 @@ def read_source(
         if extra.get("made_from") == origin:
             return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
         found = FORMATS[name].read(path, options, folder, progress or silent)
-    if options.pose_inverted:
-        found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
+    if (
+        options.pose_inverted
+        and isinstance(found, Capture)
+        and found.reading is None
+        and not found.candidates
+    ):
+        read = Reading(file=path.name, inverted=True, decided_by="option")
+        found = replace(found, base_from_gripper=inverse(found.base_from_gripper), reading=read)
     if folder is not None:
         capture_json.write(folder, found, notes=found.notes, made_from=origin)
         return replace(capture_json.read(folder), notes=found.notes)
     require_frames(len(found), str(path), at_least)
-    require_motion(found.base_from_gripper, str(path))
+    if isinstance(found, PosePairs) or not found.candidates:
+        require_motion(found.base_from_gripper, str(path))
     return found
 
 
-def format_of(path: Path, options: ReadOptions | None = None) -> str:
-    """Return the name of the capture format at a path, such as "table"; raise InputError if no format matches.
-
-    With `options.poses`, the format is "table" if no earlier one of FORMATS matches.
-    """
-    has_poses = options is not None and options.poses is not None
-    for name, form in FORMATS.items():
-        if form.recognises(path) or (name == "table" and has_poses):
+def format_of(path: Path) -> str:
+    """Return the name of the capture format at a path, such as "table"; raise InputError for a folder of several bags."""
+    for name in ("capture", "bag", "lerobot", "samples"):
+        if FORMATS[name].recognises(path):
             return name
-    if path.is_file():
-        raise InputError(
-            f"{path}: not recognised by its name or content; give its format with --format "
-            f"({', '.join(FORMATS)}), see jcr docs captures"
-        )
-    if any(bag.recognises(file) for file in path.iterdir()):
+    if path.is_dir() and any(bag.recognises(file) for file in path.iterdir()):
         raise InputError(f"{path}: holds bags; name one of them")
-    if taken := image_names(path):
-        raise InputError(
-            f"{path}: no capture.json and no poses.csv beside its {len(taken)} images ({taken[0]} … {taken[-1]}); "
-            "add a table of gripper poses with the columns image,x,y,z,qx,qy,qz,qw (m), or name one with --poses"
-        )
-    raise InputError(
-        f"{path}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); see jcr docs captures"
-    )
+    return "table"
 
 
 def _origin(path: Path, options: ReadOptions) -> list[Any]:

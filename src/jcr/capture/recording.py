@@ -11,9 +11,9 @@ from numpy import ndarray
 
 from jcr.capture.checks import checked_capture
 from jcr.capture.images import BLURRED, encode_png, sharpness
+from jcr.capture.intrinsics import read_intrinsics
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pose_track import NEVER
-from jcr.capture.ros import read_camera_info
 from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance, pose_residuals
 from jcr.files import write_bytes
@@ -97,7 +97,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     known = recording.intrinsics_of_size
     if options.camera_info is not None:
-        known = partial(read_camera_info, options.camera_info)
+        known = partial(read_intrinsics, options.camera_info)
     capture, kept = checked_capture(into, images, poses[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
     return replace(

@@ -1,6 +1,5 @@
 """Intrinsics, images and depth from messages of ROS bags (rosbags) and nodes (rclpy), and from camera_info YAML."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -9,20 +8,11 @@ from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from pydantic import AliasChoices, AliasPath, BaseModel, BeforeValidator, ConfigDict, Field
 
-from jcr.capture.plain_files import read_yaml, validated_content
-from jcr.errors import InputError, shown
-from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
-from jcr.records.capture_json import IntrinsicsEntry
+from jcr.capture.intrinsics import intrinsics_of_entry
+from jcr.errors import InputError
+from jcr.records import Intrinsics
+from jcr.records.json_file import validated_content
 
-CAMERA_INFO = "camera_info.yaml"
-_ROS_MODELS: dict[str, DistortionModel] = {
-    "": "pinhole",
-    "plumb_bob": "pinhole",
-    "rational_polynomial": "rational",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-}
-"""Distortion models of jcr by their names in ROS (sensor_msgs/distortion_models.hpp; depthai writes fisheye)."""
 _Numbers = Annotated[list[float], BeforeValidator(lambda it: list(it) if hasattr(it, "__iter__") else it)]
 """List of floats, converted from the array of a message."""
 
@@ -37,14 +27,6 @@ class CameraInfo(BaseModel):
     distortion_model: str
     d: _Numbers = Field(validation_alias=AliasChoices(AliasPath("distortion_coefficients", "data"), "d", "D"))
     p: _Numbers = Field(default=[], validation_alias=AliasChoices("p", "P"))
-
-
-def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """Read a camera_info YAML as the intrinsics of images of `size` (width, height); None if never calibrated.
-
-    Raises InputError as `intrinsics_of_ros` does.
-    """
-    return intrinsics_of_ros(read_yaml(file), size, str(file))
 
 
 def intrinsics_of_ros(
@@ -64,21 +46,9 @@ def intrinsics_of_ros(
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
         return None
-    known = _ROS_MODELS.get(model)
-    if known is None and not any(coefficients):
-        known = "pinhole"
-    if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
-        raise InputError(
-            f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
-            "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
-        )
-    if known == "rational" and not any(coefficients[5:]):
-        known = "pinhole"
-    fx, _, cx, _, fy, cy, *_ = matrix
-    count = len(COEFFICIENTS[known])
-    entry = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": info.width, "height": info.height}
-    entry |= {"model": known, "distortion": [*coefficients[:count], *[0.0] * (count - len(coefficients))]}
-    return validated_content(IntrinsicsEntry, entry, where).record(size, f"{where}: intrinsics")
+    fx, skew, cx, _, fy, cy, *_ = matrix
+    entry = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew, "width": info.width, "height": info.height}
+    return intrinsics_of_entry(entry | {"model": model, "distortion": coefficients}, size, where)
 
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.controllers import RADIANS_LIMIT
-from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import chosen_name, read_text
+from jcr.capture.documents.table import decode_text, read_limited
+from jcr.capture.notations import RADIANS_LIMIT
+from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import Stamps, bracket
 from jcr.errors import InputError
 from jcr.estimation.kinematics import Arm, forward_kinematics
@@ -30,7 +30,10 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
 
     try:
         # yourdfpy would repair invalid XML and print two lines on stderr; such a file is refused here.
-        etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
+        etree.fromstring(
+            decode_text(file, read_limited(file)).encode(),
+            etree.XMLParser(resolve_entities=False, no_network=True),
+        )
         plain = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
         for joint in plain.robot.joints:
             where, axis = f"{file}: joint {joint.name}", np.asarray(joint.axis, float)

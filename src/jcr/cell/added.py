@@ -8,11 +8,11 @@ from pathlib import Path
 
 from jcr.capture.formats.capture_json import camera_entries, read_intrinsics, with_cameras
 from jcr.capture.images import read_image, size_of_all
-from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
 from jcr.records.capture_json import NAME
+from jcr.records.json_file import read_json
 
 FOLDER, FILE = "cameras", "cameras.json"
 """Folder of the added cameras' images in the run folder, and the file of the cameras in it."""

@@ -173,25 +173,17 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
     Raises InputError for another file, and for a point that is not finite.
     """
-    from jcr.capture.plain_files import read_lines, read_npy, split_cells
+    from jcr.capture.documents import read_tables
+    from jcr.capture.readings import numbers_of_table
 
     if not path.is_file():
         raise InputError(f"{path}: no such file of points (.csv or .npy)")
     if path.suffix not in (".npy", ".csv"):
         raise InputError(f"{path}: points are read from .csv or .npy")
-    try:
-        if path.suffix == ".npy":
-            points = read_npy(path)
-        else:
-            _, rows = split_cells(read_lines(path)[0], path)
-            points = np.array(rows, float).reshape(len(rows), -1 if rows else 3)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read as points ({error}); give x, y, z in metres") from error
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise InputError(f"{path}: expected points (n, 3) in metres, got {points.shape} {points.dtype}")
-    points = points.astype(np.float64)
+    tables = [table for table in read_tables(path) if len(table.columns) == 3 and not table.place]
+    if not tables:
+        raise InputError(f"{path}: expected three numbers x, y, z (m) in each row")
+    points = numbers_of_table(tables[0])
     if not (finite := np.isfinite(points).all(1)).all():
         raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
     return points

@@ -273,6 +273,26 @@ def match_with_robot(
     )
 
 
+def match_alone(
+    matcher: Matcher, intrinsics: Intrinsics, count: int, report: Progress = silent
+) -> MatchedPairs:
+    """Match all pairs of `count` images without gripper poses, and return those with a two-view geometry.
+
+    `intrinsics` are at the size in which images are matched. Parts of the image that stay in all images are left out.
+    """
+    report("matching", 0.0)
+    matcher.still = None
+    still = np.tile(np.eye(4), (count, count, 1, 1))
+    search = _Search(
+        matcher=matcher, motion=still, intrinsics=intrinsics, repeats=np.zeros((count, count), dtype=bool)
+    )
+    search.match(dict.fromkeys(combinations(range(count), 2), (0.0, 0.0)))
+    search.hide_still_parts()
+    report("matching", 1.0)
+    geometries = {key: pair.geometry for key, pair in search.pairs.items()}
+    return MatchedPairs(geometries=geometries, intrinsics=intrinsics)
+
+
 def _pairs_to_map(
     search: _Search, found: Gate, names: Sequence[str]
 ) -> tuple[dict[Key, Pair], tuple[str, ...], tuple[str, ...]]:

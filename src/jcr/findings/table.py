@@ -137,6 +137,15 @@ class FindingKind(StrEnum):
     POSE_CONVENTION = "pose convention", KindRow("motion",
         "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}", explains=MISFIT,
         help="the option in `remedy`, or correct them at their source")
+    INVERTED_PAIR = "inverted poses", KindRow("motion",
+        "either the gripper poses or the marker poses are inverted, and pairs of poses do not tell which: the camera "
+        "is {value:.3g} m from the gripper if the gripper's are, {other:.3g} m if the marker's are ({fits})",
+        "measure that distance, and correct the poses in the file: the gripper in the base, the marker in the camera",
+        explains=MISFIT)
+    POSES_OF_CAMERA = "poses of the camera", KindRow("motion",
+        "camera and gripper frame coincide within {mm:.1f} mm and {rotation_deg:.1f}°: these are poses of the camera "
+        "itself, as from a board that it measured, and not of the gripper",
+        "give the gripper's poses in the robot's base", explains=MISFIT)
     NOISE_ABOVE_GIVEN = "noise above the given one", KindRow("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {rotation_deg:.2g}° per axis, more than the given "
         "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used")

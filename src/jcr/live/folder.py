@@ -10,16 +10,17 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.checks.capture import STILL as MOVED
-from jcr.capture.controllers import far_faults
 from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all
-from jcr.capture.plain_files import contained, validated_content
+from jcr.capture.notations import far_faults
+from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.files import remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture
 from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
+from jcr.records.json_file import validated_content
 
 IMAGES = "images"
 """Subfolder of the colour images."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.controllers import poses_from_numbers
+from jcr.capture.notations import poses_of_rows
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import inverse, rotation_angle
@@ -32,7 +32,7 @@ MOVED_ON = (0.01, np.radians(3.0))
 """Least motion (m, rad) from the last image's gripper pose to the pose at rest where the next image is taken."""
 TRY_AGAIN = (1e-3, np.radians(0.2))
 """Least motion (m, rad), in place of MOVED_ON, after an image that was refused."""
-BY_COUNT = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
+BY_COUNT = {6: "rotvec", 7: "quat:xyzw", 16: "matrix"}
 """Pose convention by the number of numbers."""
 KINDS = ("ur", "franka", "xarm")
 """Kinds of arms whose controllers can be read."""
@@ -102,7 +102,7 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
     if (named := BY_COUNT.get(len(numbers))) is None:
         forms = "x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; m, rad"
         raise InputError(f"{where}: {len(numbers)} numbers; give {forms}")
-    return poses_from_numbers(np.array([numbers], np.float64), named, "auto", where)[0]
+    return poses_of_rows(np.array([numbers], np.float64), named, "m-rad", where)[0]
 
 
 def states_of(source: str) -> States | None:
@@ -200,7 +200,7 @@ def xarm_states(host: str) -> Iterator[RobotState]:
                 raise InputError(
                     f"{where}: the arm answers with code {code or wrong}; see UFACTORY Studio; the same command resumes"
                 )
-            (base_from_gripper,) = poses_from_numbers(np.array([pose]), "xarm-axis-angle", "mm-rad", where)
+            (base_from_gripper,) = poses_of_rows(np.array([pose]), "rotvec", "mm-rad", where)
             joints = np.array(angles[: arm.axis], dtype=np.float64)
             yield RobotState(time.monotonic(), base_from_gripper, joints)
             time.sleep(XARM_POLL_S)

@@ -9,10 +9,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.capture.added import with_added_images
 from jcr.capture.formats.capture_json import kept
+from jcr.capture.formats.capture_json import read as read_kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.cell.added import added_camera, keep_camera
@@ -21,6 +24,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.files import locked, write_text
 from jcr.options import checked_options
+from jcr.pipeline.decision import decided_by_images
 from jcr.pipeline.selection import NothingFoundError
 from jcr.pipeline.stages import (
     FIRST,
@@ -30,12 +34,13 @@ from jcr.pipeline.stages import (
     forget_reconstruction,
     is_unchanged,
     keep_calibration,
+    keep_reconstruction,
     make,
     place,
 )
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BackendName
-from jcr.records import Capture, PosePairs
+from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import PACKAGES, require_packages
@@ -77,7 +82,10 @@ def run(
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
     options, missing = _possible(replace(options, reconstruct=own), capture)
     with locked(out):
+        capture, alone = _decided(capture, out, own.seed, report)
         result = begun(out, kept(capture, out / CAPTURE), options)
+        if alone is not None and own.backend in ("auto", "colmap") and own.features in ("auto", "sift"):
+            keep_reconstruction(result, alone)
         if is_unchanged(result):
             before = RunResult(out, capture=result.capture, is_unchanged=True)
             if before.parent_from_camera is None:
@@ -204,6 +212,37 @@ def measure(out: str | Path) -> "Measurement":
     from jcr.segments.measure import measure_objects
 
     return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
+
+
+def _decided(
+    capture: Capture, out: Path, seed: int, report: Progress
+) -> tuple[Capture, Reconstruction | None]:
+    """Return the capture with a decided reading, and the reconstruction that decided it if it has all images.
+
+    The decision that the run folder keeps is taken again while the file and its possible readings are the same.
+    """
+    if not capture.candidates:
+        return capture, None
+    if (known := _decided_before(capture, out / CAPTURE)) is not None:
+        return known, None
+    capture, made = decided_by_images(capture, seed, report)
+    is_whole = made is not None and len(made.image_index) == len(capture)
+    return capture, made if is_whole else None
+
+
+def _decided_before(capture: Capture, folder: Path) -> Capture | None:
+    """Return the capture with the reading that a folder keeps for the same images and numbers; None without one."""
+    with suppress(InputError, OSError, ValueError):
+        before = read_kept(folder)
+        rows = [capture.images.index(name) for name in before.images]
+        images = ((capture.folder / name, folder / name) for name in before.images)
+        if before.reading is None or not all(a.read_bytes() == b.read_bytes() for a, b in images):
+            return None
+        for _, poses in capture.candidates:
+            if len(poses) == len(capture) and np.allclose(poses[rows], before.base_from_gripper, atol=1e-9):
+                chosen = replace(capture.of_rows(rows), base_from_gripper=poses[rows], reading=before.reading)
+                return replace(chosen, candidates=())
+    return None
 
 
 def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, tuple[str, ...]]:

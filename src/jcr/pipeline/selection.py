@@ -129,12 +129,13 @@ def select_reconstruction(
     progress: Progress | None = None,
     keep: Callable[[Reconstruction], None] | None = None,
     before: Reconstruction | None = None,
+    goes_on: bool = False,
 ) -> tuple[Reconstruction, Calibration]:
     """Reconstruct and calibrate a capture with the back ends of `reconstruct.tries`, and return the best trial's result.
 
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
     a note names the selected one and the reason. If there is only one back end to try, `keep` receives its
-    reconstruction before the calibration. If the reconstruction `before` is given, only it is calibrated.
+    reconstruction before the calibration. If the reconstruction `before` is given, only it is calibrated, or it first if `goes_on`.
     Raises InputError if a back end does, or if gripper poses and joint angles contradict each other; NothingFoundError
     if no back end gives a calibration.
     """
@@ -148,14 +149,14 @@ def select_reconstruction(
 
     if before is not None:
         trials.append(_try(capture, before, options, progress))
-    candidates = tries(options.reconstruct) if before is None else []
+    candidates = tries(options.reconstruct) if before is None or goes_on else []
     for one in candidates:
         reason, goes_on = _why_untried(one, trials, len(capture), of_images) if trials else (None, True)
         notes += filter(None, [reason])
         if not goes_on:
             break
         if reason is None:
-            reported = keep if len(candidates) == 1 else None
+            reported = keep if len(candidates) == 1 and not trials else None
             trial = _try(capture, one, options, progress, reported)
             is_own = not BACKENDS[one.backend].hub_id or one.weights is not None
             if isinstance(trial.failure, InputError) and is_own:

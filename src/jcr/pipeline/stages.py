@@ -193,7 +193,8 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     try:
         keep = partial(keep_reconstruction, result)
         read = None if before is None else before.reconstruction
-        made, found = select_reconstruction(seen, options, progress, keep, read)
+        is_attempted = before is None or bool(before.state.attempts)
+        made, found = select_reconstruction(seen, options, progress, keep, read, goes_on=not is_attempted)
     except NothingFoundError as error:
         if not is_same(out):
             forget_reconstruction(out)
@@ -219,7 +220,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     attempts = found.attempts if before is None else before.state.attempts or found.attempts
     state = result.state.model_copy(update={"attempts": attempts})
     result = result.with_parts(state=state, reconstruction=made, calibration=found)
-    if is_same(out):
+    if is_same(out) and read is not None and np.array_equal(made.recon_from_camera, read.recon_from_camera):
         write_state(result)
     else:
         keep_reconstruction(result, made)

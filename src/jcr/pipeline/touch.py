@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.capture.plain_files import read_lines, split_cells
+from jcr.capture.documents import read_tables
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, by_similarity, inverse
@@ -116,18 +116,18 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()
-    header, rows = split_cells(read_lines(path)[0], path)
-    if missing := [name for name in COLUMNS if name not in (header or ())]:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
-    for line, row in enumerate(rows, start=2):
-        named = dict(zip(header or (), row, strict=False))
-        try:
-            own = np.array([float(named[name]) for name in COLUMNS[1:]])
-        except (KeyError, ValueError):
-            raise InputError(f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers") from None
+    tables = [table for table in read_tables(path) if set(COLUMNS) <= set(table.columns)]
+    if not tables:
+        raise InputError(f"{path}: has no columns {', '.join(COLUMNS)}; give them in the first line")
+    for line, row in enumerate(tables[0].rows, start=2):
+        named = dict(zip(tables[0].columns, row, strict=True))
+        cells = [named[name] for name in COLUMNS[1:]]
+        if not all(isinstance(cell, float) for cell in cells):
+            raise InputError(f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers")
+        own = np.array(cells, dtype=np.float64)
         if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
             raise InputError(f"{path}: line {line}: positions are finite and in metres")
-        images.append(named.get("image", ""))
+        images.append(str(named["image"] or ""))
         numbers.append(own)
     if len(images) < LEAST:
         raise InputError(f"{path}: {len(images)} points; touch {LEAST} or more, spread over the scene")

@@ -12,6 +12,7 @@ from jcr.calibration.drift import ALPHA, Drift, detectable, drift
 from jcr.calibration.options import GRASPING
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
+from jcr.capture.folder import require_decided
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.distributions import chi2
@@ -90,6 +91,7 @@ def verify_run(
     report = progress or silent
     if not isinstance(new, Capture):
         new = read_capture(new, at_least=1)
+    new = require_decided(new)
     run = RunResult(out)
     calibration, capture, reconstruction = run.of_wrist_camera()
     if not calibration.converged:

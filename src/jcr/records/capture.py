@@ -110,6 +110,30 @@ class CellCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Meaning of the numbers of a pose file: columns, notation of the rotation, units, direction, and who decided it."""
+
+    file: str
+    """Name of the file, or of the folder with one file for each image."""
+    columns: str = ""
+    """First part of the names of the columns that hold the pose, such as `robot_coords`; empty without names."""
+    notation: str = "matrix"
+    """Notation of the rotation, as in the option `--pose-convention`: matrix, quat:xyzw, rotvec, euler:ZYX, …"""
+    units: str = "m-rad"
+    """Units of length and angle, as in the option `--pose-units`."""
+    inverted: bool = False
+    """Whether the numbers are gripper_from_base."""
+    decided_by: Literal["names", "numbers", "option", "images"] = "names"
+    """What left this reading alone: names of columns or files, sizes of the numbers, an option, or the images."""
+    misfit_mm: float | None = None
+    """Misfit (mm) of this reading to the camera poses, 1° counted as 5 mm; None if the images were not asked."""
+    next_best: str | None = None
+    """Words for the reading with the next smallest misfit; None without one."""
+    next_misfit_mm: float | None = None
+    """Misfit (mm) of `next_best`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """Images of one scene with the gripper pose at each, after the checks of the reader."""
 
@@ -141,6 +165,13 @@ class Capture:
     """Body that the camera is mounted on; base: a fixed camera, whose images show an object in the gripper."""
     others: tuple[CellCamera, ...] = ()
     """Further cameras of the cell."""
+    reading: Reading | None = None
+    """Reading by which the gripper poses were taken from a file; None: unknown, or not yet decided."""
+    candidates: tuple[tuple[Reading, Float[ndarray, "r 4 4"]], ...] = ()
+    """Readings that names and numbers leave possible, with the gripper poses that each gives; empty once decided.
+
+    A pose is NaN where a row holds none. r is the number of images, or of rows where rows and images differ in number.
+    Until a reading is decided, `base_from_gripper` is NaN."""
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -173,6 +204,8 @@ class PosePairs:
     """Whether the unit of the camera poses is the metre, as with a marker of known size."""
     notes: tuple[str, ...] = ()
     backend: str = "poses given"
+    is_inverted: bool = False
+    """Whether the gripper poses were inverted on reading, as `--pose-inverted` asks."""
 
     def __len__(self) -> int:
         """Return the number of pairs."""

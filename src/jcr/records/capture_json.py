@@ -20,7 +20,7 @@ from pydantic import (
 
 from jcr.errors import InputError
 from jcr.geometry import HUGE, require_rigid
-from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount
+from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
@@ -210,6 +210,8 @@ class CaptureFile(Entry, extra="allow"):
     robot: Any = None
     urdf: str | None = None
     cameras: CameraEntries | None = None
+    reading: Reading | None = None
+    """How the poses were read from a file; absent where they were written as base_from_gripper."""
 
     def as_text(self) -> str:
         """Return the text of the capture.json."""

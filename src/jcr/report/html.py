@@ -1,11 +1,9 @@
 """File report.html: one page with the verdict on a calibration, the transform to copy, and the evidence."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 
 from jcr.calibration.record import FailedCalibration
 from jcr.capture.formats.capture_json import origin
-from jcr.capture.formats.table import TABLES
 from jcr.errors import printable
 from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
@@ -19,7 +17,7 @@ from jcr.report.verdict import failure_section, head
 from jcr.result import RunResult
 from jcr.rounding import significant
 
-UNNAMED = {Path(name).stem for name in (*TABLES, "capture.json", "metadata.yaml")}
+UNNAMED = {"poses", "capture", "metadata"}
 """Stems of file names that are the same in every capture, so that the folder names the capture."""
 LINKS = {
     "warnings": "Warnings",

@@ -33,7 +33,7 @@ from jcr.errors import RejectedError
 from jcr.extras import extra
 from jcr.features.matchers import FeatureName, Geometries, Matcher
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
-from jcr.features.stage import MatchedPairs, match_with_robot
+from jcr.features.stage import MatchedPairs, match_alone, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.missing_images import model_near_cameras, nearer_to_robot, with_missing_images
@@ -69,6 +69,8 @@ _MOST_OBSERVATIONS = 60_000
 """Largest number of observations of a map; more would not help, because the robot's errors limit the accuracy."""
 _MOST_MATCHED = 120_000
 """Largest number of matched keypoints that are mapped; adjusting a point costs the square of its number of images."""
+MOST_ALONE = 40
+"""Largest number of images that are reconstructed without poses; all pairs are matched, 780 of forty images."""
 _SIFT_THREADS = 8
 """Largest number of images whose features are found at once; each takes 240 bytes per pixel meanwhile."""
 _FEW_FEATURES = 1000
@@ -105,6 +107,31 @@ def reconstruct_colmap(
     if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
         notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
+
+
+def reconstruct_alone(capture: Capture, seed: int = 0, progress: Progress | None = None) -> Reconstruction:
+    """Reconstruct camera poses and tracks of a capture from its images alone, without its gripper poses.
+
+    More images than MOST_ALONE are reconstructed in part: that many, spread over their order. The rest is as in
+    `reconstruct_colmap`.
+    """
+    report = progress or silent
+    rows = np.unique(np.linspace(0, len(capture) - 1, min(len(capture), MOST_ALONE)).round().astype(int))
+    images = [read_image(capture.folder / capture.images[row]) for row in rows]
+    all_intrinsics, known, warnings = starting_intrinsics(capture)
+    with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        cameras = working_cameras(all_intrinsics, known)
+        matcher = matcher_of(images, cameras[0], known, "sift", seed, report)
+        working = resized(all_intrinsics[0], cameras[0].width, cameras[0].height)
+        matched = match_alone(matcher, working, len(images), report)
+        matched = replace(matched, geometries=_thinned(matched.geometries, len(images), seed))
+        database = write_database(Path(folder), cameras[0], matcher.features.x_px, matched.geometries)
+        model = _map_incrementally(database, cameras, matcher, report, None)
+        if model is None or model.num_reg_images() < _MIN_REGISTERED:
+            raise _not_registered(matcher, matched, model).with_more(*warnings)
+        made = _adjusted(model, images, all_intrinsics[0], known, seed)
+    report("mapping", 1.0)
+    return replace(made, image_index=rows[made.image_index], warnings=warnings)
 
 
 def reconstruct_near_cameras(

@@ -8,11 +8,11 @@ import pycolmap
 
 from jcr.camera import HALF_PIXEL
 from jcr.capture.images import read_image
-from jcr.capture.plain_files import validated_content
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
 from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics, Reconstruction
 from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.json_file import validated_content
 from jcr.sfm.colmap import matched_database
 from jcr.sfm.model import poses_of, quiet_colmap, tracks_of, triangulated_model
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import chosen_name, read_yaml
+from jcr.capture.documents import read_content
+from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import Stamps, TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros
@@ -156,7 +156,7 @@ def _opened(path: Path) -> Iterator[Any]:
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:
         metadata = path / "metadata.yaml"
-        about = read_yaml(metadata) if metadata.is_file() else None
+        about = read_content(metadata) if metadata.is_file() else None
         files = about["rosbag2_bagfile_information"]["relative_file_paths"] if about is not None else []
         if not isinstance(files, list):  # a text would be taken for as many files as it has letters
             raise ValueError("its metadata has no list of files")

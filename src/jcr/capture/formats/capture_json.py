@@ -1,7 +1,7 @@
 """Capture folder: `capture.json` and the images that it names."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json, validated_content
+from jcr.capture.plain_files import contained
 from jcr.errors import InputError, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import write_new
@@ -24,6 +24,7 @@ from jcr.records.capture_json import (
     IntrinsicsEntry,
     StdEntry,
 )
+from jcr.records.json_file import read_json, validated_content
 
 FILE, URDF = "capture.json", "robot.urdf"
 _CAMERAS = TypeAdapter(CameraEntries)
@@ -131,6 +132,7 @@ def stated_fields(
         "robot": robot,
         "urdf": None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf"),
         "depths": depths if any(depths) else None,
+        "reading": content.reading,
         "notes": notes,
     }
 
@@ -254,6 +256,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
         write_new(folder / URDF, urdf.read_bytes())  # so that the folder contains the whole capture
     optional = {
+        "reading": None if capture.reading is None else asdict(capture.reading),
         "robot": capture.robot,
         "urdf": None if urdf is None else URDF,
         "cameras": camera_entries(capture) or None,

@@ -12,16 +12,18 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field
 
-from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
-from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import chosen_name, contained, read_json, validated_content
+from jcr.capture.documents import Table
+from jcr.capture.options import ReadOptions, chosen_name
+from jcr.capture.plain_files import contained
 from jcr.capture.pose_track import interpolated_poses, speed
+from jcr.capture.readings import readings_of, undecided
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture
+from jcr.records.json_file import read_json, validated_content
 
 INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
@@ -55,7 +57,7 @@ class Info(BaseModel):
     codebase_version: str = ""
     chunks_size: Annotated[int, Field(ge=1)] = 1000
     data_path: Annotated[str, Field(max_length=1000)]
-    video_path: Annotated[str, Field(max_length=1000)] = ""
+    video_path: Annotated[str, Field(max_length=1000)] | None = None
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
         raise InputError(f"{table}: {key} of episode {index} {text}") from None
     if not (np.isfinite(time_s).all() and np.isfinite(state).all()):
         raise InputError(f"{table}: {key} holds NaN or infinity; choose another episode")
-    video = _file(path, info.video_path, video_fields | {"video_key": camera}) if has_video else None
+    video = _file(path, info.video_path or "", video_fields | {"video_key": camera}) if has_video else None
     return Episode(index, np.array(rows["frame_index"]), time_s, state, table, video, start_s)
 
 
@@ -243,16 +245,24 @@ def _poses(
             raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
         recorded = state[:, columns]
         return arm.poses(recorded), arm.angles(recorded)
-    convention = "rpy" if options.pose_convention == "auto" else options.pose_convention
-    wanted = CONVENTIONS[convention].columns
-    if key == CARTESIAN or options.pose_convention != "auto":
-        names = list(wanted)
-    elif not set(wanted) <= set(names):
+    if key == CARTESIAN and not names:
+        names = ["x", "y", "z", "roll", "pitch", "yaw"]
+    names = [*names, *[None] * (state.shape[1] - len(names))] if names else [None] * state.shape[1]
+    if len(names) > state.shape[1]:
+        raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
+    cells = tuple(map(tuple, state.tolist()))
+    table = Table(file=path, place=key, columns=tuple(names), rows=cells, keys=None, words="")
+    _, readings = readings_of(table, options, where)
+    if not readings:
+        listed = ", ".join(name for name in names if name) or "its numbers"
         raise InputError(
-            f"{where}: {', '.join(names) or 'its numbers'} are no pose; give --urdf and --gripper-frame for joint "
-            "angles (--pose-units m-deg for degrees), or --pose-convention"
+            f"{where}: {listed} are no pose; give --urdf and --gripper-frame for joint angles (--pose-units m-deg for "
+            "degrees), or --pose-convention"
         )
-    if state.shape[1] < len(names):
-        raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
-    numbers = state[:, [names.index(name) for name in wanted]]
-    return poses_from_numbers(numbers, convention, options.pose_units, where), None
+    direct = [one for one in readings if not one[0].inverted] or readings
+    if len(direct) > 1:
+        raise undecided(where, [reading for reading, _ in direct])
+    poses = direct[0][1]
+    if (wrong := np.flatnonzero(np.isnan(poses[:, 0, 0]))).size:
+        raise InputError(f"{where}: frame {wrong[0]} holds no pose; choose another episode")
+    return poses, None

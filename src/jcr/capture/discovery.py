@@ -1,0 +1,256 @@
+"""Discovery of a capture's images and of the documents that may hold its gripper poses."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from PIL import Image
+
+from jcr.capture.documents import Table, read_record_tables, read_tables
+from jcr.capture.pairing import NEARLY, Pairing, natural, pair, plain_name
+from jcr.capture.readings import words_of
+from jcr.errors import InputError, first_few
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+OTHER_IMAGES = {
+    ".heic": "HEIC",
+    ".heif": "HEIC",
+    ".dng": "raw",
+    ".cr2": "raw",
+    ".nef": "raw",
+    ".arw": "raw",
+    ".raw": "raw",
+}
+"""Endings of pictures that are not read, and the names of their formats."""
+NOT_SCENE = {
+    "mask",
+    "masks",
+    "depth",
+    "depths",
+    "seg",
+    "segmentation",
+    "label",
+    "labels",
+    "disparity",
+    "confidence",
+}
+"""Words in names of files and folders with images that do not show the scene in colour."""
+USUAL = ("images", "image", "rgb", "color", "colour", "img", "imgs")
+"""Names of folders with the images of a capture, the first ones preferred."""
+IGNORED = {
+    ".pyc",
+    ".py",
+    ".ipynb",
+    ".md",
+    ".pdf",
+    ".zip",
+    ".gz",
+    ".ply",
+    ".pcd",
+    ".stl",
+    ".urdf",
+    ".mp4",
+    ".avi",
+    ".svg",
+}
+"""Endings of files that hold no poses."""
+DEEPEST = 4
+"""Largest number of folders below the capture's in which files are found."""
+MOST_FILES, MOST_BYTES = 200, 20_000_000
+"""Largest number and size of the documents that are searched for poses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Discovery:
+    """Images of a capture, tables that may hold their poses with the pairing of each, and what was left out."""
+
+    images: tuple[str, ...]
+    """Paths relative to the folder, in natural order."""
+    tables: tuple[tuple[Table, Pairing], ...]
+    documents: tuple[Path, ...]
+    """Files that may hold intrinsics or poses."""
+    refused: tuple[InputError, ...]
+    """Errors of files that cannot be read."""
+    notes: tuple[str, ...]
+
+
+def discover(folder: Path, poses: Path | None = None) -> Discovery:
+    """Find the images of a folder and all tables with a row for nearly every image.
+
+    `poses` is the only file of poses that is read, or a folder with one file for each image; None: all documents of the
+    folder, or beside it if there are none. Raises InputError if the folder has no images.
+    """
+    images, notes = find_images(folder)
+    documents = list(_files(folder)) if poses is None else [poses]
+    tables, refused = _tables_of(documents, images)
+    if not tables and not refused and poses is None:
+        beside = sorted(one for one in folder.resolve().parent.iterdir() if one.is_file())
+        tables, _ = _tables_of([one for one in beside if _may_hold_poses(one)], images)
+    return Discovery(
+        images=images, tables=tuple(tables), documents=tuple(documents), refused=tuple(refused), notes=notes
+    )
+
+
+def find_images(folder: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the images of a folder or of one of its subfolders, relative to it in natural order, and notes.
+
+    Hidden files, masks and depth images are left out, and images of another size than most. Of several folders with
+    images, the one with a usual name, else the one with most images, is taken, which a note states. Raises InputError
+    if there are none.
+    """
+    found, others = dict[Path, list[Path]](), Counter[str]()
+    for file in _walk(folder):
+        if (suffix := file.suffix.lower()) in OTHER_IMAGES:
+            others[OTHER_IMAGES[suffix]] += 1
+        relative = file.relative_to(folder)
+        words = {word for part in (*relative.parts[:-1], relative.stem) for word in words_of(part)}
+        if suffix in IMAGE_SUFFIXES and not words & NOT_SCENE:
+            found.setdefault(file.parent, []).append(file)
+    if not found:
+        what = (
+            f"; it holds {first_few(sorted(others))} pictures: convert them to PNG or JPEG" if others else ""
+        )
+        raise InputError(
+            f"{folder}: holds no images ({', '.join(IMAGE_SUFFIXES)}){what or '; put them there'}"
+        )
+    if max(map(len, found.values())) == 1 and len(found) > 2:  # a folder for each image
+        taken, chosen, notes = [one for files in found.values() for one in files], folder, list[str]()
+    else:
+        chosen = max(found, key=lambda one: (_preference(one, folder, found), -len(one.parts)))
+        taken, notes = found[chosen], list[str]()
+    rest = sorted(str(one.relative_to(folder)) for one in found if one != chosen and len(found[one]) >= 3)
+    if rest and chosen in found:
+        notes.append(f"images taken from {chosen.relative_to(folder)}/, not from {first_few(rest)}")
+    sizes = {file: _size(file) for file in taken}
+    usual = Counter(size for size in sizes.values() if size is not None).most_common(1)
+    odd = [file for file in taken if usual and sizes[file] not in (None, usual[0][0])]
+    if odd and len(odd) < len(taken) / 2:
+        names = first_few([str(file.relative_to(folder)) for file in odd])
+        notes.append(
+            f"{len(odd)} images of another size than {usual[0][0][0]}x{usual[0][0][1]} are left out: {names}"
+        )
+        taken = [file for file in taken if file not in odd]
+    return tuple(sorted((str(file.relative_to(folder)) for file in taken), key=natural)), tuple(notes)
+
+
+def _preference(one: Path, folder: Path, found: dict[Path, list[Path]]) -> tuple[bool, int, int]:
+    """Return the sort key of a folder with images: many enough, usual name, number of images."""
+    most = max(map(len, found.values()))
+    name = one.name.lower() if one != folder else ""
+    rank = len(USUAL) - USUAL.index(name) if name in USUAL else 0
+    return len(found[one]) >= min(3, most), rank, len(found[one])
+
+
+def _size(file: Path) -> tuple[int, int] | None:
+    """Return the size of an image file by its header; None for a damaged one."""
+    try:
+        with Image.open(file) as opened:
+            return opened.size
+    except Exception:  # decoders raise errors of many types for a damaged file
+        return None
+
+
+def _walk(folder: Path, depth: int = 0) -> Iterator[Path]:
+    """Yield the files of a folder and its subfolders, without hidden ones, nearest first."""
+    entries = sorted(one for one in folder.iterdir() if not one.name.startswith((".", "__")))
+    yield from (one for one in entries if one.is_file())
+    for one in entries if depth < DEEPEST else ():
+        if one.is_dir():
+            yield from _walk(one, depth + 1)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder that may hold poses, up to the limit of bytes."""
+    total = 0
+    for file in _walk(folder):
+        if _may_hold_poses(file):
+            total += file.stat().st_size
+            if total <= MOST_BYTES:
+                yield file
+
+
+def _may_hold_poses(file: Path) -> bool:
+    """Test whether a file may hold poses, by its ending."""
+    return file.suffix.lower() not in {*IMAGE_SUFFIXES, *IGNORED, *OTHER_IMAGES}
+
+
+def _tables_of(
+    documents: Sequence[Path], images: Sequence[str]
+) -> tuple[list[tuple[Table, Pairing]], list[InputError]]:
+    """Return the tables of documents with a row for nearly every image, each paired with the images, and errors.
+
+    Files of which there is one for each image are read as one table; so are those that an index lists beside images.
+    """
+    found, refused, grouped = list[tuple[Table, Pairing]](), list[InputError](), set[Path]()
+
+    def add(tables: Sequence[Table]) -> None:
+        """Append the tables that may belong to the images."""
+        for table in tables:
+            paired = pair(table, images)
+            off = abs(len(table.rows) - len(images))
+            if paired.row is not None or paired.stamp_ns is not None or off <= max(2, len(images) // 4):
+                found.append((table, paired))
+
+    for files in _groups([one for one in documents if one.is_file()], images):
+        grouped |= set(files)
+        try:
+            add(read_record_tables(files))
+        except InputError as error:
+            refused.append(error)
+    for folder in (one for one in documents if one.is_dir()):
+        files = sorted((one for one in folder.iterdir() if one.is_file()), key=lambda one: natural(one.name))
+        add(read_record_tables(files))
+    for file in [one for one in documents if one.is_file() and one not in grouped][:MOST_FILES]:
+        try:
+            tables = read_tables(file)
+        except InputError as error:
+            refused.append(error)
+            continue
+        add(tables)
+        for table in tables:
+            add(_indexed(table, images))
+    return found, refused
+
+
+def _groups(documents: Sequence[Path], images: Sequence[str]) -> list[list[Path]]:
+    """Return groups of documents of one folder and ending of which each image has one, by its name or its number."""
+    names = {plain_name(image) for image in images}
+    groups = dict[tuple[Path, str, str], list[Path]]()
+    for file in documents:
+        is_like = plain_name(file.stem) in names
+        template = "=" if is_like else re.sub(r"\d+", "#", file.stem)
+        groups.setdefault((file.parent, file.suffix.lower(), template), []).append(file)
+    least = max(3, NEARLY * len(images))
+    return [
+        sorted(files, key=lambda one: natural(one.name)) for files in groups.values() if len(files) >= least
+    ]
+
+
+def _indexed(table: Table, images: Sequence[str]) -> list[Table]:
+    """Return the tables of the documents that a table lists beside the names of images, with these names as keys."""
+    columns = [[row[k] for row in table.rows] for k in range(len(table.columns))]
+    texts = [[cell for cell in cells if isinstance(cell, str)] for cells in columns]
+    whole = [cells for cells in texts if len(cells) == len(table.rows)]
+    own = {plain_name(image) for image in images}
+    of_images = [
+        cells
+        for cells in whole
+        if cells and all(Path(cell).suffix.lower() in IMAGE_SUFFIXES for cell in cells)
+    ]
+    if not of_images or len({plain_name(cell) for cell in of_images[0]} & own) < NEARLY * len(own):
+        return []
+    for cells in whole:
+        files = [table.file.parent / cell for cell in cells if len(cell) < 255 and "\0" not in cell]
+        inside = all(
+            file.resolve().is_relative_to(table.file.parent.resolve()) and file.is_file() for file in files
+        )
+        if cells is of_images[0] or len(files) < len(cells) or not inside:
+            continue
+        try:
+            made = read_record_tables(files)
+        except InputError:
+            continue
+        return [replace(one, keys=tuple(of_images[0])) for one in made if len(one.rows) == len(files)]
+    return []

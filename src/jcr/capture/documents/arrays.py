@@ -1,0 +1,190 @@
+"""Tables in arrays of NumPy (.npy, .npz) and MATLAB (.mat), and the names of binary files that are refused."""
+
+import io
+import math
+import struct
+import zipfile
+import zlib
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from scipy.io import loadmat
+from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
+
+from jcr.capture.documents.nested import nested_tables
+from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
+from jcr.errors import InputError, shown
+
+_PICKLE = (
+    "a Python pickle, which may run programs; save numbers, np.save('poses.npy', np.array(poses, float))"
+)
+_MATLAB_OBJECT = "a MATLAB object such as a table; save it with writetable(T,'poses.csv')"
+_SHEET = "a spreadsheet; save it as CSV"
+_REFUSED = {
+    b"\x89HDF": "HDF5; save arrays, np.save('poses.npy', h5py.File(name)['poses'][:])",
+    b"MATLAB 7.3": "a MATLAB 7.3 file; save it with save('poses.mat','A','-v7')",
+    b"\xd0\xcf\x11\xe0": _SHEET,
+    **{b"\x80" + bytes([protocol]): _PICKLE for protocol in range(2, 6)},
+}
+"""First bytes of the files that are refused by name, and their remedy."""
+_NPY, _ZIP, _MATLAB = b"\x93NUMPY", b"PK\x03\x04", b"MATLAB 5.0"
+
+
+def array_tables(file: Path, data: bytes) -> list[Table] | None:
+    """Return the tables in the bytes of a .npy, .npz or .mat file; None for a file that may be text.
+
+    An array of n rows, or of n matrices along its first or last side, is a table of n rows. Raises InputError for
+    pickles, HDF5, spreadsheets and MATLAB objects, with the line of code that saves what can be read.
+    """
+    for start, name in _REFUSED.items():
+        if data.startswith(start):
+            raise InputError(f"{file}: {name}")
+    if file.suffix.lower() in (".pkl", ".pickle", ".joblib"):
+        raise InputError(f"{file}: {_PICKLE}")
+    try:
+        if data.startswith(_NPY):
+            arrays = {"": _read_npy(file, data)}
+        elif data.startswith(_ZIP):
+            arrays = _read_npz(file, data)
+        elif data.startswith(_MATLAB) or file.suffix.lower() == ".mat":
+            arrays = _read_mat(file, data)
+        else:
+            return None
+    except InputError:
+        raise
+    except Exception as error:  # NumPy and SciPy parse headers with errors of many types
+        raise InputError(f"{file}: not readable as arrays ({str(error)[:80]}); save it again") from None
+    return _tables_of(file, arrays)
+
+
+def _read_npy(file: Path, data: bytes) -> ndarray:
+    """Return the array in the bytes of a .npy file; raise InputError for objects and for missing bytes."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header = (
+        np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    )
+    shape, by_columns, dtype = read_header(stream)
+    if dtype.hasobject:
+        raise InputError(f"{file}: {_PICKLE}")
+    if math.prod(shape) > MAX_ITEMS or math.prod(shape) * dtype.itemsize > len(data):
+        raise InputError(
+            f"{file}: an array of shape {shown(shape)}, too large or cut off; save the poses alone"
+        )
+    flat = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+    return flat.reshape(shape, order="F" if by_columns else "C")
+
+
+def _read_npz(file: Path, data: bytes) -> dict[str, Any]:
+    """Return the arrays in the bytes of a .npz file by name; raise InputError for other archives."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {member.filename: member for member in archive.infolist()}
+        if "[Content_Types].xml" in members or "mimetype" in members:
+            raise InputError(f"{file}: {_SHEET}")
+        if any(name.endswith(".pkl") for name in members):
+            raise InputError(f"{file}: {_PICKLE}")
+        if not members or not all(name.endswith(".npy") for name in members):
+            raise InputError(f"{file}: an archive; unpack it")
+        if sum(member.file_size for member in members.values()) > MAX_BYTES:
+            raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
+        return {name.removesuffix(".npy"): _read_npy(file, archive.read(name)) for name in members}
+
+
+def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
+    """Return the variables in the bytes of a .mat file by name, fields of a struct as "struct.field"."""
+    if data.startswith(_MATLAB):
+        _limit_compressed(file, data)
+    variables = {
+        name: value for name, value in loadmat(io.BytesIO(data)).items() if not name.startswith("__")
+    }
+    found, objects = dict[str, Any](), False
+    queue = list(variables.items())
+    while queue:
+        name, value = queue.pop(0)
+        if isinstance(value, MatlabObject | MatlabFunction | MatlabOpaque):
+            objects = True
+        elif isinstance(value, ndarray) and value.dtype.names and value.size == 1:
+            queue += [(f"{name}.{field}", value[field].flat[0]) for field in value.dtype.names]
+        else:
+            found[name] = _plain(value) if value.dtype.hasobject else value
+    if objects and not found:
+        raise InputError(f"{file}: {_MATLAB_OBJECT}")
+    return found
+
+
+def _limit_compressed(file: Path, data: bytes) -> None:
+    """Raise InputError if the variables of a .mat file of version 5 have more than 20 MB once decompressed."""
+    order, at, total = "<" if data[126:128] == b"IM" else ">", 128, 0
+    while at + 8 <= len(data):
+        kind, size = struct.unpack(f"{order}II", data[at : at + 8])
+        if kind == 15:
+            total += len(zlib.decompressobj().decompress(data[at + 8 : at + 8 + size], MAX_BYTES - total + 1))
+        if total > MAX_BYTES:
+            raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
+        at += 8 + size
+
+
+def _plain(value: Any) -> Any:
+    """Return a cell array or struct array of MATLAB, or what it holds, as nested lists and dictionaries."""
+    if not isinstance(value, ndarray):
+        return value
+    if value.dtype.names:
+        return [{name: _plain(one[name]) for name in value.dtype.names} for one in value.flat]
+    if value.dtype.hasobject:
+        return [_plain(one) for one in value.flat]
+    if value.dtype.kind == "U":
+        return str(value.flat[0]) if value.size == 1 else value.tolist()
+    return _squeezed(value).astype(float).tolist()
+
+
+def _squeezed(array: ndarray) -> ndarray:
+    """Return an array without sides of length 1."""
+    return array.reshape([side for side in array.shape if side != 1])
+
+
+def _tables_of(file: Path, arrays: dict[str, Any]) -> list[Table]:
+    """Return the tables of arrays and nested lists by name: each alone, and those of equal length joined."""
+    tables, equal = list[Table | None](), defaultdict[int, dict[str, list[dict[str | int, Cell]]]](dict)
+    for name, value in arrays.items():
+        if not isinstance(value, ndarray):
+            tables += nested_tables(file, {name: value} if name else value)
+            continue
+        for array in _row_views(value):
+            rows = _rows(array)
+            tables.append(table_of(file, rows, place=name))
+            equal[len(rows)].setdefault(name, rows)
+    for named in equal.values():
+        if len(named) > 1:
+            rows = [dict[str | int, Cell]() for _ in next(iter(named.values()))]
+            for name, parts in named.items():
+                for row, part in zip(rows, parts, strict=True):
+                    row.update({f"{name}.{column}": cell for column, cell in part.items()})
+            tables.append(table_of(file, rows))
+    return [table for table in tables if table][:MAX_TABLES]
+
+
+def _row_views(array: ndarray) -> list[ndarray]:
+    """Return an array with its rows first; twice if the last side may count the rows as well; numbers and texts only."""
+    if array.dtype.kind not in "fiuUb" or array.size == 0:
+        return []
+    array = array.reshape(array.shape or (1,))
+    views = [array]
+    if array.ndim == 3 and max(array.shape[:2]) <= 4:
+        views = (
+            [array, np.moveaxis(array, -1, 0)] if max(array.shape[1:]) <= 4 else [np.moveaxis(array, -1, 0)]
+        )
+    elif array.ndim == 2 and array.shape[0] in (3, 4, 6, 7) and array.shape[1] > 4:
+        views.append(array.T)
+    return views
+
+
+def _rows(array: ndarray) -> list[dict[str | int, Cell]]:
+    """Return the cells of each row of an array, by their indices where a row has two or more sides."""
+    flat = array.reshape(len(array), -1)
+    columns = [".".join(map(str, place)) for place in np.ndindex(array.shape[1:])]
+    names = columns if array.ndim > 2 else range(flat.shape[1])
+    cells = flat.tolist() if array.dtype.kind == "U" else flat.astype(float).tolist()
+    return [dict(zip(names, row, strict=True)) for row in cells]

@@ -1,0 +1,198 @@
+"""Reading of a folder of images with documents that hold the gripper poses: tables, pairing, and readings."""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.checks import checked_capture, require_frames
+from jcr.capture.discovery import Discovery, discover
+from jcr.capture.documents import Table
+from jcr.capture.intrinsics import intrinsics_of_capture
+from jcr.capture.options import ReadOptions
+from jcr.capture.pairing import Pairing, poses_at_images
+from jcr.capture.readings import readings_of, source_of, undecided
+from jcr.errors import InputError, first_few
+from jcr.records import Capture, Reading
+
+POSE_WORDS = re.compile(r"pos|tcp|robot|ee|arm|hand|flange|matri|end|gripper", re.IGNORECASE)
+"""Parts of names of files that probably hold the poses."""
+_Poses = Float[ndarray, "r 4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """A table that may hold the gripper poses: its readings, paired with the images."""
+
+    table: Table
+    paired: Pairing
+    relevance: int
+    candidates: tuple[tuple[Reading, _Poses], ...]
+    """Readings, with the poses of the images; of the rows if rows and images differ in number."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rank(self) -> tuple[int, bool, bool]:
+        """Sort key, largest for the table that most probably holds the robot's poses."""
+        return (
+            self.relevance,
+            self.paired.row is not None or self.paired.stamp_ns is not None,
+            self.paired.is_by_name,
+        )
+
+
+def read(path: Path, options: ReadOptions) -> Capture:
+    """Read a capture from a folder with images and documents, or from a file of poses beside or above images.
+
+    Where names, numbers and options leave several readings, the capture has them as `candidates`, and its poses are NaN
+    until the images decide. Raises InputError if there are no poses, or no images for them.
+    """
+    folder, poses = (path, options.poses) if path.is_dir() else (path.parent, path)
+    found = discover(folder, poses)
+    sources, errors = list[_Source](), list[InputError]()
+    for table, paired in found.tables:
+        try:
+            source = _source(table, paired, options)
+        except InputError as error:
+            errors.append(error)
+            continue
+        sources += [source] if source.candidates else []
+    if not sources:
+        raise _no_poses(folder, found, [*errors, *found.refused])
+    best = max(source.rank for source in sources)
+    chosen = _without_copies([source for source in sources if source.rank == best])
+    if chosen[0].paired.row is None and chosen[0].paired.stamp_ns is None:
+        return _unpaired(folder, found, chosen, options)
+    return _paired(folder, found, chosen, options)
+
+
+def _source(table: Table, paired: Pairing, options: ReadOptions) -> _Source:
+    """Return a table with its readings at the images; raise InputError if numbers contradict units or times."""
+    where = f"{table.file}{f': {table.place}' if table.place else ''}"
+    rank, readings = readings_of(table, options, where, paired.skipped)
+    if paired.row is None and paired.stamp_ns is None:
+        return _Source(table=table, paired=paired, relevance=rank, candidates=tuple(readings))
+    made, notes = list[tuple[Reading, _Poses]](), set[str]()
+    for reading, of_rows in readings:
+        at_images, stale, note = poses_at_images(of_rows, paired, options.max_gap_ms, where)
+        notes |= {note} if note is not None else set()
+        if stale.all():
+            raise InputError(
+                f"{where}: no pose within {options.max_gap_ms:.0f} ms around any image; raise --max-gap-ms, or check "
+                "the clocks"
+            )
+        made.append((reading, at_images))
+    return _Source(
+        table=table, paired=paired, relevance=rank, candidates=tuple(made), notes=tuple(sorted(notes))
+    )
+
+
+def _without_copies(sources: list[_Source]) -> list[_Source]:
+    """Return the sources without those whose readings all give the poses of an earlier source."""
+    kept = list[_Source]()
+    for source in sources:
+        known = [poses for one in kept for _, poses in one.candidates]
+        new = [
+            (reading, poses)
+            for reading, poses in source.candidates
+            if not any(
+                poses.shape == other.shape and np.allclose(poses, other, atol=1e-9, equal_nan=True)
+                for other in known
+            )
+        ]
+        if new:
+            kept.append(replace(source, candidates=tuple(new)))
+    return kept
+
+
+def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
+    """Return the capture of tables whose rows are paired with images; frames without a pose are left out with a note."""
+    candidates = [one for source in chosen for one in source.candidates]
+    file = str(chosen[0].table.file)
+    has_pose = np.any([np.isfinite(poses).all((1, 2)) for _, poses in candidates], axis=0)
+    faults = dict[int, str]()
+    nameless = [k for k in np.flatnonzero(~has_pose).tolist() if _has_row(chosen, k)]
+    for k in nameless:
+        faults[k] = (
+            f"{file}: the row of {found.images[k]} holds no pose (a number is missing or no rotation); correct it"
+        )
+    unlisted = [found.images[k] for k in np.flatnonzero(~has_pose).tolist() if k not in faults]
+    rows = [k for k in range(len(found.images)) if found.images[k] not in set(unlisted)]
+    images = [found.images[k] for k in rows]
+    require_frames(len(images), file, 0)
+    is_decided = len(candidates) == 1
+    poses = candidates[0][1][rows] if is_decided else np.full((len(rows), 4, 4), np.nan)
+    placed = {rows.index(k): text for k, text in faults.items()}
+    capture, kept = checked_capture(folder, images, poses, file, placed)
+    taken = [rows[k] for k in kept]
+    notes = [*found.notes, *(note for source in chosen for note in source.notes)]
+    notes.append(f"poses of {source_of(chosen[0].table)}, paired with the images {chosen[0].paired.how}")
+    if unlisted:
+        notes.append(
+            f"{len(unlisted)} images have no pose in {Path(file).name} and are left out: {first_few(unlisted)}"
+        )
+    intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
+    return replace(
+        capture,
+        source=chosen[0].table.file,
+        intrinsics=intrinsics,
+        reading=candidates[0][0] if is_decided else None,
+        candidates=() if is_decided else tuple((reading, of_all[taken]) for reading, of_all in candidates),
+        notes=(*notes, *more, *capture.notes),
+    )
+
+
+def _has_row(chosen: list[_Source], image: int) -> bool:
+    """Test whether a table has a row for the image with an index."""
+    return any(source.paired.row is not None and source.paired.row[image] >= 0 for source in chosen)
+
+
+def _unpaired(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
+    """Return the capture of tables whose rows differ in number from the images; only the images can tell which fit."""
+    file, images = str(chosen[0].table.file), list(found.images)
+    none = np.full((len(images), 4, 4), np.nan)
+    capture, _ = checked_capture(folder, images, none, file)
+    intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
+    candidates = tuple(one for source in chosen for one in source.candidates)
+    return replace(
+        capture,
+        source=chosen[0].table.file,
+        intrinsics=intrinsics,
+        candidates=candidates,
+        notes=(*found.notes, *more, *capture.notes),
+    )
+
+
+def _no_poses(folder: Path, found: Discovery, errors: list[InputError]) -> InputError:
+    """Return the error that no document holds poses: that of the file that most probably should, else how to add one."""
+    named = [error for error in errors if POSE_WORDS.search(Path(str(error).split(":")[0]).name)]
+    if named or errors:
+        return (named or errors)[0]
+    listed = first_few([one.name for one in found.documents])
+    images = found.images
+    return InputError(
+        f"{folder}: no gripper poses for its {len(images)} images ({images[0]} … {images[-1]})"
+        f"{f' in {listed}' if listed else ''}; add a file with a row for each image (image,x,y,z,qx,qy,qz,qw in m, or as "
+        "the robot writes it), or name one with --poses"
+    )
+
+
+def count_differs(capture: Capture) -> InputError:
+    """Return the error that a file has another number of poses than there are images; it is not raised."""
+    rows = len(capture.candidates[0][1])
+    return InputError(
+        f"{capture.source}: {rows} poses for {len(capture)} images ({capture.images[0]} … {capture.images[-1]}), and nothing "
+        f"says which belongs to which; add a column with the images' names, or remove what is too much"
+    )
+
+
+def require_decided(capture: Capture) -> Capture:
+    """Return a capture whose reading is decided; raise InputError that lists the possible readings for another one."""
+    if capture.candidates:
+        is_unpaired = len(capture.candidates[0][1]) != len(capture)
+        readings = [reading for reading, _ in capture.candidates]
+        raise count_differs(capture) if is_unpaired else undecided(str(capture.source), readings)
+    return capture

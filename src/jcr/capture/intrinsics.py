@@ -1,0 +1,309 @@
+"""Intrinsics from the files of OpenCV, ROS, Kalibr, RealSense, OpenICC, ViSP and COLMAP, or from a 3x3 matrix."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jcr.camera import fold_distance_px
+from jcr.capture.documents import read_content, read_tables
+from jcr.capture.documents.table import decode_text, read_limited
+from jcr.capture.options import ReadOptions
+from jcr.capture.readings import numbers_of_table, words_of
+from jcr.errors import InputError, shown
+from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
+from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.json_file import validated_content
+
+NAMED = re.compile(
+    r"cam(era)?[_-]?(info|intr|param|calib)|intrin|calib|^ost$|cameras?$|^k$|opencv", re.IGNORECASE
+)
+"""Names of files that may hold intrinsics."""
+CERTAIN = ("camera_info.yaml", "camera_info.yml", "camera_info.json")
+"""Names of files that are intrinsics of the capture's camera, whatever size they state."""
+MODELS: dict[str, DistortionModel] = {
+    "": "pinhole", "plumb_bob": "pinhole", "radtan": "pinhole", "brown_conrady": "pinhole", "opencv": "pinhole",
+    "none": "pinhole", "pinhole": "pinhole", "inverse_brown_conrady": "pinhole", "rational_polynomial": "rational",
+    "full_opencv": "rational", "equidistant": "fisheye", "equi": "fisheye", "fisheye": "fisheye",
+    "opencv_fisheye": "fisheye", "kannala_brandt4": "fisheye",
+}  # fmt: skip
+"""Distortion models by their names in ROS, Kalibr, librealsense and COLMAP."""
+SKEW = 1e-4
+"""Largest skew, as a share of the focal length, that counts as none: a tenth of a pixel at the edge of an image."""
+_COLMAP: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+"""Parameters of COLMAP's camera models, in the order of cameras.txt."""
+
+
+def intrinsics_of_capture(
+    folder: Path, documents: Sequence[Path], options: ReadOptions, size: tuple[int, int]
+) -> tuple[Intrinsics | None, tuple[str, ...]]:
+    """Return the intrinsics for images of `size` (width, height) that a capture's documents state, and notes.
+
+    The file of `options.camera_info` is read; without it, a camera_info.yaml, or the only document that states
+    intrinsics for this size. The result is None without one. Raises InputError for an unusable file that was named.
+    """
+    if options.camera_info is not None:
+        return read_intrinsics(options.camera_info, size), ()
+    for file in documents:
+        if file.name.lower() in CERTAIN and file.parent in (folder, folder / "images"):
+            return read_intrinsics(file, size), ()
+    found, notes = dict[Path, Intrinsics](), list[str]()
+    for file in (one for one in documents if NAMED.search(one.stem)):
+        try:
+            read = read_intrinsics(file, size, size_needed=True)
+        except InputError:
+            continue
+        if read is not None:
+            found[file] = read
+    if len({str(one) for one in found.values()}) == 1:
+        file, intrinsics = next(iter(found.items()))
+        return intrinsics, (f"intrinsics of {file.relative_to(folder)}",)
+    if found:
+        listed = ", ".join(str(file.relative_to(folder)) for file in found)
+        notes.append(f"intrinsics of {listed} differ and were not used; name one with --camera-info")
+    return None, tuple(notes)
+
+
+def read_intrinsics(file: Path, size: tuple[int, int], size_needed: bool = False) -> Intrinsics | None:
+    """Read the intrinsics of a file for images of `size` (width, height); None if the camera was never calibrated.
+
+    `size_needed`: a file that does not state its images' size is no intrinsics. Raises InputError for a file without
+    intrinsics, an unknown distortion model, another size, a skew, or a distortion that folds over within the image.
+    """
+    for entry in _entries(file):
+        if not entry["fx"] and not entry["fy"]:
+            return None
+        if size_needed and entry.get("width") is None:
+            break
+        return intrinsics_of_entry(entry, size, str(file))
+    raise InputError(
+        f"{file}: no intrinsics were found in it; give those of OpenCV, ROS, Kalibr, RealSense or COLMAP, or a 3x3 "
+        "matrix"
+    )
+
+
+def intrinsics_of_entry(entry: dict[str, Any], size: tuple[int, int], where: str) -> Intrinsics:
+    """Return the intrinsics of an entry: fx, fy, cx, cy, skew, distortion, model by the name of a tool, width, height.
+
+    Raises InputError, begun with `where`, for what jcr's camera models cannot express, and for another image size.
+    """
+    model, coefficients = str(entry.get("model") or "").lower(), [*map(float, entry.get("distortion") or ())]
+    if abs(skew := float(entry.get("skew") or 0.0)) > SKEW * abs(entry["fx"]):
+        raise InputError(
+            f"{where}: a skew of {skew:.4g} px between the axes, which cameras do not have; calibrate without skew, or "
+            "leave the intrinsics out: they are estimated"
+        )
+    known = MODELS.get(model)
+    if known is None and not any(coefficients):
+        known = "pinhole"
+    if known == "pinhole" and len(coefficients) > 5:
+        known = "rational"
+    if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
+        raise InputError(
+            f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
+            "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
+        )
+    if known == "rational" and not any(coefficients[5:]):
+        known = "pinhole"
+    count = len(COEFFICIENTS[known])
+    numbers = {key: float(entry[key]) for key in ("fx", "fy", "cx", "cy")}
+    sides = {key: int(entry[key]) for key in ("width", "height") if entry.get(key)}
+    distortion = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
+    content = numbers | sides | {"model": known, "distortion": distortion}
+    made = validated_content(IntrinsicsEntry, content, where).record(size, f"{where}: intrinsics")
+    return made
+
+
+def fold_warning(intrinsics: Intrinsics | None) -> str | None:
+    """Return a sentence that the distortion folds over within the image; None if it does not."""
+    if intrinsics is None or (radius_px := fold_distance_px(intrinsics)) is None:
+        return None
+    return f"the given distortion is not monotonic: it folds over {radius_px:.0f} px from the principal point"
+
+
+def _entries(file: Path) -> Iterator[dict[str, Any]]:
+    """Yield the intrinsics that a file may state, in the fields of `intrinsics_of_entry`."""
+    if file.suffix.lower() in (".npy", ".npz", ".mat"):
+        yield from _of_matrices(file)
+        return
+    text = decode_text(file, read_limited(file))
+    if "<model>" in text and "<px>" in text:
+        yield from _of_visp(file, text)
+        return
+    cells = next((line.split() for line in text.splitlines() if line[:1].isdecimal()), [])
+    names = _COLMAP.get(cells[1], ()) if len(cells) > 4 else ()
+    if names and len(cells) == 4 + len(names):
+        yield _of_colmap(cells, names)
+        return
+    if "[camera matrix]" in text or "camera matrix" in text:
+        yield from _of_ost(text)
+    try:
+        content = read_content(file)
+    except InputError:
+        yield from _of_matrices(file)
+        return
+    yield from _of_content(content)
+
+
+def _of_content(content: Any, width: Any = None, height: Any = None) -> Iterator[dict[str, Any]]:
+    """Yield the intrinsics in nested data, outer ones first; an outer size applies to what lies below."""
+    if isinstance(content, list):
+        for part in content[:64]:
+            yield from _of_content(part, width, height)
+        return
+    if not isinstance(content, dict):
+        return
+    keys = {str(key).lower(): value for key, value in content.items()}
+    resolution = keys.get("resolution") or keys.get("image_size") or keys.get("size")
+    pair = resolution if isinstance(resolution, list) and len(resolution) == 2 else (None, None)
+    width = _first(keys, "image_width", "width", "w") or pair[0] or width
+    height = _first(keys, "image_height", "height", "h") or pair[1] or height
+    found = _numbers(keys)
+    if found is not None:
+        yield found | {"width": width, "height": height}
+        return
+    for part in content.values():
+        yield from _of_content(part, width, height)
+
+
+def _first(keys: dict[str, Any], *names: str) -> Any:
+    """Return the value of the first key that is there; None without one."""
+    return next((keys[name] for name in names if keys.get(name) is not None), None)
+
+
+def _numbers(keys: dict[str, Any]) -> dict[str, Any] | None:
+    """Return focal lengths, principal point, skew and distortion from one map; None if it has no intrinsics."""
+    distortion = _flat(_first(keys, "distortion_coefficients", "dist_coeffs", "distortion_coeffs", "distcoeffs", "coeffs",
+                              "distortion", "dist", "d"))  # fmt: skip
+    model = _first(keys, "distortion_model", "model")
+    made: dict[str, Any] = {"distortion": distortion, "model": model if isinstance(model, str) else ""}
+    matrix = _flat(
+        _first(keys, "camera_matrix", "k", "intrinsic_matrix", "mtx", "cameramatrix", "intrinsics", "matrix")
+    )
+    if len(matrix) == 9:
+        by_columns = abs(matrix[6]) > 1 and not matrix[2]
+        rows = np.array(matrix).reshape(3, 3).T if by_columns else np.array(matrix).reshape(3, 3)
+        return made | {
+            "fx": rows[0, 0],
+            "fy": rows[1, 1],
+            "cx": rows[0, 2],
+            "cy": rows[1, 2],
+            "skew": rows[0, 1],
+        }
+    if len(matrix) == 4:  # Kalibr
+        return made | dict(zip(("fx", "fy", "cx", "cy"), matrix, strict=True))
+    fx, fy = _first(keys, "fx", "fl_x", "focal_length", "f"), _first(keys, "fy", "fl_y")
+    cx = _first(keys, "cx", "ppx", "principal_pt_x", "principal_point_x")
+    cy = _first(keys, "cy", "ppy", "principal_pt_y", "principal_point_y")
+    if not all(isinstance(one, float) for one in (fx, cx, cy)):
+        return None
+    aspect = keys.get("aspect_ratio")
+    fy = fy if isinstance(fy, float) else fx * (aspect if isinstance(aspect, float) else 1.0)
+    named = [_first(keys, name, f"radial_distortion_{name[1]}" if name[0] == "k" else f"tangential_distortion_{name[1]}")
+             for name in COEFFICIENTS["pinhole"]]  # fmt: skip
+    if not distortion and any(isinstance(one, float) for one in named):
+        made["distortion"] = [one if isinstance(one, float) else 0.0 for one in named]
+    return made | {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": keys.get("skew") or 0.0}
+
+
+def _flat(value: Any) -> list[float]:
+    """Return nested lists, or the entry "data" of a map, as a flat list of numbers; empty for other content."""
+    if isinstance(value, dict):
+        value = next((one for key, one in value.items() if str(key).lower() == "data"), None)
+    if not isinstance(value, list):
+        return []
+    flat = [cell for row in value for cell in (row if isinstance(row, list) else [row])]
+    return flat if all(isinstance(cell, float) for cell in flat) else []
+
+
+def _of_colmap(cells: list[str], names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the intrinsics of a line of COLMAP's cameras.txt; its pixel centres are at half integers."""
+    named = dict(zip(names, map(float, cells[4:]), strict=True))
+    focal = named.get("f")
+    fisheye = cells[1] == "OPENCV_FISHEYE"
+    order = COEFFICIENTS["fisheye" if fisheye else "rational"]
+    return {
+        "fx": named.get("fx", focal), "fy": named.get("fy", focal),
+        "cx": named["cx"] - 0.5, "cy": named["cy"] - 0.5,
+        "distortion": [named.get(name, 0.0) for name in order],
+        "model": "fisheye" if fisheye else "rational_polynomial",
+        "width": float(cells[2]), "height": float(cells[3]),
+    }  # fmt: skip
+
+
+def _of_ost(text: str) -> Iterator[dict[str, Any]]:
+    """Yield the intrinsics of ost.txt, which ROS' camera calibrator prints."""
+    sections = dict[str, list[float]]()
+    name = ""
+    for line in text.splitlines():
+        words = line.strip().strip("[]").lower()
+        if words and not re.match(r"[-+.\d]", words):
+            name = words
+            continue
+        try:
+            sections.setdefault(name, []).extend(map(float, line.split()))
+        except ValueError:
+            return
+    matrix = sections.get("camera matrix", [])
+    if len(matrix) == 9:
+        sides = {side: sections[side][0] for side in ("width", "height") if sections.get(side)}
+        names = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5], "skew": matrix[1]}
+        yield names | sides | {"distortion": sections.get("distortion", [])}
+
+
+def _of_visp(file: Path, text: str) -> Iterator[dict[str, Any]]:
+    """Yield the intrinsics of a camera.xml of ViSP: the model without distortion comes first."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{file}: XML with a document type; remove it")
+    try:
+        camera = ElementTree.fromstring(text).find(".//camera")
+    except ElementTree.ParseError:
+        return
+    if camera is None:
+        return
+    for model in camera.findall("model"):
+        named = {one.tag: one.text for one in model} | {
+            one.tag: one.text for one in camera if one.tag.startswith("image")
+        }
+        names = {
+            "fx": "px",
+            "fy": "py",
+            "cx": "u0",
+            "cy": "v0",
+            "width": "image_width",
+            "height": "image_height",
+        }
+        try:
+            yield {ours: float(named[theirs] or "") for ours, theirs in names.items()}
+        except (KeyError, ValueError):
+            continue
+
+
+def _of_matrices(file: Path) -> Iterator[dict[str, Any]]:
+    """Yield the intrinsics of the 3x3 matrices of a text or an array file, with five numbers beside as distortion."""
+    tables = read_tables(file)
+    for table in tables:
+        numbers = numbers_of_table(table)
+        matrix = numbers.reshape(3, 3) if numbers.size == 9 else np.full((3, 3), np.nan)
+        if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)) or matrix[0, 0] <= 2:
+            continue
+        others = [
+            numbers_of_table(one).ravel()
+            for one in tables
+            if set(words_of(one.place)) & {"dist", "d", "distortion", "distcoeffs"}
+        ]
+        yield {
+            "fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2], "skew": matrix[0, 1],
+            "distortion": others[0].tolist() if others and others[0].size in (4, 5, 8) else [],
+        }  # fmt: skip

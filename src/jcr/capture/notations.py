@@ -1,0 +1,267 @@
+"""Notations of rotations, names of robot makers for them, and the conversion of rows of numbers to transforms."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.errors import InputError, did_you_mean, shown
+from jcr.geometry import HUGE, nearest_rotation, transform
+
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+"""Metres in each unit of length."""
+RADIANS_LIMIT = 2 * np.pi + 0.01
+"""Largest plausible angle of a pose in radians; larger numbers are degrees."""
+METRES_LIMIT = 10.0
+"""Largest plausible distance of a gripper from its base, m: the longest industrial arms reach 5 m, portals 10 m."""
+UNIT_TOLERANCE = 1e-2
+"""Largest accepted difference from 1 of a quaternion's length and of a matrix axis; three digits suffice."""
+SEQUENCES = (
+    *("xyz", "ZYX", "ZYZ", "XYZ", "zyx", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
+    *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
+)
+"""Sequences of Euler angles in SciPy's notation (lower case: fixed axes, upper case: moving axes), usual ones first."""
+EULERS = tuple(f"euler:{sequence}" for sequence in SEQUENCES)
+NUMBERS = {"quat:xyzw": 4, "quat:wxyz": 4, "rotvec": 3, "matrix": 9, "matrix:columns": 9} | dict.fromkeys(
+    EULERS, 3
+)
+"""Notations of a rotation, and how many numbers each has."""
+
+
+class Maker(NamedTuple):
+    """Notation in which the robots of a maker show a pose, and the document that states it."""
+
+    notation: str
+    source: str
+
+
+# "euler:xyz" about fixed axes is Rz(third)·Ry(second)·Rx(first); "euler:ZYX" is Rz(first)·Ry(second)·Rx(third).
+MAKERS = {
+    "ur": Maker("rotvec", "Universal Robots, The URScript Programming Language, pose p[x, y, z, rx, ry, rz]"),
+    "franka": Maker("matrix:columns", "Franka, libfranka, RobotState::O_T_EE: column-major 4x4"),
+    "xarm": Maker("euler:xyz", "UFACTORY, xArm Developer Manual: roll, pitch, yaw about fixed axes"),
+    "xarm-axis-angle": Maker("rotvec", "UFACTORY, xArm Developer Manual: axis-angle pose"),
+    "kuka": Maker("euler:ZYX", "KUKA, System Software operating manual: A about Z, B about Y, C about X"),
+    "fanuc": Maker("euler:xyz", "FANUC, operator's manual of the R-30iB: W, P, R about fixed X, Y, Z"),
+    "yaskawa": Maker("euler:xyz", "Yaskawa, DX200 operator's manual: Rx, Ry, Rz about fixed X, Y, Z"),
+    "abb": Maker("quat:wxyz", "ABB, RAPID technical reference manual, data type orient: q1 is the scalar"),
+    "unitree": Maker("euler:xyz", "Unitree, Z1 SDK: roll, pitch, yaw"),
+    "realman": Maker("euler:xyz", "RealMan, RM API2, rm_euler_t: rx, ry, rz about fixed axes"),
+    "doosan": Maker("euler:ZYZ", "Doosan Robotics, programming manual, posx: A, B, C are Z-Y-Z"),
+    "kawasaki": Maker("euler:ZYZ", "Kawasaki, AS Language reference manual: O, A, T are Z-Y-Z"),
+    "staubli": Maker(
+        "euler:XYZ", "Stäubli, VAL 3 reference manual, type trsf: rx, ry, rz about moving X, Y, Z"
+    ),
+    "mecademic": Maker("euler:XYZ", "Mecademic, Meca500 programming manual: mobile X-Y-Z"),
+    "techman": Maker("euler:xyz", "Techman Robot, TMflow expression editor: RX, RY, RZ with R = Rz·Ry·Rx"),
+    "aubo": Maker("euler:xyz", "AUBO, ARCS interface description: rx, ry, rz with R = Rz·Ry·Rx"),
+    "jaka": Maker("euler:xyz", "JAKA, SDK manual, type Rpy: rx, ry, rz about fixed axes"),
+    "epson": Maker("euler:ZYX", "Epson, RC+ user's guide: U about Z, V about Y, W about X"),
+}
+"""Notation of each maker; units differ between a maker's products and follow from the numbers or `--pose-units`."""
+
+
+def notation_of(name: str) -> str:
+    """Return the notation for a value of `--pose-convention`, a notation or a maker; raise InputError for others."""
+    notation = MAKERS[name].notation if name in MAKERS else name
+    sequence = notation.removeprefix("euler:")
+    if notation in NUMBERS or (notation == f"euler:{sequence}" and sequence in SEQUENCES):
+        return notation
+    known = (*[one for one in NUMBERS if one not in EULERS], "euler:ZYX", *MAKERS)
+    raise InputError(
+        f"--pose-convention {shown(name)}: not one of {', '.join(known)} (any sequence of x, y, z about fixed or "
+        f"X, Y, Z about moving axes){did_you_mean(name, (*NUMBERS, *MAKERS))}"
+    )
+
+
+def in_words(notation: str, angle: str) -> str:
+    """Return a notation of a rotation in words, such as "angles in degrees, R = Rz·Ry·Rx"; `angle` is "deg" or "rad"."""
+    unit = {"deg": "degrees", "rad": "radians"}[angle]
+    if notation == "rotvec":
+        return f"rotation vector in {unit}"
+    if notation.startswith("quat:"):
+        return f"quaternion {', '.join(notation[5:])}"
+    if notation.startswith("matrix"):
+        return "rotation matrix by columns" if notation.endswith("columns") else "rotation matrix"
+    sequence = notation[6:]
+    product = sequence[::-1] if sequence.islower() else sequence
+    return f"angles {sequence} in {unit}, R = {'·'.join(f'R{axis.lower()}' for axis in product)}"
+
+
+def rotations_of(
+    numbers: Float[ndarray, "n k"], notation: str, radians: float = 1.0
+) -> Float[ndarray, "n 3 3"]:
+    """Return the rotations that n rows of numbers describe in a notation; NaN for a row that is no rotation.
+
+    `radians` is the size of the unit of angles. A quaternion whose length, or a matrix whose axes differ from 1 by more
+    than 1 % is no rotation; nor is a mirrored matrix.
+    """
+    made = np.full((len(numbers), 3, 3), np.nan)
+    sound = np.isfinite(numbers).all(1) & (np.abs(numbers) < HUGE).all(1)
+    if notation.startswith("quat:"):
+        sound &= np.abs(np.linalg.norm(np.where(sound[:, None], numbers, 0.0), axis=1) - 1) < UNIT_TOLERANCE
+        order = [notation[5:].index(axis) for axis in "xyzw"]
+        made[sound] = Rotation.from_quat(numbers[sound][:, order]).as_matrix()
+    elif notation.startswith("matrix"):
+        matrix = numbers.reshape(-1, 3, 3)
+        matrix = np.swapaxes(matrix, 1, 2) if notation.endswith("columns") else matrix
+        usable = np.where(sound[:, None, None], matrix, np.zeros((3, 3)))
+        gap = np.abs(usable @ np.swapaxes(usable, 1, 2) - np.eye(3)).max((1, 2))
+        sound &= (gap < 2 * UNIT_TOLERANCE) & (np.linalg.det(usable) > 0)
+        made[sound] = nearest_rotation(matrix[sound])
+    elif notation == "rotvec":
+        made[sound] = Rotation.from_rotvec(numbers[sound] * radians).as_matrix()
+    else:
+        made[sound] = Rotation.from_euler(notation[6:], numbers[sound] * radians).as_matrix()
+    return made
+
+
+def numbers_of(rotation: Float[ndarray, "n 3 3"], notation: str) -> Float[ndarray, "n k"]:
+    """Return the numbers, with angles in radians, that describe n rotations in a notation; inverse of `rotations_of`."""
+    read = Rotation.from_matrix(rotation)
+    if notation.startswith("quat:"):
+        return read.as_quat()[:, ["xyzw".index(axis) for axis in notation[5:]]]
+    if notation.startswith("matrix"):
+        return (np.swapaxes(rotation, 1, 2) if notation.endswith("columns") else rotation).reshape(-1, 9)
+    if notation == "rotvec":
+        return read.as_rotvec()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # gimbal lock
+        return read.as_euler(notation[6:])
+
+
+def poses_of(
+    position: Float[ndarray, "n 3"], rotation: Float[ndarray, "n k"], notation: str, units: str = "m-rad"
+) -> Float[ndarray, "n 4 4"]:
+    """Return the transforms (m) of n positions and rotations as written; NaN for a row that is no transform.
+
+    `notation` is that of the rotation and `units` are those of both, such as "mm-deg".
+    """
+    length, angle = units.split("-")
+    made = transform(
+        rotations_of(rotation, notation, np.radians(1.0) if angle == "deg" else 1.0),
+        position * METRES[length],
+    )
+    bad = ~(np.isfinite(made).all((1, 2)) & (np.abs(made) < HUGE).all((1, 2)))
+    made[bad] = np.nan
+    return made
+
+
+def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str) -> str:
+    """Return the unit (m, mm or cm) of positions as written, by their size; `stated` is the one that was given, if any.
+
+    Raises InputError, begun with `where`, if the size contradicts the stated unit, or if the base frame is far from
+    all positions. Positions further from the origin than 10 are no metres, and positions that are all within 10 of each
+    other are no millimetres, because a calibration needs motions above 10 mm.
+    """
+    position = position[np.isfinite(position).all(1)]
+    if not len(position):
+        return stated or "m"
+    far = float(np.linalg.norm(position, axis=1).max())
+    spread = float(np.linalg.norm(position - np.median(position, axis=0), axis=1).max())
+    unit = stated or ("m" if far <= METRES_LIMIT else "mm")
+    per = METRES[unit]
+    if stated in ("mm", "cm") and 0 < far <= METRES_LIMIT:
+        raise InputError(
+            f"{where}: the gripper is at most {far:.4g} {unit} from the base, too near for {unit}; these look like "
+            "metres: give --pose-units m-rad (or m-deg), or correct the unit in the column's name"
+        )
+    if spread < METRES_LIMIT < far and per < 1 and spread > 0 and len(position) > 1:
+        raise InputError(
+            f"{where}: the positions are {far:.4g} from the origin, and all within {spread:.3g} of each other; as "
+            "metres the base frame is far away: subtract one offset from all, or give the poses in the arm's own base "
+            "frame"
+        )
+    if far * per > METRES_LIMIT:
+        if stated is None or spread * per <= METRES_LIMIT:
+            raise InputError(
+                f"{where}: the positions are up to {far * per:.4g} m from the origin; a map frame is far away: "
+                "subtract one offset from all, or give the poses in the arm's own base frame"
+            )
+        raise InputError(
+            f"{where}: the gripper is up to {far:.4g} {unit} from the base; these look like millimetres: give "
+            "--pose-units mm-rad (or mm-deg)"
+        )
+    return unit
+
+
+def angle_unit(numbers: Float[ndarray, "n k"], notation: str, stated: str | None, where: str) -> str:
+    """Return the unit (rad or deg) of a rotation's numbers, by their size; `stated` is the one that was given, if any.
+
+    Angles beyond 2π are degrees. Angles that are all within 2π are radians: as degrees they would turn the gripper by
+    less than 7°. Raises InputError, begun with `where`, if the size contradicts the stated unit.
+    """
+    if NUMBERS[notation] != 3:
+        return "rad"
+    largest = float(np.nanmax(np.abs(numbers), initial=0.0))
+    if stated == "rad" and largest > RADIANS_LIMIT:
+        raise InputError(
+            f"{where}: angles go up to {largest:.4g} rad; these look like degrees: give --pose-units m-deg (or mm-deg)"
+        )
+    if stated == "deg" and 0 < largest < np.pi:
+        raise InputError(
+            f"{where}: angles are at most {largest:.3g}°, too small for a calibration; these look like radians: give "
+            "--pose-units m-rad (or mm-rad)"
+        )
+    return stated or ("rad" if largest <= RADIANS_LIMIT else "deg")
+
+
+def poses_of_rows(
+    rows: Float[ndarray, "n k"], convention: str, units: str = "auto", where: str = "poses"
+) -> Float[ndarray, "n 4 4"]:
+    """Return the transforms (m) of rows of numbers in a known notation: a position and a rotation, or 12 or 16 numbers.
+
+    `convention` is a value of `--pose-convention`; `units` are such as "mm-deg", or "auto" for those that the sizes of
+    the numbers show. Raises InputError, begun with `where`, for a row that is no transform.
+    """
+    notation, numbers = notation_of(convention), np.asarray(rows, dtype=np.float64)
+    width = 12 if notation.startswith("matrix") else 3 + NUMBERS[notation]
+    if numbers.ndim != 2 or numbers.shape[1] not in ((12, 16) if width == 12 else (width,)):
+        raise InputError(f"{where}: rows of {numbers.shape[-1]} numbers; {convention} has {width}")
+    if width == 12:
+        matrix = numbers.reshape(len(numbers), -1, 4)
+        if notation == "matrix:columns" and numbers.shape[1] == 16:
+            matrix = np.swapaxes(matrix, 1, 2)
+        position, rotation, notation = matrix[:, :3, 3], matrix[:, :3, :3].reshape(-1, 9), "matrix"
+    else:
+        position, rotation = numbers[:, :3], numbers[:, 3:]
+    length, angle = (None, None) if units == "auto" else units.split("-")
+    length = length_unit(position, length, where)
+    angle = angle_unit(rotation, notation, angle, where)
+    poses = poses_of(position, rotation, notation, f"{length}-{angle}")
+    if (wrong := np.flatnonzero(np.isnan(poses[:, 0, 0]))).size:
+        raise InputError(
+            f"{where}: pose {wrong[0] + 1} is no rigid transform; check the numbers and their notation"
+        )
+    return poses
+
+
+def tolerated(count: int) -> int:
+    """Return the number of faulty frames among `count` that may be left out: a quarter, rounded down, at least one."""
+    return max(1, count // 4)
+
+
+def far_faults(position: Float[ndarray, "n 3"], where: str, names: list[str]) -> dict[int, str]:
+    """Return a message for each position (m, base frame) that is more than 10 m from the base, by the index of its row.
+
+    Raises InputError, begun with `where`, if more rows are that far than `tolerated` permits, or the only row is. Wrong
+    units or a far base frame are then the cause. `names` are the names of the rows in the messages. NaN counts as 0.
+    """
+    distance = np.linalg.norm(np.nan_to_num(position), axis=1)
+    rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
+    if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
+        spread = float(np.ptp(position[np.isfinite(position).all(1)], axis=0).max())
+        if len(distance) > 1 and spread < METRES_LIMIT:
+            cause = (
+                "a map frame that is far away: subtract one offset from all, or use the arm's own base frame"
+            )
+        else:
+            cause = "millimetres: divide the translations by 1000"
+        raise InputError(
+            f"{where}: the gripper is up to {distance.max():.4g} m from the base; these look like {cause}"
+        )
+    text = "m from the base, the others are nearer; record it again"
+    return {k: f"{names[k]} is {distance[k]:.4g} {text}" for k in rows}

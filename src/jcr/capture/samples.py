@@ -1,0 +1,99 @@
+"""Samples of marker-based hand-eye tools: pairs of gripper pose and marker pose, without images.
+
+The frame of a fixed marker is the recon frame: recon_from_camera is the inverse of camera_from_marker.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jcr.capture.checks import require_frames
+from jcr.capture.documents import Table, read_content, read_tables
+from jcr.capture.options import ReadOptions
+from jcr.capture.readings import Candidate, readings_of
+from jcr.errors import InputError
+from jcr.geometry import inverse
+from jcr.records import PosePairs
+
+PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
+"""Keys of the gripper pose and the marker pose in a sample of MoveIt Calibration and of easy_handeye2."""
+SUFFIXES = (".yaml", ".yml", ".json", ".samples")
+
+
+def recognises(path: Path) -> bool:
+    """Test whether a path is a file with samples of MoveIt Calibration or easy_handeye2."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES and _pairs(read_content(path)) is not None
+
+
+def read(path: Path, options: ReadOptions) -> PosePairs:
+    """Read samples of MoveIt Calibration (effector_wrt_world, object_wrt_sensor) or easy_handeye2 (robot, tracking).
+
+    The marker frame is the recon frame: recon_from_camera is the inverse of the sample's camera_from_marker (m). Raises
+    InputError for eye_on_base, where the camera does not move with the robot and `robot` is inverted.
+    """
+    content = read_content(path)
+    found = _pairs(content)
+    if found is None:
+        raise InputError(f"{path}: no samples of MoveIt Calibration or easy_handeye2; name such a file")
+    entries, keys = found
+    kind = "eye_in_hand"  # MoveIt Calibration writes a list, without parameters
+    if isinstance(content, dict):
+        parameters = content.get("parameters")
+        kind = parameters.get("calibration_type") if isinstance(parameters, dict) else None
+    if kind == "eye_on_base":
+        raise InputError(
+            f"{path}: calibration_type eye_on_base, a camera beside the robot; jcr calibrates cameras on the gripper"
+        )
+    notes = () if kind == "eye_in_hand" else ("calibration_type is not given; taken as eye_in_hand",)
+    (reading, gripper), (_, marker) = (_poses(path, key, len(entries), options) for key in keys)
+    sound = np.flatnonzero(np.isfinite(gripper).all((1, 2)) & np.isfinite(marker).all((1, 2)))
+    require_frames(len(sound), str(path))
+    left_out = [
+        f"left out: sample {row + 1} holds no pair of poses"
+        for row in range(len(entries))
+        if row not in sound
+    ]
+    return PosePairs(
+        source=path,
+        images=tuple(f"sample {row + 1}" for row in sound),
+        base_from_gripper=gripper[sound],
+        recon_from_camera=inverse(marker[sound]),
+        is_metric=True,
+        notes=(*notes, *left_out),
+        is_inverted=reading.inverted,
+    )
+
+
+def _pairs(content: Any) -> tuple[list[Any], tuple[str, str]] | None:
+    """Return the samples in the content of a file, and their keys of gripper and marker pose; None without samples."""
+    lists = [content, *(content.values() if isinstance(content, dict) else ())]
+    for entries in (one for one in lists if isinstance(one, list) and one and isinstance(one[0], dict)):
+        for keys in PAIRS:
+            if set(keys) <= entries[0].keys():
+                return entries, keys
+    return None
+
+
+def _poses(path: Path, key: str, count: int, options: ReadOptions) -> Candidate:
+    """Return the reading and the poses (m) of one key of the samples; raise InputError if it holds no poses.
+
+    A marker's pose is camera_from_marker; only the gripper's pose is inverted by `options`.
+    """
+    is_gripper = key in {gripper for gripper, _ in PAIRS}
+    own = options if is_gripper else ReadOptions(pose_units=options.pose_units)
+    for table in read_tables(path):
+        if len(table.rows) != count:
+            continue
+        places = [k for k, name in enumerate(table.columns) if (name or "").startswith(f"{key}.")]
+        columns = tuple((table.columns[k] or "").removeprefix(f"{key}.") for k in places)
+        rows = tuple(tuple(row[k] for k in places) for row in table.rows)
+        part = Table(file=path, place="", columns=columns, rows=rows, keys=None, words="")
+        readings = readings_of(part, replace(own, pose_columns=None), f"{path}: {key}")[1] if places else []
+        directed = [one for one in readings if one[0].inverted == own.pose_inverted]
+        if directed:
+            return directed[0]
+    raise InputError(
+        f"{path}: {key}: holds no poses; give position and quaternion, or 16 numbers of a matrix"
+    )

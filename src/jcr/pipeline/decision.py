@@ -1,0 +1,310 @@
+"""Decision between readings of gripper poses by the images: camera poses without the robot, and the misfit of each reading."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, islice
+from math import comb
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
+
+from jcr.calibration.checks.convention import BETTER, of_camera
+from jcr.capture.checks import require_frames, require_motion
+from jcr.capture.folder import count_differs
+from jcr.capture.notations import tolerated
+from jcr.capture.pairing import FARTHEST, other_orders
+from jcr.capture.readings import text_of, undecided
+from jcr.errors import InputError, RejectedError, first_few
+from jcr.estimation.pose_misfit import MM_PER_DEG, NO_FIT, Misfit, angle_gap, pair_angles, pose_misfit
+from jcr.geometry import Poses, rotation_angle
+from jcr.progress import Progress
+from jcr.records import Capture, Reading, Reconstruction
+from jcr.rounding import significant
+
+LEAST_MISFIT = 0.3
+"""Misfit (mm) below which two readings are not told apart: 0.1 mm and 0.04°, as structure from motion reaches at best."""
+FEWEST = 5
+"""Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
+SAME_ROW = 1e-3
+"""Largest difference (m, and of the entries of a rotation) of two poses of an arm at rest."""
+MOST_CHOICES = 3000
+"""Largest number of choices of rows that are tried where rows and images differ in number."""
+
+
+class _Fit(NamedTuple):
+    """Reading with the misfit of its poses at the registered images."""
+
+    reading: Reading
+    poses: Poses
+    """Poses of all images of the capture, (n,4,4)."""
+    misfit: Misfit
+
+    @property
+    def is_of_camera(self) -> bool:
+        """Whether gripper_from_camera is almost the identity, as for a board's poses that a camera measured."""
+        return of_camera(self.misfit.x) is not None
+
+
+def decided_by_images(
+    capture: Capture, seed: int = 0, progress: Progress | None = None
+) -> tuple[Capture, Reconstruction | None]:
+    """Return a capture whose reading is decided, and the reconstruction without poses if that decided it.
+
+    A capture without `candidates` is returned as it is. Raises InputError as `decide`, or if the images cannot be
+    reconstructed; the message then lists the readings.
+    """
+    if not capture.candidates:
+        return capture, None
+    from jcr.sfm.colmap import reconstruct_alone
+
+    readings = [reading for reading, _ in capture.candidates]
+    try:
+        made = reconstruct_alone(capture, seed, progress)
+    except RejectedError as error:
+        if len(capture.candidates[0][1]) != len(capture):
+            raise count_differs(capture) from None
+        raise InputError(
+            f"{undecided(str(capture.source), readings)}; the images do not tell: {error.what}"
+        ) from None
+    return decide(capture, made.recon_from_camera, made.image_index), made
+
+
+def decide(capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray, " m"]) -> Capture:
+    """Return the capture with the reading of its poses that fits the camera poses, decisively better than all others.
+
+    `recon_from_camera` are the camera poses of the images with the indices `image_index`, in any frame and unit. Raises
+    InputError if rows and images differ in number, if no reading fits, if several do, or if the poses fit in another
+    order; the message states what fits, which is never taken.
+    """
+    if len(capture.candidates[0][1]) != len(capture):
+        raise _rows_of_images(capture, recon_from_camera, image_index)
+    fits = _ranked(capture.candidates, recon_from_camera, image_index)
+    own = [fit for fit in fits if not fit.is_of_camera]
+    if fits[0].is_of_camera and not (own and own[0].misfit.is_of_robot):
+        raise _poses_of_camera(capture, fits[0])
+    return _taken(capture, own, recon_from_camera, image_index)
+
+
+def _taken(
+    capture: Capture, fits: Sequence[_Fit], recon_from_camera: Poses, image_index: Int[ndarray, " m"]
+) -> Capture:
+    """Return the capture with the best of its readings; raise InputError if it does not fit, or another one does, too."""
+    best, where = fits[0], str(capture.source)
+    others = [fit for fit in fits[1:] if _differ(best, fit)]
+    size = max(best.misfit.mm, LEAST_MISFIT)
+    if not best.misfit.is_of_robot or (others and others[0].misfit.mm < BETTER * size):
+        _refuse_order(capture, best, recon_from_camera, image_index)
+        if not best.misfit.is_of_robot:
+            raise InputError(
+                f"{where}: the poses fit the images in no reading; the best is {text_of(best.reading)}, which disagrees by "
+                f"{_size(best.misfit)}: check that poses and images are of one capture and in one order"
+            )
+        rivals = [best, *(fit for fit in others if fit.misfit.mm < BETTER * size)]
+        sizes = ", ".join(_size(fit.misfit) for fit in rivals[:6])
+        raise InputError(
+            f"{undecided(where, [fit.reading for fit in rivals])}; the images fit them all ({sizes}): or add images, "
+            "rotated by 20° or more about other axes"
+        )
+    if len(best.poses) < FEWEST:
+        raise InputError(
+            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {len(best.poses)} images are too few to decide, "
+            f"{FEWEST} are needed"
+        )
+    has_pose = np.isfinite(best.poses).all((1, 2))
+    rows, lost = np.flatnonzero(has_pose), [capture.images[k] for k in np.flatnonzero(~has_pose).tolist()]
+    if len(lost) > tolerated(len(capture)):
+        raise InputError(
+            f"{where}: the rows of {first_few(lost)} hold no pose as {text_of(best.reading)}; correct them"
+        )
+    require_frames(len(rows), where)
+    require_motion(best.poses[rows], where)
+    reading = replace(
+        best.reading,
+        decided_by="images",
+        misfit_mm=round(best.misfit.mm, 3),
+        next_best=text_of(others[0].reading) if others else None,
+        next_misfit_mm=round(others[0].misfit.mm, 3) if others and np.isfinite(others[0].misfit.mm) else None,
+    )
+    notes = [f"left out: {where}: the rows of {first_few(lost)} hold no pose"] if lost else []
+    chosen = replace(capture.of_rows(rows), others=capture.others, base_from_gripper=best.poses[rows])
+    return replace(chosen, reading=reading, candidates=(), notes=(*capture.notes, *notes))
+
+
+def _ranked(
+    candidates: Sequence[tuple[Reading, Poses]], recon_from_camera: Poses, image_index: Int[ndarray, " m"]
+) -> list[_Fit]:
+    """Return the readings with their misfits, best first.
+
+    Readings are fitted in the order of their screw congruence, until the rest cannot be near the best: a difference of
+    angles is a misfit by itself. The misfit of the rest is that lower bound.
+    """
+    cameras, gaps = pair_angles(recon_from_camera), list[float]()
+    for _, poses in candidates:
+        known = np.flatnonzero(np.isfinite(poses[image_index]).all((1, 2)))
+        of_known = pair_angles(poses[image_index[known]])
+        gaps.append(angle_gap(of_known, cameras[np.ix_(known, known)]) if len(known) > 2 else np.inf)
+    fits, best = list[_Fit](), np.inf
+    for k in np.argsort(gaps, kind="stable").tolist():
+        reading, poses = candidates[k]
+        least_mm = (
+            MM_PER_DEG * float(np.degrees(gaps[k])) / 2
+        )  # of two rotations that differ, each has half of the error
+        if least_mm > 2 * BETTER * max(best, LEAST_MISFIT) or not np.isfinite(gaps[k]):
+            fits.append(_Fit(reading, poses, NO_FIT))
+            continue
+        known = np.flatnonzero(np.isfinite(poses[image_index]).all((1, 2)))
+        fits.append(_Fit(reading, poses, pose_misfit(poses[image_index[known]], recon_from_camera[known])))
+        best = min(best, fits[-1].misfit.mm)
+    return sorted(fits, key=lambda fit: fit.misfit.mm)
+
+
+def _differ(one: _Fit, other: _Fit) -> bool:
+    """Test whether the poses of two readings differ by more than the misfit of the first, at any image."""
+    both = np.isfinite(one.poses).all((1, 2)) & np.isfinite(other.poses).all((1, 2))
+    a, b = one.poses[both], other.poses[both]
+    turned = np.asarray(rotation_angle(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]))
+    apart = 1e3 * np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + MM_PER_DEG * np.degrees(turned)
+    return bool(apart.max(initial=0.0) > max(one.misfit.mm, LEAST_MISFIT))
+
+
+def _poses_of_camera(capture: Capture, best: _Fit) -> InputError:
+    """Return the error that only poses of the camera itself fit, as a board's poses do when they are inverted."""
+    return InputError(
+        f"{capture.source}: as {text_of(best.reading)} the poses are those of the camera itself ({_size(best.misfit)}, camera "
+        "and gripper frame within 10 mm and 2°): probably a board's or marker's pose that the camera measured, or its "
+        "inverse, and not the robot's; give the gripper's poses in the robot's base"
+    )
+
+
+def _refuse_order(
+    capture: Capture, best: _Fit, recon_from_camera: Poses, image_index: Int[ndarray, " m"]
+) -> None:
+    """Raise InputError if the poses of a reading fit in another order, three times better than in the given one."""
+    size = max(best.misfit.mm, LEAST_MISFIT)
+    tried = list[_Fit]()
+    for how, order in other_orders(capture.images):
+        candidates = []
+        for reading, poses in capture.candidates:
+            moved = np.full_like(poses, np.nan)
+            has = order >= 0
+            moved[has] = poses[order[has]]
+            candidates.append((replace(reading, next_best=how), moved))
+        tried += _ranked(candidates, recon_from_camera, image_index)[:1]
+    tried = sorted((fit for fit in tried if not fit.is_of_camera), key=lambda fit: fit.misfit.mm)
+    if tried and tried[0].misfit.is_of_robot and tried[0].misfit.mm * BETTER < size:
+        found = tried[0]
+        raise InputError(
+            f"{capture.source}: the poses fit the images ({_size(found.misfit)}, {text_of(found.reading)}) when they are "
+            f"{found.reading.next_best}; correct the order in the file, or add a column with the images' names"
+        )
+
+
+def _rows_of_images(
+    capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray, " m"]
+) -> InputError:
+    """Return the error that rows and images differ in number, with the rows or images that the camera poses leave over."""
+    rows, images = len(capture.candidates[0][1]), len(capture)
+    more, fewer = max(rows, images), min(rows, images)
+    cameras, tried = pair_angles(recon_from_camera), list[tuple[float, int, tuple[int, ...]]]()
+    count = comb(more, more - fewer)
+    for k, (_, poses) in enumerate(capture.candidates):
+        angles = pair_angles(np.nan_to_num(poses))
+        choices = combinations(range(more), more - fewer)
+        every = islice(choices, MOST_CHOICES) if count <= MOST_CHOICES else _ends(more, more - fewer)
+        for dropped in every:
+            row, at = _places(rows, images, dropped, image_index)
+            if len(at) > 3:
+                tried.append((angle_gap(angles[np.ix_(row, row)], cameras[np.ix_(at, at)]), k, dropped))
+    fits = []
+    for _, k, dropped in sorted(tried)[:40]:
+        row, at = _places(rows, images, dropped, image_index)
+        poses = capture.candidates[k][1][row]
+        if np.isfinite(poses).all():
+            fits.append((pose_misfit(poses, recon_from_camera[at], share=1.0), capture.candidates[k][0], dropped, poses))
+    fits.sort(key=lambda one: one[0].mm)
+    plain = str(count_differs(capture))
+    if not fits or not fits[0][0].is_of_robot:
+        return InputError(f"{plain}; in no choice of them the poses fit the images")
+    misfit, reading, dropped = fits[0]
+    others = [
+        one for one in fits[1:] if one[2] != dropped and one[0].mm < BETTER * max(misfit.mm, LEAST_MISFIT)
+    ]
+    if others:
+        return InputError(f"{plain}; the images do not show which are too much")
+    if rows < images:
+        names = first_few([capture.images[k] for k in dropped])
+        return InputError(
+            f"{plain}; by the images ({_size(misfit)}), {names} have no pose: remove these images"
+        )
+    numbers = ", ".join(str(k + 1) for k in dropped)
+    lag = _lag(capture, dropped)
+    return InputError(
+        f"{plain}; by the images ({_size(misfit)}, {text_of(reading)}), row {numbers} (counted from 1) has no image{lag}: "
+        f"{_removal(capture.source, dropped)}"
+    )
+
+
+def _places(
+    rows: int, images: int, dropped: tuple[int, ...], image_index: Int[ndarray, " m"]
+) -> tuple[list[int], list[int]]:
+    """Return the rows, and the camera poses that belong to them, if the rows or images `dropped` have no partner."""
+    left = [k for k in range(max(rows, images)) if k not in dropped]
+    if rows > images:
+        return [left[image] for image in image_index.tolist()], list(range(len(image_index)))
+    at = {image: k for k, image in enumerate(image_index.tolist())}
+    pairs = [(row, at[image]) for row, image in enumerate(left) if image in at]
+    return [row for row, _ in pairs], [k for _, k in pairs]
+
+
+def _ends(count: int, dropped: int) -> Iterator[tuple[int, ...]]:
+    """Yield the choices that drop only the first and the last of `count` places."""
+    for first in range(dropped + 1):
+        yield (*range(first), *range(count - dropped + first, count))
+
+
+def _lag(capture: Capture, dropped: tuple[int, ...]) -> str:
+    """Return words that poses and images are shifted, if the images' names count from another number than 1."""
+    first = "".join(c for c in Path(capture.images[0]).stem if c.isdecimal())
+    shift = int(first) - 1 - (0 if 0 not in dropped else len(dropped)) if first else 0
+    if shift and abs(shift) <= FARTHEST:
+        return f" (image {first} has the pose of row {int(first) - shift}: the poses are {'one' if abs(shift) == 1 else abs(shift)} behind)"
+    return ""
+
+
+def _removal(source: Path | None, dropped: tuple[int, ...]) -> str:
+    """Return the remedy that removes rows from a file."""
+    if source is not None and source.suffix == ".npy":
+        return f"remove it with numpy.save({source.name!r}, numpy.delete(numpy.load({source.name!r}), {[*dropped]}, 0))"
+    return "remove it from the file"
+
+
+def _size(misfit: Misfit) -> str:
+    """Return a misfit in words, such as "0.4 mm and 0.03° per axis"."""
+    if not np.isfinite(misfit.mm):
+        return "no fit"
+    return f"{significant(1e3 * misfit.metres)} mm and {significant(float(np.degrees(misfit.radians)))}°"
+
+
+def decision_in_words(reading: Reading) -> str:
+    """Return a sentence on how the poses were read and what decided it, for the terminal and the report."""
+    by = {
+        "names": "by names",
+        "numbers": "by the numbers",
+        "option": "by option",
+        "images": "decided by the images",
+    }
+    text = f"{reading.file}: {text_of(reading)}; {by[reading.decided_by]}"
+    if reading.misfit_mm is None:
+        return text
+    following = ""
+    if reading.next_best is not None:
+        size = (
+            "none of them fits"
+            if reading.next_misfit_mm is None
+            else f"{significant(reading.next_misfit_mm)} mm"
+        )
+        following = f"; next best: {reading.next_best}, {size}"
+    return f"{text} ({significant(reading.misfit_mm)} mm{following})"
