@@ -15,8 +15,9 @@ from scipy.io import savemat
 
 from jcr.capture.documents import Table, read_content, read_record_tables, read_tables
 from jcr.errors import InputError
+from places import SHARED
 
-INPUTS = Path("/work/shared/inputs")
+INPUTS = SHARED / "inputs"
 SIX = (None,) * 6
 MATRIX = tuple(f"{i}.{j}" for i in range(4) for j in range(4))
 EYE = (1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 6.0, 0.0, 0.0, 1.0, 7.0, 0.0, 0.0, 0.0, 1.0)

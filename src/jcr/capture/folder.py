@@ -20,6 +20,8 @@ from jcr.records import Capture, Reading
 
 POSE_WORDS = re.compile(r"pos|tcp|robot|ee|arm|hand|flange|matri|end|gripper", re.IGNORECASE)
 """Parts of names of files that probably hold the poses."""
+SAME = 1e-4
+"""Largest difference (m, and of the entries of a rotation) of the same poses in two files with rounded numbers."""
 _Poses = Float[ndarray, "r 4 4"]
 
 
@@ -91,20 +93,16 @@ def _source(table: Table, paired: Pairing, options: ReadOptions) -> _Source:
 
 
 def _without_copies(sources: list[_Source]) -> list[_Source]:
-    """Return the sources without those whose readings all give the poses of an earlier source."""
+    """Return the sources without those that hold the poses of an earlier one; sources with fewer readings come first."""
     kept = list[_Source]()
-    for source in sources:
+    for source in sorted(sources, key=lambda one: len(one.candidates)):
         known = [poses for one in kept for _, poses in one.candidates]
-        new = [
-            (reading, poses)
-            for reading, poses in source.candidates
-            if not any(
-                poses.shape == other.shape and np.allclose(poses, other, atol=1e-9, equal_nan=True)
-                for other in known
-            )
-        ]
-        if new:
-            kept.append(replace(source, candidates=tuple(new)))
+        is_copy = any(
+            poses.shape == other.shape and np.allclose(poses, other, rtol=0, atol=SAME, equal_nan=True)
+            for _, poses in source.candidates
+            for other in known
+        )
+        kept += [] if is_copy else [source]
     return kept
 
 

@@ -239,9 +239,9 @@ def stamps_of_names(images: Sequence[str]) -> Int[ndarray, " n"] | None:
     found = list[int]()
     for image in images:
         name = plain_name(image)
-        number = re.search(r"(?<!\d)\d{9,19}(?:\.\d+)?(?!\d)", name)
+        number = re.search(r"(?<!\d)(?:\d{9,19}(?:\.\d+)?|\d+\.\d+)(?!\d)", name)
         sides = re.fullmatch(r"\D*(\d{10})[._](\d{9})\D*", name)  # seconds and nanoseconds
-        text = f"{sides[1]}.{sides[2]}" if sides else number[0] if number else name
+        text = f"{sides[1]}.{sides[2]}" if sides else number[0] if number else ""
         date = DATE.search(name)
         try:
             found.append(stamp_ns(date[0] if date else text))
@@ -268,6 +268,8 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
             "header",
             "ros",
         }
+        if len(set(map(str, cells))) < len(cells) / 2:
+            continue  # a turn of an axis, such as KUKA's T
         numeric = [cell for cell in cells if isinstance(cell, float)]
         rising = len(numeric) == len(cells) and bool((np.diff(numeric) >= 0).all())
         if not is_named and not (name is None and k == 0 and rising and abs(numeric[0]) > 1e4):

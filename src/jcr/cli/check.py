@@ -68,7 +68,7 @@ class CheckCommand:
                 progress,
                 self.thorough,
             )
-            self.output.result(_check_lines(self, capture, found), _check_facts(capture, found))
+            self.output.result(_check_lines(self, found), _check_facts(found))
         return 3 if found.verdict == "rejected" else 0
 
 
@@ -83,19 +83,30 @@ def read_arguments(read: ReadOptions) -> list[str]:
     return given
 
 
-def _check_lines(command: CheckCommand, capture: Capture | PosePairs, found: "Examination") -> list[str]:
+def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
     from jcr.pipeline.check import QUICK
+    from jcr.pipeline.decision import decision_in_words
 
+    capture = found.capture
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"
     if not isinstance(capture, PosePairs):
         size = "x".join(map(str, capture.image_size))
         intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
         about = f"{len(capture)} images of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
+    undecided = isinstance(capture, Capture) and bool(capture.candidates)
     outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
-    lines = [f"{verdict_in_words(found.findings)}: {outcome}. {about}"]
+    verdict = verdict_in_words(found.findings)
+    if undecided and not is_rejected:
+        verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"
+    lines = [f"{verdict}: {outcome}. {about}"]
+    if undecided:
+        readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
+        lines += labelled("Poses", f"{readings} (jcr check without --poses-only, or jcr run)")
+    elif isinstance(capture, Capture) and capture.reading is not None:
+        lines += labelled("Poses", decision_in_words(capture.reading))
     if not is_rejected:
         rotation = np.degrees(found.largest_rotation_rad)
         motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
@@ -129,15 +140,19 @@ def _check_lines(command: CheckCommand, capture: Capture | PosePairs, found: "Ex
     return [*lines, *labelled("Next", closing)]
 
 
-def _check_facts(capture: Capture | PosePairs, found: "Examination") -> dict[str, Any]:
+def _check_facts(found: "Examination") -> dict[str, Any]:
     """Return what `jcr check --json` prints: verdict, images, motion, expected accuracy, findings and notes."""
     from jcr.calibration.record import as_json, mm_and_deg
 
+    capture = found.capture
+    reading = None if isinstance(capture, PosePairs) else capture.reading
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     seen = None if found.expected is None else found.expected.seen
     observed = ("observable", "unobservable", "advice")
     return {
         "verdict": found.verdict,
+        "reading": reading and asdict(reading),
+        "undecided": [] if isinstance(capture, PosePairs) else [asdict(one) for one, _ in capture.candidates],
         "images": capture.images,
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),

@@ -229,11 +229,15 @@ def _run(
 def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
     """Print the summary of a calibration and the capture's notes; nothing with --json, for which `show` prints all."""
     from jcr.calibration.words import MOST_LINES, summary
+    from jcr.pipeline.decision import decision_in_words
 
     if not output.json:
         others = 0 if result.cameras is None else len(result.cameras.cameras)
         most = MOST_LINES - others - 1  # one line is left to the caller
         lines = summary(result.calibration, most).splitlines()
+        read = result.capture
+        if isinstance(read, Capture) and read.reading is not None:
+            lines += labelled("Poses", decision_in_words(read.reading))
         notes = [line for note in capture.notes for line in labelled("Note", note)]
         lines += notes[: max(most - 2 - len(lines), 0)]
         sys.stdout.write("\n".join(lines) + "\n")

@@ -40,6 +40,7 @@ from jcr.findings import (
     verdict_of,
 )
 from jcr.geometry import largest_motion
+from jcr.pipeline.decision import decided_by_images, first_reading
 from jcr.progress import Progress
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.sfm.colmap import reconstruct_colmap
@@ -52,6 +53,8 @@ QUICK, QUICK_SIZE_PX = 8, 800
 class Examination:
     """Result of the check of a capture: motion, expected uncertainty, findings, and notes."""
 
+    capture: Capture | PosePairs
+    """Capture with the reading of its poses; it still has `candidates` if the images were not asked."""
     largest_move_m: float
     """Largest distance between the gripper's origins in two poses."""
     largest_rotation_rad: float
@@ -104,6 +107,8 @@ def check_capture(
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture, progress=progress)
+    if isinstance(capture, Capture) and capture.candidates:
+        capture = decided_by_images(capture, progress=progress)[0] if look else first_reading(capture)
     given = capture.base_from_gripper
     (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes]
     if move_m < 5e-3 and rotation_rad > np.radians(5):
@@ -135,6 +140,7 @@ def check_capture(
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
     return Examination(
+        capture=capture,
         largest_move_m=move_m,
         largest_rotation_rad=rotation_rad,
         observability=seen,

@@ -72,6 +72,19 @@ def decided_by_images(
     return decide(capture, made.recon_from_camera, made.image_index), made
 
 
+def first_reading(capture: Capture) -> Capture:
+    """Return an undecided capture with the poses of its first reading, for measures of its motion; it stays undecided.
+
+    Raises InputError if poses and images differ in number.
+    """
+    poses = capture.candidates[0][1]
+    if len(poses) != len(capture):
+        raise count_differs(capture)
+    rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+    require_motion(poses[rows], str(capture.source))
+    return replace(capture.of_rows(rows), base_from_gripper=poses[rows])
+
+
 def decide(capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray, " m"]) -> Capture:
     """Return the capture with the reading of its poses that fits the camera poses, decisively better than all others.
 
@@ -223,16 +236,22 @@ def _rows_of_images(
         row, at = _places(rows, images, dropped, image_index)
         poses = capture.candidates[k][1][row]
         if np.isfinite(poses).all():
-            fits.append((pose_misfit(poses, recon_from_camera[at], share=1.0), capture.candidates[k][0], dropped, poses))
+            fits.append(
+                (
+                    pose_misfit(poses, recon_from_camera[at], share=1.0),
+                    capture.candidates[k][0],
+                    dropped,
+                    poses,
+                )
+            )
     fits.sort(key=lambda one: one[0].mm)
     plain = str(count_differs(capture))
     if not fits or not fits[0][0].is_of_robot:
         return InputError(f"{plain}; in no choice of them the poses fit the images")
-    misfit, reading, dropped = fits[0]
-    others = [
-        one for one in fits[1:] if one[2] != dropped and one[0].mm < BETTER * max(misfit.mm, LEAST_MISFIT)
-    ]
-    if others:
+    misfit, reading, dropped, chosen = fits[0]
+    near = [one for one in fits[1:] if one[0].mm < BETTER * max(misfit.mm, LEAST_MISFIT)]
+    # Rows of an arm that did not move are equal, and it does not matter which of them is removed.
+    if any(len(one[3]) != len(chosen) or np.abs(one[3] - chosen).max() > SAME_ROW for one in near):
         return InputError(f"{plain}; the images do not show which are too much")
     if rows < images:
         names = first_few([capture.images[k] for k in dropped])

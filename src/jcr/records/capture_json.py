@@ -15,6 +15,7 @@ from pydantic import (
     Field,
     PlainSerializer,
     StringConstraints,
+    TypeAdapter,
     model_validator,
 )
 
@@ -200,6 +201,14 @@ def _one_own(cameras: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
 CameraEntries = Annotated[dict[Name, CameraEntry], AfterValidator(_one_own)]
 
 
+def _read_reading(value: Any) -> Reading:
+    """Return a reading from a JSON object; a Reading is returned unchanged."""
+    return _READING.validate_python(value)
+
+
+_READING = TypeAdapter(Reading)
+
+
 class CaptureFile(Entry, extra="allow"):
     """Content of a capture.json; unknown keys are kept."""
 
@@ -210,7 +219,7 @@ class CaptureFile(Entry, extra="allow"):
     robot: Any = None
     urdf: str | None = None
     cameras: CameraEntries | None = None
-    reading: Reading | None = None
+    reading: Annotated[Reading, BeforeValidator(_read_reading)] | None = None
     """How the poses were read from a file; absent where they were written as base_from_gripper."""
 
     def as_text(self) -> str:

@@ -3,18 +3,19 @@
 import io
 import math
 import struct
+import warnings
 import zipfile
 import zlib
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.io import loadmat
-from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
 
 from jcr.capture.documents.nested import nested_tables
+from jcr.capture.documents.plain import MAX_DEPTH
 from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
 from jcr.errors import InputError, shown
 
@@ -30,6 +31,22 @@ _REFUSED = {
     **{b"\x80" + bytes([protocol]): _PICKLE for protocol in range(2, 6)},
 }
 """First bytes of the files that are refused by name, and their remedy."""
+_COMPRESSED, _MATRIX = 15, 14
+_KINDS = {
+    1: "i1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+    17: "u2",
+    18: "u4",
+}
+"""Kinds of elements of a .mat file, and types of their numbers; others are bytes (MathWorks, MAT-File Format)."""
+_OBJECT = object()
 _NPY, _ZIP, _MATLAB = b"\x93NUMPY", b"PK\x03\x04", b"MATLAB 5.0"
 
 
@@ -46,10 +63,10 @@ def array_tables(file: Path, data: bytes) -> list[Table] | None:
         raise InputError(f"{file}: {_PICKLE}")
     try:
         if data.startswith(_NPY):
-            arrays = {"": _read_npy(file, data)}
+            arrays: dict[str, Any] = {"": _read_npy(file, data)}
         elif data.startswith(_ZIP):
             arrays = _read_npz(file, data)
-        elif data.startswith(_MATLAB) or file.suffix.lower() == ".mat":
+        elif data.startswith(_MATLAB):
             arrays = _read_mat(file, data)
         else:
             return None
@@ -67,7 +84,9 @@ def _read_npy(file: Path, data: bytes) -> ndarray:
     read_header = (
         np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     )
-    shape, by_columns, dtype = read_header(stream)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a header that Python 2 wrote
+        shape, by_columns, dtype = read_header(stream)
     if dtype.hasobject:
         raise InputError(f"{file}: {_PICKLE}")
     if math.prod(shape) > MAX_ITEMS or math.prod(shape) * dtype.itemsize > len(data):
@@ -94,55 +113,89 @@ def _read_npz(file: Path, data: bytes) -> dict[str, Any]:
 
 
 def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
-    """Return the variables in the bytes of a .mat file by name, fields of a struct as "struct.field"."""
-    if data.startswith(_MATLAB):
-        _limit_compressed(file, data)
-    variables = {
-        name: value for name, value in loadmat(io.BytesIO(data)).items() if not name.startswith("__")
-    }
-    found, objects = dict[str, Any](), False
-    queue = list(variables.items())
-    while queue:
-        name, value = queue.pop(0)
-        if isinstance(value, MatlabObject | MatlabFunction | MatlabOpaque):
-            objects = True
-        elif isinstance(value, ndarray) and value.dtype.names and value.size == 1:
-            queue += [(f"{name}.{field}", value[field].flat[0]) for field in value.dtype.names]
-        else:
-            found[name] = _plain(value) if value.dtype.hasobject else value
+    """Return the variables in the bytes of a .mat file of version 5 by name, fields of a struct as "struct.field".
+
+    The format is read here, because scipy.io.loadmat ends the process on damaged files.
+    """
+    if len(data) <= 128:
+        raise ValueError("the file is cut off")
+    order, found, left, objects = "<" if data[126:128] == b"IM" else ">", dict[str, Any](), MAX_BYTES, False
+    for kind, content in _elements(data[128:], order):
+        if kind == _COMPRESSED:
+            unpacked = zlib.decompressobj().decompress(content, left + 1)
+            left -= len(unpacked)
+            if left < 0:
+                raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
+            kind, content = next(_elements(unpacked, order))
+        name, value = _variable(content, order, 0) if kind == _MATRIX else ("", None)
+        objects = objects or value is _OBJECT
+        queue = [(name, value)] if name and value is not _OBJECT else []
+        while queue:
+            name, value = queue.pop()
+            if isinstance(value, dict):
+                queue += [(f"{name}.{field}", part) for field, part in value.items()]
+            else:
+                found[name] = value if isinstance(value, ndarray) else _plain(value)
     if objects and not found:
         raise InputError(f"{file}: {_MATLAB_OBJECT}")
     return found
 
 
-def _limit_compressed(file: Path, data: bytes) -> None:
-    """Raise InputError if the variables of a .mat file of version 5 have more than 20 MB once decompressed."""
-    order, at, total = "<" if data[126:128] == b"IM" else ">", 128, 0
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of the elements of a .mat file, or of those inside an element."""
+    at = 0
     while at + 8 <= len(data):
-        kind, size = struct.unpack(f"{order}II", data[at : at + 8])
-        if kind == 15:
-            total += len(zlib.decompressobj().decompress(data[at + 8 : at + 8 + size], MAX_BYTES - total + 1))
-        if total > MAX_BYTES:
-            raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
-        at += 8 + size
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        if kind >> 16:  # up to four bytes in the place of the size
+            yield kind & 0xFFFF, data[at + 4 : at + 4 + (kind >> 16)]
+            at += 8
+            continue
+        if at + 8 + size > len(data):
+            raise ValueError("the file is cut off")
+        yield kind, data[at + 8 : at + 8 + size]
+        at += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+
+
+def _variable(content: bytes, order: str, depth: int) -> tuple[str, Any]:
+    """Return name and value of a variable: array, list (cell array), dictionary (struct), text, or an object's mark."""
+    parts = list(_elements(content, order))
+    if not parts or depth > MAX_DEPTH:
+        return "", None
+    numbers = [np.frombuffer(part, order + _KINDS.get(kind, "u1")) for kind, part in parts]
+    kind = content[8] if order == "<" else content[11]
+    if kind in (3, 16, 17):
+        return "object", _OBJECT
+    shape, name = [int(side) for side in numbers[1]], parts[2][1].decode("latin-1")
+    inner = [_variable(part, order, depth + 1)[1] for at, part in parts[3:] if at == _MATRIX]
+    if kind == 1:
+        return name, inner
+    if kind == 2:
+        width = int(numbers[3][0])
+        fields = [
+            parts[4][1][k : k + width].split(b"\0")[0].decode("latin-1")
+            for k in range(0, len(parts[4][1]), width)
+        ]
+        structs = [
+            dict(zip(fields, inner[k : k + len(fields)], strict=True))
+            for k in range(0, len(inner), len(fields))
+        ]
+        return name, structs[0] if len(structs) == 1 else structs
+    array = numbers[3].reshape(shape, order="F")
+    return name, [
+        "".join(map(chr, row)).strip() for row in array.reshape(len(array), -1)
+    ] if kind == 4 else array
 
 
 def _plain(value: Any) -> Any:
-    """Return a cell array or struct array of MATLAB, or what it holds, as nested lists and dictionaries."""
-    if not isinstance(value, ndarray):
-        return value
-    if value.dtype.names:
-        return [{name: _plain(one[name]) for name in value.dtype.names} for one in value.flat]
-    if value.dtype.hasobject:
-        return [_plain(one) for one in value.flat]
-    if value.dtype.kind == "U":
-        return str(value.flat[0]) if value.size == 1 else value.tolist()
-    return _squeezed(value).astype(float).tolist()
-
-
-def _squeezed(array: ndarray) -> ndarray:
-    """Return an array without sides of length 1."""
-    return array.reshape([side for side in array.shape if side != 1])
+    """Return what a cell array or a struct array of MATLAB holds as nested lists and dictionaries."""
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list):
+        texts = len(value) == 1 and isinstance(value[0], str)
+        return value[0] if texts else [_plain(part) for part in value]
+    if isinstance(value, ndarray):
+        return value.reshape([side for side in value.shape if side != 1]).astype(float).tolist()
+    return None if value is _OBJECT else value
 
 
 def _tables_of(file: Path, arrays: dict[str, Any]) -> list[Table]:

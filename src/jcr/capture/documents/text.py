@@ -149,7 +149,9 @@ def _cells(line: str, separator: str | None, decimal: bool) -> list[Cell]:
         if isinstance(cell, str) and (" " in cell or "," in cell):
             marks = r",?\s+" if decimal else r"[,\s]+"
             parts = [cell_of(part.replace(",", ".")) for part in re.split(marks, cell) if part]
-            if _NAME.fullmatch(str((parts or [""])[0])) or (parts and all(isinstance(one, float) for one in parts)):
+            if _NAME.fullmatch(str((parts or [""])[0])) or (
+                parts and all(isinstance(one, float) for one in parts)
+            ):
                 cells += parts
                 continue
         cells.append(cell.rstrip(":") if isinstance(cell, str) else cell)

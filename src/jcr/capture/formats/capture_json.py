@@ -1,7 +1,7 @@
 """Capture folder: `capture.json` and the images that it names."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -256,7 +256,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
         write_new(folder / URDF, urdf.read_bytes())  # so that the folder contains the whole capture
     optional = {
-        "reading": None if capture.reading is None else asdict(capture.reading),
+        "reading": capture.reading,
         "robot": capture.robot,
         "urdf": None if urdf is None else URDF,
         "cameras": camera_entries(capture) or None,
