@@ -147,7 +147,8 @@ def _outcome(
     """Write poses of a recording in a layout, and read it as a user would: without option, then with those named."""
     shutil.rmtree(folder, ignore_errors=True)
     write_layout(folder, layout, recording, poses, rows)
-    by_images, by_option = False, tuple[Kind, ...]()
+    by_images = False
+    by_option: tuple[Kind, ...] = ()
     try:
         capture = read_source(folder)
         assert isinstance(capture, Capture)
