@@ -1,6 +1,7 @@
 """Layouts in which people store images and gripper poses: a table of templates and writers of arrays."""
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -80,7 +81,9 @@ def numbers_of(poses: Poses, rotation: str, angle: str) -> Float[ndarray, "n k"]
     elif rotation == "rotvec":
         numbers = per_rad * turned.as_rotvec()
     else:
-        numbers = per_rad * turned.as_euler(rotation)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # gimbal lock: the third angle is 0
+            numbers = per_rad * turned.as_euler(rotation)
     return np.hstack([poses[:, :3, 3], numbers])
 
 
