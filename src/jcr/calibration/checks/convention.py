@@ -153,7 +153,7 @@ def _alternatives(
 
 
 def _mistakes() -> Iterator[tuple[str, str, bool]]:
-    """Yield the notation in which numbers were taken, that in which they were meant, and whether degrees were radians."""
+    """Yield the notation that was taken, the one that was meant, and whether degrees were taken for radians."""
     yield from (("matrix", "matrix:columns", False), ("rotvec", "rotvec", True))
     for one in NUMBERS:
         for other in NUMBERS:
