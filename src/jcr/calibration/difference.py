@@ -76,7 +76,8 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     """Return the step from `calibration` to `other`, and a χ² test whether their covariances explain the step.
 
     Each argument is a result, a Calibration, a path (run folder, calibration.json, a JSON file with
-    gripper_from_camera, or a file that `read_transform` reads), or a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
+    gripper_from_camera, or a file that `read_transform` reads), or a 4×4 gripper_from_camera. Raises
+    InputError if one of them has none.
 
     The step Δ is translation (m), then rotation vector (rad), along gripper axes. Its χ² is ΔᵀV⁻¹Δ, where V is the sum
     of the covariances Pₖ of both by all causes of error k. The share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any

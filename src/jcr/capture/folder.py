@@ -182,8 +182,8 @@ def _no_poses(folder: Path, found: Discovery, errors: list[InputError]) -> Input
     images = found.images
     return InputError(
         f"{folder}: no gripper poses for its {len(images)} images ({images[0]} … {images[-1]})"
-        f"{f' in {listed}' if listed else ''}; add a file with a row for each image (image,x,y,z,qx,qy,qz,qw in m, or as "
-        "the robot writes it), or name one with --poses"
+        f"{f' in {listed}' if listed else ''}; add a file with a row for each image (image,x,y,z,qx,qy,qz,qw in m, or "
+        "as the robot writes it), or name one with --poses"
     )
 
 
@@ -191,8 +191,8 @@ def count_differs(capture: Capture) -> InputError:
     """Return the error that a file has another number of poses than there are images; it is not raised."""
     rows = len(capture.candidates[0][1])
     return InputError(
-        f"{capture.source}: {rows} poses for {len(capture)} images ({capture.images[0]} … {capture.images[-1]}), and nothing "
-        f"says which belongs to which; add a column with the images' names, or remove what is too much"
+        f"{capture.source}: {rows} poses for {len(capture)} images ({capture.images[0]} … {capture.images[-1]}), and "
+        f"nothing says which belongs to which; add a column with the images' names, or remove what is too much"
     )
 
 

@@ -31,6 +31,10 @@ MODELS: dict[str, DistortionModel] = {
     "opencv_fisheye": "fisheye", "kannala_brandt4": "fisheye",
 }  # fmt: skip
 """Distortion models by their names in ROS, Kalibr, librealsense and COLMAP."""
+DISTORTION_KEYS = (
+    "distortion_coefficients", "dist_coeffs", "distortion_coeffs", "distcoeffs", "coeffs", "distortion", "dist", "d",
+)  # fmt: skip
+"""Keys of distortion coefficients, the usual ones first."""
 SKEW = 1e-4
 """Largest skew, as a share of the focal length, that counts as none: a tenth of a pixel at the edge of an image."""
 _COLMAP: dict[str, tuple[str, ...]] = {
@@ -184,8 +188,7 @@ def _first(keys: dict[str, Any], *names: str) -> Any:
 
 def _numbers(keys: dict[str, Any]) -> dict[str, Any] | None:
     """Return focal lengths, principal point, skew and distortion from one map; None if it has no intrinsics."""
-    distortion = _flat(_first(keys, "distortion_coefficients", "dist_coeffs", "distortion_coeffs", "distcoeffs", "coeffs",
-                              "distortion", "dist", "d"))  # fmt: skip
+    distortion = _flat(_first(keys, *DISTORTION_KEYS))
     model = _first(keys, "distortion_model", "model")
     made: dict[str, Any] = {"distortion": distortion, "model": model if isinstance(model, str) else ""}
     matrix = _flat(

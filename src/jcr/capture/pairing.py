@@ -71,7 +71,7 @@ class Pairing:
     how: str
     """Words for the user: by what the rows and images were paired."""
     row: Int[ndarray, " n"] | None = None
-    """Row of each image, -1 for an image without one; None if rows and images differ in number and nothing pairs them."""
+    """Row of each image, -1 without one; None if rows and images differ in number and nothing pairs them."""
     skipped: frozenset[int] = frozenset()
     """Columns that hold names of images, numbers of rows or time stamps."""
     is_by_name: bool = False
@@ -331,7 +331,8 @@ def poses_at_images(
         if shift is None:
             raise InputError(
                 f"{where}: no image lies within the times of the poses; the first image is {gap_s:+.1f} s from the "
-                "first pose: the two clocks differ; correct the time stamps of one, or add a column with the images' names"
+                "first pose: the two clocks differ; correct the time stamps of one, or add a column with the images' "
+                "names"
             )
         stamps, note = (
             stamps + shift,

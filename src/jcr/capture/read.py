@@ -98,7 +98,7 @@ def read_source(
 
 
 def format_of(path: Path) -> str:
-    """Return the name of the capture format at a path, such as "table"; raise InputError for a folder of several bags."""
+    """Return the name of the capture format at a path, such as "table"; raise InputError for a folder of bags."""
     for name in ("capture", "bag", "lerobot", "samples"):
         if FORMATS[name].recognises(path):
             return name

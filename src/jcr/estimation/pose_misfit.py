@@ -1,4 +1,4 @@
-"""Misfit of gripper poses to camera poses, robust and without a likelihood, for the comparison of many readings of poses."""
+"""Robust misfit of gripper poses to camera poses in closed form, for the comparison of many readings of the poses."""
 
 from typing import NamedTuple
 
@@ -72,7 +72,7 @@ def pair_angles(a_from_b: Poses) -> Float[ndarray, "n n"]:
 def angle_gap(gripper_angles: Float[ndarray, "n n"], camera_angles: Float[ndarray, "n n"]) -> float:
     """Return the typical difference (rad) of the angles by which gripper and camera turn between the same two images.
 
-    It is the 60 % quantile over all pairs, which 20 % wrong images leave almost unchanged. Screw congruence: whatever the
+    It is the 60 % quantile over all pairs, which 20 % wrong images leave almost unchanged. Whatever the
     hand-eye transform and the scale are, both angles are equal.
     """
     upper = np.triu_indices(len(gripper_angles), 1)

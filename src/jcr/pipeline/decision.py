@@ -1,4 +1,4 @@
-"""Decision between readings of gripper poses by the images: camera poses without the robot, and the misfit of each reading."""
+"""Decision between readings of gripper poses by the images: camera poses without the robot, and each reading's misfit."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ from jcr.records import Capture, Reading, Reconstruction
 from jcr.rounding import significant
 
 LEAST_MISFIT = 0.3
-"""Misfit (mm) below which two readings are not told apart: 0.1 mm and 0.04°, as structure from motion reaches at best."""
+"""Misfit (mm) below which two readings are not told apart: 0.1 mm and 0.04°, the best of structure from motion."""
 FEWEST = 5
 """Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
 SAME_ROW = 1e-3
@@ -104,7 +104,7 @@ def decide(capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray,
 def _taken(
     capture: Capture, fits: Sequence[_Fit], recon_from_camera: Poses, image_index: Int[ndarray, " m"]
 ) -> Capture:
-    """Return the capture with the best of its readings; raise InputError if it does not fit, or another one does, too."""
+    """Return the capture with the best of its readings; raise InputError if it does not fit, or another one does."""
     best, where = fits[0], str(capture.source)
     others = [fit for fit in fits[1:] if _differ(best, fit)]
     size = max(best.misfit.mm, LEAST_MISFIT)
@@ -112,8 +112,8 @@ def _taken(
         _refuse_order(capture, best, recon_from_camera, image_index)
         if not best.misfit.is_of_robot:
             raise InputError(
-                f"{where}: the poses fit the images in no reading; the best is {text_of(best.reading)}, which disagrees by "
-                f"{_size(best.misfit)}: check that poses and images are of one capture and in one order"
+                f"{where}: the poses fit the images in no reading; the best is {text_of(best.reading)}, which disagrees "
+                f"by {_size(best.misfit)}: check that poses and images are of one capture and in one order"
             )
         rivals = [best, *(fit for fit in others if fit.misfit.mm < BETTER * size)]
         sizes = ", ".join(_size(fit.misfit) for fit in rivals[:6])
@@ -186,8 +186,8 @@ def _differ(one: _Fit, other: _Fit) -> bool:
 def _poses_of_camera(capture: Capture, best: _Fit) -> InputError:
     """Return the error that only poses of the camera itself fit, as a board's poses do when they are inverted."""
     return InputError(
-        f"{capture.source}: as {text_of(best.reading)} the poses are those of the camera itself ({_size(best.misfit)}, camera "
-        "and gripper frame within 10 mm and 2°): probably a board's or marker's pose that the camera measured, or its "
+        f"{capture.source}: as {text_of(best.reading)} the poses are those of the camera itself ({_size(best.misfit)}, "
+        "camera and gripper frame within 10 mm and 2°): probably a board's or marker's pose that the camera measured, or its "
         "inverse, and not the robot's; give the gripper's poses in the robot's base"
     )
 
@@ -210,15 +210,15 @@ def _refuse_order(
     if tried and tried[0].misfit.is_of_robot and tried[0].misfit.mm * BETTER < size:
         found = tried[0]
         raise InputError(
-            f"{capture.source}: the poses fit the images ({_size(found.misfit)}, {text_of(found.reading)}) when they are "
-            f"{found.reading.next_best}; correct the order in the file, or add a column with the images' names"
+            f"{capture.source}: the poses fit the images ({_size(found.misfit)}, {text_of(found.reading)}) when they "
+            f"are {found.reading.next_best}; correct the order in the file, or add a column with the images' names"
         )
 
 
 def _rows_of_images(
     capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray, " m"]
 ) -> InputError:
-    """Return the error that rows and images differ in number, with the rows or images that the camera poses leave over."""
+    """Return the error that rows and images differ in number, with those that the camera poses leave over."""
     rows, images = len(capture.candidates[0][1]), len(capture)
     more, fewer = max(rows, images), min(rows, images)
     cameras, tried = pair_angles(recon_from_camera), list[tuple[float, int, tuple[int, ...]]]()
@@ -261,8 +261,8 @@ def _rows_of_images(
     numbers = ", ".join(str(k + 1) for k in dropped)
     lag = _lag(capture, dropped)
     return InputError(
-        f"{plain}; by the images ({_size(misfit)}, {text_of(reading)}), row {numbers} (counted from 1) has no image{lag}: "
-        f"{_removal(capture.source, dropped)}"
+        f"{plain}; by the images ({_size(misfit)}, {text_of(reading)}), row {numbers} (counted from 1) has no "
+        f"image{lag}: {_removal(capture.source, dropped)}"
     )
 
 
@@ -289,7 +289,8 @@ def _lag(capture: Capture, dropped: tuple[int, ...]) -> str:
     first = "".join(c for c in Path(capture.images[0]).stem if c.isdecimal())
     shift = int(first) - 1 - (0 if 0 not in dropped else len(dropped)) if first else 0
     if shift and abs(shift) <= FARTHEST:
-        return f" (image {first} has the pose of row {int(first) - shift}: the poses are {'one' if abs(shift) == 1 else abs(shift)} behind)"
+        by = "one" if abs(shift) == 1 else abs(shift)
+        return f" (image {first} has the pose of row {int(first) - shift}: the poses are {by} behind)"
     return ""
 
 

@@ -135,7 +135,8 @@ def select_reconstruction(
 
     The next back end is tried while the best trial failed, or is rejected for a reason that may depend on the back end;
     a note names the selected one and the reason. If there is only one back end to try, `keep` receives its
-    reconstruction before the calibration. If the reconstruction `before` is given, only it is calibrated, or it first if `goes_on`.
+    reconstruction before the calibration. If the reconstruction `before` is given, only it is
+    calibrated, or it first if `goes_on`.
     Raises InputError if a back end does, or if gripper poses and joint angles contradict each other; NothingFoundError
     if no back end gives a calibration.
     """

@@ -15,7 +15,7 @@ MAX_JSON = 32_000_000
 
 
 def read_json(file: Path) -> Any:
-    """Read a JSON file; raise InputError if it is missing, no UTF-8 JSON, too large, or has a key twice in one object."""
+    """Read a JSON file; raise InputError if it is missing, too large, no UTF-8 JSON, or has a key twice in an object."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         content = dict(pairs)

@@ -21,6 +21,7 @@ _SYNTAXES = {
     ".jsonl": "JSON",
     ".yaml": "YAML",
     ".yml": "YAML",
+    ".calib": "YAML",
     ".samples": "YAML",
     ".xml": "XML",
 }
