@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from jcr.camera import fold_distance_px
 from jcr.capture.documents import read_content, read_tables
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.options import ReadOptions
@@ -127,13 +126,6 @@ def intrinsics_of_entry(entry: dict[str, Any], size: tuple[int, int], where: str
     content = numbers | sides | {"model": known, "distortion": distortion}
     made = validated_content(IntrinsicsEntry, content, where).record(size, f"{where}: intrinsics")
     return made
-
-
-def fold_warning(intrinsics: Intrinsics | None) -> str | None:
-    """Return a sentence that the distortion folds over within the image; None if it does not."""
-    if intrinsics is None or (radius_px := fold_distance_px(intrinsics)) is None:
-        return None
-    return f"the given distortion is not monotonic: it folds over {radius_px:.0f} px from the principal point"
 
 
 def _entries(file: Path) -> Iterator[dict[str, Any]]:

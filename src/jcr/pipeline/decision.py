@@ -1,4 +1,4 @@
-"""Decision between readings of gripper poses by the images: camera poses without the robot, and each reading's misfit."""
+"""Decision between readings of gripper poses by the images: camera poses without the robot, misfit of each reading."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -69,7 +69,8 @@ def decided_by_images(
         raise InputError(
             f"{undecided(str(capture.source), readings)}; the images do not tell: {error.what}"
         ) from None
-    return decide(capture, made.recon_from_camera, made.image_index), made
+    decided = decide(capture, made.recon_from_camera, made.image_index)
+    return decided, made if len(decided) == len(capture) else None  # its rows are those of all images
 
 
 def first_reading(capture: Capture) -> Capture:
@@ -187,8 +188,8 @@ def _poses_of_camera(capture: Capture, best: _Fit) -> InputError:
     """Return the error that only poses of the camera itself fit, as a board's poses do when they are inverted."""
     return InputError(
         f"{capture.source}: as {text_of(best.reading)} the poses are those of the camera itself ({_size(best.misfit)}, "
-        "camera and gripper frame within 10 mm and 2°): probably a board's or marker's pose that the camera measured, or its "
-        "inverse, and not the robot's; give the gripper's poses in the robot's base"
+        "camera and gripper frame within 10 mm and 2°): probably a board's pose that the camera measured, or its inverse"
+        ", and not the robot's; give the gripper's poses in the robot's base"
     )
 
 

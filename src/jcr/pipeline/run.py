@@ -25,7 +25,7 @@ from jcr.extras import is_installed
 from jcr.files import locked, write_text
 from jcr.options import checked_options
 from jcr.pipeline.decision import decided_by_images
-from jcr.pipeline.selection import NothingFoundError
+from jcr.pipeline.selection import NEARLY_ALL, NothingFoundError
 from jcr.pipeline.stages import (
     FIRST,
     REST,
@@ -217,7 +217,7 @@ def measure(out: str | Path) -> "Measurement":
 def _decided(
     capture: Capture, out: Path, seed: int, report: Progress
 ) -> tuple[Capture, Reconstruction | None]:
-    """Return the capture with a decided reading, and the reconstruction that decided it if it has all images.
+    """Return the capture with a decided reading, and the reconstruction that decided it if it has nearly all images.
 
     The decision that the run folder keeps is taken again while the file and its possible readings are the same.
     """
@@ -226,8 +226,8 @@ def _decided(
     if (known := _decided_before(capture, out / CAPTURE)) is not None:
         return known, None
     capture, made = decided_by_images(capture, seed, report)
-    is_whole = made is not None and len(made.image_index) == len(capture)
-    return capture, made if is_whole else None
+    is_enough = made is not None and len(made.image_index) >= NEARLY_ALL * len(capture)
+    return capture, made if is_enough else None
 
 
 def _decided_before(capture: Capture, folder: Path) -> Capture | None:
