@@ -16,7 +16,7 @@ from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, other_orders
 from jcr.capture.readings import options_of, text_of
 from jcr.estimation.pose_misfit import Misfit, angle_gap, pair_angles, pose_misfit
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import Poses, inverse, rotation_angle, transform
+from jcr.geometry import Poses, Transform, inverse, rotation_angle, transform
 from jcr.records import Reading
 
 FITTED = 60
@@ -30,6 +30,9 @@ BETTER = 3.0
 """Ratio of the misfits of two readings of the same poses above which the images decide between them."""
 BOARD = (0.01, np.radians(2.0))
 """Largest gripper_from_camera (m, rad) that counts as none; no camera of a real arm is nearer to the gripper's frame."""
+INVERTED_BOARD = 0.03
+"""As the first number of BOARD, for inverse poses. A board's pose in the camera is one; its errors of some millimetres,
+and a scale that is observed badly, move the camera by 7 to 23 mm in a real capture."""
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
 INVERSES = "their inverses (gripper_from_base was given)"
 AT_SOURCE = "correct them at their source"
@@ -43,8 +46,10 @@ def check_convention(case: Case) -> Case:
     Another reading is looked for if the calibration is rejected and no wrong size of a board explains that.
     """
     capture, camera, rows = case.capture, case.recon_from_camera, case.reconstruction.image_index
-    if capture.reading is not None and (found := of_camera(case.hand_eye.gripper_from_camera)):
-        return case.after((found,))
+    if capture.reading is not None:
+        found = of_camera(case.hand_eye.gripper_from_camera, capture.reading.inverted)
+        if found is not None:
+            return case.after((found,))
     by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
     if case.hand_eye.converged or case.pose_fit.converged or by_board:
         return case
@@ -53,11 +58,14 @@ def check_convention(case: Case) -> Case:
     return case.after(better_reading(poses, camera, observable, capture.images, rows, capture.untaken))
 
 
-def of_camera(gripper_from_camera: Poses) -> Finding | None:
-    """Return the finding that camera and gripper frame coincide, as where a board's poses were read; None otherwise."""
+def of_camera(gripper_from_camera: Transform, is_inverted: bool) -> Finding | None:
+    """Return the finding that camera and gripper frame coincide, as where a board's poses were read; None otherwise.
+
+    `is_inverted`: the gripper poses are inverses of what was written, as a board's pose in the camera would be.
+    """
     metres = float(np.linalg.norm(gripper_from_camera[:3, 3]))
     radians = float(rotation_angle(gripper_from_camera[:3, :3]))
-    if metres > BOARD[0] or radians > BOARD[1]:
+    if metres > (INVERTED_BOARD if is_inverted else BOARD[0]) or radians > BOARD[1]:
         return None
     return Finding.of(FindingKind.POSES_OF_CAMERA, "rejects", "poses", value=metres, rotation=radians)
 
@@ -113,7 +121,8 @@ def better_reading(
     ]
     if is_pairs and words == INVERSES:
         return (inverted_pair(fit, texts[0]),)
-    if found := of_camera(fit.x):
+    is_inverse = words == INVERSES or any(one.inverted and text_of(one) == words for one, _ in untaken)
+    if found := of_camera(fit.x, is_inverse):
         return (found,)
     details = {"reading": words, "remedy": remedy, "fits": texts[0], "given": texts[1]}
     severity = "rejects" if observable else "warns"
