@@ -80,7 +80,7 @@ def paired_by_name(
 
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a sort key that orders names by the numbers in them: img2 before img10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def image_names(folder: Path) -> list[str]:

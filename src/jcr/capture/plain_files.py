@@ -156,26 +156,3 @@ def read_npy(file: Path) -> ndarray:
         raise
     except Exception as error:  # NumPy parses the header as Python, with errors of many types
         raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
-
-
-def contained(folder: Path, name: str, where: str) -> Path:
-    """Return `folder/name`; raise InputError if the name is absolute, invalid, or leads out of the folder.
-
-    The file need not exist, but must not be a folder, pipe or device. Messages begin with `where`.
-    """
-    try:
-        longest = max(len(part.encode()) for part in Path(name).parts)
-    except ValueError:  # an empty name, or half of a surrogate pair
-        longest = LONGEST + 1
-    if "\0" in name or longest > LONGEST or Path(name).is_absolute():
-        raise InputError(f"{where}: {shown(name)} is no path inside the capture; use one under {folder}")
-    target = folder / name
-    try:
-        inside = target.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):
-        raise InputError(f"{where}: {name!r} is a link that leads back to itself; put a file there") from None
-    if not inside:
-        raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")
-    if target.exists() and not target.is_file():  # opening a pipe would block for ever
-        raise InputError(f"{where}: {name!r} is a folder, a pipe or a device; name the image's file")
-    return target

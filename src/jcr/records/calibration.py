@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, Field, PlainSerializer, computed_field, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, computed_field
 
+from jcr.errors import InputError
 from jcr.findings import Finding, remedy, unobservable
 from jcr.records.capture import Intrinsics
+from jcr.records.checked import require_fields
 from jcr.records.json_fields import (
     Covariance7,
     Matrix,
@@ -47,6 +49,8 @@ class ImageVerdict:
     """Angle between reported and predicted gripper orientation (degrees); None for an image that is not registered."""
     reprojection_px: float | None = None
     """Median reprojection error (px); None for an image that was not adjusted."""
+
+    __post_init__ = require_fields
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,8 @@ class Excitation:
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise:
@@ -103,6 +109,8 @@ class RobotNoise:
     """Size (rad) of the systematic errors: of the joint offsets of a known arm, else of the gripper's rotation."""
     systematic_left: Annotated[tuple[Metres, Radians], Field(alias="systematic_left_mm_deg")] = (0.0, 0.0)
     """Systematic errors of the poses per axis (m, rad), without the part that the hand-eye transform absorbs."""
+
+    __post_init__ = require_fields
 
     @property
     def together(self) -> tuple[float, float]:
@@ -125,6 +133,8 @@ class JointOffsets:
     prior_std: float
     """Standard deviation of a joint's offset in the prior (rad), the same for all joints."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
@@ -134,6 +144,8 @@ class Share:
     rotation_deg: Spread
     covariance: PartCovariance7
     """Covariance in COVARIANCE_ORDER; the sum over all causes is the covariance of the calibration."""
+
+    __post_init__ = require_fields
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
@@ -193,6 +205,8 @@ class LeaveOneOut:
     how: str
     """Method of the prediction, in words."""
 
+    __post_init__ = require_fields
+
     @property
     def length_m(self) -> float:
         """Translation and rotation error as one length (m): hypot of translation and 0.3 m times the rotation (rad)."""
@@ -225,6 +239,8 @@ class DepthCheck:
     features: int
     """Number of features that were compared."""
 
+    __post_init__ = require_fields
+
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
         """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
 
@@ -252,6 +268,8 @@ class PointUncertainty:
     rotation_95_deg: Spread
     """Bound on the orientation error at the point (degrees), including the rotation about the ray."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointUncertaintyOverImage(PointUncertainty):
@@ -273,6 +291,8 @@ class SceneUncertainty:
     """Standard deviation per axis of a point's remaining error, the deformation of the scene (m)."""
     within_95_m: Spread
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
+
+    __post_init__ = require_fields
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
         """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors.
@@ -299,6 +319,8 @@ class GivenIntrinsicsResult:
     differs_mm: Spread
     """Distance (mm) of one central point's positions by given and estimated intrinsics, each with its transform."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
@@ -311,6 +333,8 @@ class ModelError:
     expressed: Square
     """Matrix (q,e): parameters (camera.parameters) that best fit each polynomial at the points of the images."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointCovariance:
@@ -321,12 +345,11 @@ class JointCovariance:
     order: tuple[str, ...]
     """Names of the rows: COVARIANCE_ORDER, then fx, fy, cx, cy and the distortion."""
 
-    @model_validator(mode="after")
-    def _is_square(self) -> "JointCovariance":
-        """Raise ValueError unless the covariance has a row and a column for each name in `order`."""
+    def __post_init__(self) -> None:
+        """Raise InputError unless the covariance has a row and a column for each name in `order`."""
+        require_fields(self)
         if self.covariance.shape != 2 * (len(self.order),):
-            raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
-        return self
+            raise InputError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -428,6 +451,8 @@ class PaperResiduals:
     rotation: float
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class LengthCheck:
@@ -441,6 +466,8 @@ class LengthCheck:
     """Standard deviation of the stated length in percent, without that of the robot."""
     used: bool = False
     """Whether the length is a prior of the scale; none is if two lengths contradict each other."""
+
+    __post_init__ = require_fields
 
     @property
     def off(self) -> float:
@@ -468,3 +495,5 @@ class Attempt:
     """Reason why the run does not keep this attempt; None if it does."""
     features: str | None = None
     """Features that were matched between images; None for back ends without a choice of features."""
+
+    __post_init__ = require_fields

@@ -159,13 +159,13 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 def read_cloud(path: Path) -> PointCloud:
     """Read a PLY file of `write_cloud`; raise InputError for any other file."""
     try:
-        header, _, body = read_bytes(path).partition(b"end_header\n")
+        header, _, body = read_bytes(path).partition(b"\nend_header\n")  # a label may be called end_header
         lines = header.decode().splitlines()
         names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
         vertices = np.frombuffer(body, [(name, f"<{_COLUMNS[name]}") for name in names])
         columns = {name: vertices[name].astype(_AS_READ[_COLUMNS[name]]) for name in names}
-        is_whole = _FIRST in lines and len(names) >= len(_COLUMNS) - 2
-        if not is_whole or not all(np.isfinite(column).all() for column in columns.values()):
+        is_whole = f"element vertex {len(vertices)}" in lines  # not cut between two points
+        if not is_whole or _FIRST not in lines or len(names) < len(_COLUMNS) - 2:
             raise ValueError
         words = [line.split(maxsplit=3) for line in lines]
         centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
@@ -176,8 +176,8 @@ def read_cloud(path: Path) -> PointCloud:
             label_names=tuple(word[3] for word in words if word[:2] == ["comment", "label"]),
             **columns,
         )
-    except InputError:  # read_bytes refuses the path, such as a pipe
-        raise
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
     except (ValueError, IndexError):
