@@ -255,7 +255,7 @@ class Calibration(Outcome):
     """Known lengths, each compared with the robot's positions."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless exactly the two transforms of the camera's mount are set, and the scale is possible."""
+        """Raise InputError unless the scale is possible and exactly the two transforms of the mount are set."""
         require_fields(self)
         own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
         own, other = (own, other) if self.mount == "gripper" else (other, own)

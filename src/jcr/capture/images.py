@@ -104,7 +104,7 @@ def read_image(source: Path | bytes, where: str | None = None) -> UInt8[ndarray,
     where = where or str(source if isinstance(source, Path) else "image")
     with opened_image(source, where) as opened:
         # Pillow reads coloured 16-bit images with a mode of 8 bits; only the tile names the 16 bits.
-        if ";16" in str(opened.tile) or opened.mode[0] in "IF":
+        if ";16" in str(getattr(opened, "tile", ())) or opened.mode[0] in "IF":
             raise InputError(f"{where}: pixels of more than 8 bits a channel; save it with 8 bits")
         orientation = opened.getexif().get(ORIENTATION, 1)
         if orientation in range(2, 9):

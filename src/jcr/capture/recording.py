@@ -142,8 +142,8 @@ def best_frames(
     """Return the ascending rows of at most `count` sharp frames from n in order of time, and remarks for the user.
 
     The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
-    as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows, UNREADABLE for some.
-    Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
+    as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows,
+    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
     necessary. Raises InputError if fewer than three frames are left.
     """
     still = _runs(usable & (speed < STILL))

@@ -109,7 +109,8 @@ def image_labels(
         labels = read_labels(capture, reconstruction)
         if labels is None and options.segments == "labels":
             raise InputError(
-                f"{capture.folder / 'labels'}: holds no PNG; give NAME.png for each images/NAME.jpg, or choose --segments tabletop"
+                f"{capture.folder / 'labels'}: holds no PNG; give NAME.png for each images/NAME.jpg, or choose "
+                "--segments tabletop"
             )
         return labels
     if options.segments == "sam":

@@ -27,9 +27,9 @@ def reconstruct_given(
 ) -> Reconstruction:
     """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
-    Images are identified by their names, with folders where the file name alone is ambiguous. The points are those of the model, or with fewer than MIN_POINTS are
-    triangulated from SIFT matches. Raises InputError when the model contains fewer than three of the images,
-    RejectedError when too few points can be triangulated.
+    Images are identified by their names, with folders where the file name alone is ambiguous. The points are those of
+    the model, or with fewer than MIN_POINTS are triangulated from SIFT matches. Raises InputError when the model
+    contains fewer than three of the images, RejectedError when too few points can be triangulated.
     """
     report = progress or silent
     model = read_model(cameras)
