@@ -143,8 +143,8 @@ def best_frames(
 
     The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
     as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows,
-    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
-    necessary. Raises InputError if fewer than three frames are left.
+    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame;
+    the slowest frames between stops are added if necessary. Raises InputError if fewer than three frames are left.
     """
     still = _runs(usable & (speed < STILL))
     moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]

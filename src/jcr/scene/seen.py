@@ -44,8 +44,8 @@ class SeenGrid:
         """Raise InputError unless the grid has a place, cells of a size, and known states."""
         if not (np.isfinite(self.cell) and self.cell > 0):
             raise InputError(f"grid of seen space: cells of {self.cell:g} m; give a length above 0")
-        if self.lower.shape != (3,) or not torch.isfinite(self.lower).all():
-            raise InputError("grid of seen space: no lower corner; give three finite numbers (m)")
+        if self.lower.shape != (3,) or self.lower.dtype != torch.float32 or not self.lower.isfinite().all():
+            raise InputError("grid of seen space: no lower corner; give three finite numbers (m, float32)")
         if self.state.dtype != torch.uint8 or self.state.ndim != 3 or 0 in self.state.shape:
             raise InputError(
                 f"grid of seen space: states of shape {tuple(self.state.shape)}; give cells by z, y, x"
