@@ -97,9 +97,10 @@ def capture_file(folder: Path, name: str, where: str) -> Path:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete the temporary files in a folder that killed processes have left."""
-    for begun in folder.glob(".*.????????.part*"):
-        begun.unlink()
+    """Delete the temporary files in a folder that killed processes have left; a folder that is a link is left alone."""
+    for begun in () if folder.is_symlink() else folder.glob(".*.????????.part*"):
+        if begun.is_file():
+            begun.unlink()
 
 
 @contextmanager
@@ -113,8 +114,9 @@ def locked(path: Path) -> Iterator[None]:
     new = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
-        # A lock that is a link (of a folder from elsewhere) would empty the file that it leads to.
-        lock = os.fdopen(os.open(path / LOCK, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW, 0o666), "w")
+        # A lock that is a link (of a folder from elsewhere) would lead to another file, a pipe would block.
+        flags = os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        lock = os.fdopen(os.open(path / LOCK, flags, 0o666), "w")
     except (FileExistsError, NotADirectoryError):
         file = next(part for part in (path, *path.parents) if part.is_file())
         raise InputError(f"{file}: is a file; name a folder for the results") from None
