@@ -18,6 +18,8 @@ IMAGES = "images"
 """Subfolder of a capture in which its images are expected; the user may link it to a folder elsewhere."""
 LONGEST = 255
 """Largest length of a file name in bytes that file systems accept."""
+LONGEST_PATH = 1000
+"""Largest number of characters of a path that a file names; file systems accept 4096 bytes with the folder before."""
 
 
 @contextmanager
@@ -64,7 +66,13 @@ def path_inside(folder: Path, name: str, where: str, *asked: Path) -> Path:
         longest = max(len(part.encode()) for part in parts)
     except ValueError:  # an empty name, or half of a surrogate pair
         longest = LONGEST + 1
-    if "\0" in name or longest > LONGEST or Path(name).is_absolute():
+    if (
+        "\0" in name
+        or "\n" in name
+        or longest > LONGEST
+        or len(name) > LONGEST_PATH
+        or Path(name).is_absolute()
+    ):
         raise InputError(f"{where}: {shown(name)} is no path inside the capture; name a file under {folder}")
     if ".." in parts:  # no file need be there yet, whose place could be resolved
         raise InputError(f"{where}: {shown(name)} leads out of {folder} (..); copy the file into it")

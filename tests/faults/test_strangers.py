@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import shutil
 import struct
 import subprocess
@@ -241,6 +242,38 @@ def test_a_file_that_starts_a_program_is_no_image(tmp_path: Path):
     Image.new("RGB", SIZE).save(file, format="EPS")
     with pytest.raises(InputError, match="not a readable image"):
         read_image(file)
+
+
+def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
+    """Each of the scans decodes all pixels again: 12 MB took 12 s."""
+    file = tmp_path / "0.jpg"
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(file, progressive=True)
+    assert read_image(file).shape == (480, 640, 3)
+    data = file.read_bytes()
+    last = data[data.rfind(b"\xff\xda") : -2]
+    file.write_bytes(data[:-2] + 200 * last[:500] + b"\xff\xd9")
+    with pytest.raises(InputError, match="a JPEG of 2[01][0-9] scans"):
+        read_image(file)
+
+
+@pytest.mark.parametrize("name", ["images/0.png\n", "images/" + 500 * "a/" + "0.png"])
+def test_names_that_no_line_holds_are_refused(tmp_path: Path, name: str):
+    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    content = json.loads((folder / "capture.json").read_text())
+    content["frames"][0]["image"] = name
+    (folder / "capture.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="no path inside the capture") as caught:
+        jcr.read_capture(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lock_that_is_a_pipe_blocks_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    capture = table_capture(tmp_path / "cap", str)
+    (tmp_path / "out").mkdir()
+    os.mkfifo(tmp_path / "out/.lock")
+    assert dispatch(["calibrate", str(capture), str(tmp_path / "out"), "--quiet"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
 
 
 def ros_image(height: int, width: int, encoding: str, data: bytes | None = None, /, **facts: Any) -> Any:
@@ -555,6 +588,11 @@ CLOUD_CHANGES: dict[str, Callable[[bytes], bytes]] = {
     "image 77": cell_of("image", 77),
     "no point": lambda data: data.partition(b"end_header\n")[0] + b"end_header\n",
     "a quarter": lambda data: data[: -75 * ((len(data) - data.index(b"end_header\n") - 11) // 100)],
+    "another byte order": lambda data: data.replace(b"little", b"big"),
+    "axes in another order": lambda data: data.replace(
+        b"float x\nproperty float y", b"float y\nproperty float x"
+    ),
+    "a camera that is not counted": lambda data: data.replace(b"comment camera 0", b"comment camera 1"),
     "points twice": lambda data: data + data.partition(b"end_header\n")[2],
 }
 
@@ -698,6 +736,8 @@ RECORDS: dict[str, Callable[[], object]] = {
     ),
     "a label that is not there": lambda: cloud_of(np.zeros((1, 3)), label=np.ones(1, int)),
     "a camera that is not there": lambda: cloud_of(np.zeros((1, 3)), image=np.ones(1, int)),
+    "images of no size": lambda: capture_of(np.stack([np.eye(4)] * 3), image_size=(0, -1)),
+    "noise below 0": lambda: jcr.RobotNoise(translation=-1.0, rotation=0.0, estimated=False),
     "a scale of 0": lambda: hand_eye_of(np.eye(4), scale=0.0),
     "transforms of two mounts": lambda: hand_eye_of(np.eye(4), on_base=np.eye(4)),
 }

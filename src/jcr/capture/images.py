@@ -22,6 +22,8 @@ refused before it is unpacked."""
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
 """Pillow's names of the formats that are read, by the content of the file. Others have readers that are little used, or
 that start programs (PostScript)."""
+MAX_SCANS = 100
+"""Largest number of scans of a JPEG with its previews; progressive ones have about ten."""
 ONE_CHANNEL = {
     "1": np.uint8,
     "L": np.uint8,
@@ -70,6 +72,8 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
             file = source if isinstance(source, Path) else io.BytesIO(source)
             with Image.open(file, formats=FORMATS) as opened:
                 require_pixels(opened.size, where)
+                if opened.format in ("JPEG", "MPO"):
+                    _require_few_scans(source, where)
                 # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
@@ -85,6 +89,13 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
         ) from None
     except Exception as error:  # decoders raise errors of many types for a damaged file
         raise InputError(f"{where}: not a readable image ({error}); save it again as PNG or JPEG") from None
+
+
+def _require_few_scans(source: Path | bytes, where: str) -> None:
+    """Raise InputError, begun with `where`, if a JPEG has over MAX_SCANS scans; each decodes the whole image."""
+    data = source.read_bytes() if isinstance(source, Path) else source
+    if (count := data.count(b"\xff\xda")) > MAX_SCANS:  # the marker of a scan, which its data cannot hold
+        raise InputError(f"{where}: a JPEG of {count} scans; save it again")
 
 
 def require_pixels(size: tuple[int, int], where: str) -> None:

@@ -43,11 +43,11 @@ class ImageVerdict:
     """Whether the calibration uses the image."""
     reason: str | None
     """Reason why the image is not used; None if it is."""
-    translation_residual_mm: float | None = None
+    translation_residual_mm: Spread | None = None
     """Distance between reported and predicted gripper position (mm); None for an image that is not registered."""
-    rotation_residual_deg: float | None = None
+    rotation_residual_deg: Spread | None = None
     """Angle between reported and predicted gripper orientation (degrees); None for an image that is not registered."""
-    reprojection_px: float | None = None
+    reprojection_px: Spread | None = None
     """Median reprojection error (px); None for an image that was not adjusted."""
 
     __post_init__ = require_fields
@@ -110,7 +110,12 @@ class RobotNoise:
     systematic_left: Annotated[tuple[Metres, Radians], Field(alias="systematic_left_mm_deg")] = (0.0, 0.0)
     """Systematic errors of the poses per axis (m, rad), without the part that the hand-eye transform absorbs."""
 
-    __post_init__ = require_fields
+    def __post_init__(self) -> None:
+        """Raise InputError unless the errors are finite and not negative."""
+        require_fields(self)
+        sizes = self.translation, self.rotation, self.systematic, *self.systematic_left, *(self.given or ())
+        if not all(np.isfinite(sizes)) or min(sizes) < 0:
+            raise InputError("RobotNoise: an error that is negative or not finite; give standard deviations")
 
     @property
     def together(self) -> tuple[float, float]:
@@ -196,11 +201,11 @@ class Budget:
 class LeaveOneOut:
     """Mean leave-one-out error: difference of each reported gripper pose from its prediction by the other images."""
 
-    translation_mm: float
+    translation_mm: Spread
     """Mean distance between predicted and reported gripper position."""
-    rotation_deg: float
+    rotation_deg: Spread
     """Mean angle between predicted and reported gripper orientation."""
-    reprojection_px: float | None
+    reprojection_px: Spread | None
     """Median reprojection error with the predicted poses (px); None if the images were not adjusted."""
     how: str
     """Method of the prediction, in words."""
@@ -446,9 +451,9 @@ class Uncertainty:
 class PaperResiduals:
     """Mean residuals of AX = XB, where A and B are gripper and camera motions between consecutive used images."""
 
-    translation: float
+    translation: Spread
     """Mean translation residual δ_t (m)."""
-    rotation: float
+    rotation: Spread
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
     __post_init__ = require_fields
@@ -487,9 +492,9 @@ class Attempt:
     backend: str
     images_registered: int | None
     """Number of registered images; None if the back end failed."""
-    reconstruct_s: float
+    reconstruct_s: Spread
     """Time of the reconstruction (s)."""
-    calibrate_s: float
+    calibrate_s: Spread
     """Time of the calibration (s); 0 if the back end failed."""
     why_not: str | None
     """Reason why the run does not keep this attempt; None if it does."""

@@ -93,7 +93,7 @@ class CellCamera:
     mount: Mount
     images: tuple[str, ...]
     """Paths relative to `folder`."""
-    image_size: tuple[int, int]
+    image_size: tuple[Pixels, Pixels]
     """Width and height (px)."""
     intrinsics: Intrinsics | None = None
     """Given intrinsics; None: unknown, to be estimated."""
@@ -125,7 +125,7 @@ class Capture:
     images: tuple[str, ...]
     """Paths relative to `folder`, which are also the names of the images in all later records."""
     base_from_gripper: Float[ndarray, "n 4 4"]
-    image_size: tuple[int, int]
+    image_size: tuple[Pixels, Pixels]
     """Width and height of all images (px)."""
     intrinsics: Intrinsics | None = None
     """Given intrinsics; None: unknown, to be estimated."""
