@@ -25,6 +25,8 @@ USUAL_FOCAL = 0.8
 """Assumed focal length of an unknown camera over the long side of its image (64° wide); wrist cameras: 0.5 to 1.2."""
 WITHIN_FOLD = 0.9
 """Share of `fold_distance_px` up to which a distortion is inverted."""
+LEAST_FOCAL = 1e-3
+"""Smallest estimated focal length, as a share of the given or initial one; no estimate that is accepted is near it."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
 """Camera whose pixel coordinates are x/z, y/z."""
 Coordinate = Inexact[ndarray, "*batch"] | np.inexact
@@ -51,6 +53,8 @@ def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
 def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
     """Return a camera of the same model and image size with the p `values`, in the order of `parameters`."""
     fx, fy, cx, cy, *distortion = values.tolist()
+    # A step from a poor initial estimate may pass 0, where no camera is.
+    fx, fy = max(fx, LEAST_FOCAL * camera.fx), max(fy, LEAST_FOCAL * camera.fy)
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 

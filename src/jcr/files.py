@@ -8,12 +8,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from jcr.errors import InputError
+from jcr.errors import InputError, shown
 
 LOCK = ".lock"
 """Name of the file in a folder that is locked by the process that writes there."""
-COPIES = "capture", "added"
+COPIES = "capture", "added", "cameras"
 """Subfolders of a run folder into which images are copied."""
+IMAGES = "images"
+"""Subfolder of a capture in which its images are expected; the user may link it to a folder elsewhere."""
+LONGEST = 255
+"""Largest length of a file name in bytes that file systems accept."""
+LONGEST_PATH = 1000
+"""Largest number of characters of a path that a file names; file systems accept 4096 bytes with the folder before."""
 
 
 @contextmanager
@@ -48,23 +54,77 @@ def require_file(path: Path) -> None:
         raise InputError(f"{path}: a pipe or a device; name a file")
 
 
+def path_inside(folder: Path, name: str, where: str, *asked: Path) -> Path:
+    """Return `folder/name` for a name that a file states; raise InputError if it could lead out of the folder.
+
+    The name must be relative, without a step upwards (..). Symbolic links must stay inside of the folder, or lead into
+    one of the folders `asked`, which the user named or linked. The file need not exist, but must not be a folder, pipe
+    or device. Messages begin with `where`.
+    """
+    parts = Path(name).parts
+    try:
+        longest = max(len(part.encode()) for part in parts)
+    except ValueError:  # an empty name, or half of a surrogate pair
+        longest = LONGEST + 1
+    if (
+        "\0" in name
+        or "\n" in name
+        or longest > LONGEST
+        or len(name) > LONGEST_PATH
+        or Path(name).is_absolute()
+    ):
+        raise InputError(f"{where}: {shown(name)} is no path inside the capture; name a file under {folder}")
+    if ".." in parts:  # no file need be there yet, whose place could be resolved
+        raise InputError(f"{where}: {shown(name)} leads out of {folder} (..); copy the file into it")
+    target = folder / name
+    try:
+        place = target.resolve()
+    except (OSError, RuntimeError):
+        raise InputError(
+            f"{where}: {shown(name)} is a link that leads back to itself; put a file there"
+        ) from None
+    if not any(place.is_relative_to(root.resolve()) for root in (folder, *asked)):
+        raise InputError(
+            f"{where}: {shown(name)} is a link that leads out of {folder}; copy the file into it"
+        )
+    try:
+        is_wrong = target.exists() and not target.is_file()  # opening a pipe would block for ever
+    except OSError as error:  # a path that is too long as a whole
+        raise InputError(f"{where}: {shown(name)} cannot be a file ({error.strerror}); rename it") from None
+    if is_wrong:
+        raise InputError(f"{where}: {shown(name)} is a folder, a pipe or a device; name a file")
+    return target
+
+
+def capture_file(folder: Path, name: str, where: str) -> Path:
+    """Return the path of a file that a capture in `folder` names; raise InputError as `path_inside` does.
+
+    The user may link the subfolder of the images to a folder elsewhere: who names the capture names its images.
+    """
+    return path_inside(folder, name, where, folder / IMAGES)
+
+
 def remove_unfinished(folder: Path) -> None:
-    """Delete the temporary files in a folder that killed processes have left."""
-    for begun in folder.glob(".*.????????.part*"):
-        begun.unlink()
+    """Delete the temporary files in a folder that killed processes have left; a folder that is a link is left alone."""
+    for begun in () if folder.is_symlink() else folder.glob(".*.????????.part*"):
+        if begun.is_file():
+            begun.unlink()
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Create a folder and lock it for this process within a `with` block.
 
-    Raises InputError if another process has locked the folder. Temporary files of killed processes are removed. A new
-    folder is removed again if it stays empty.
+    Raises InputError if another process has locked the folder, or if a subfolder for copies is a link, by which files
+    would be written elsewhere. Temporary files of killed processes are removed. A new folder is removed again if it
+    stays empty.
     """
     new = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
-        lock = (path / LOCK).open("w", encoding="utf-8")
+        # A lock that is a link (of a folder from elsewhere) would lead to another file, a pipe would block.
+        flags = os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        lock = os.fdopen(os.open(path / LOCK, flags, 0o666), "w")
     except (FileExistsError, NotADirectoryError):
         file = next(part for part in (path, *path.parents) if part.is_file())
         raise InputError(f"{file}: is a file; name a folder for the results") from None
@@ -75,6 +135,8 @@ def locked(path: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(f"{path}: another jcr is writing there; wait for it or choose another") from None
+        for linked in (path / name for name in COPIES if (path / name).is_symlink()):
+            raise InputError(f"{linked}: is a link; results are written in the run folder only: remove it")
         for folder in (path, *(sub for name in COPIES for sub in (path / name).rglob("."))):
             remove_unfinished(folder)
         try:

@@ -235,7 +235,7 @@ def test_label_images_are_read_where_the_pointmap_looks_through_the_distortion(t
         (np.zeros((60, 79), np.uint8), "is .79, 60. pixels"),
         (np.zeros((60, 80, 3), np.uint8), "one channel"),
         (np.full((60, 80), 5000, np.uint16), "holds label 5000"),
-        (b"no picture", "no label image"),
+        (b"no picture", "not a readable image"),
     ],
 )
 def test_unusable_label_images_are_named(tmp_path: Path, label: ndarray | bytes | None, words: str):

@@ -122,7 +122,7 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
     found = np.asarray(viewer._mark.position)
     assert abs(found[2] - (z + book.box_size[2] / 2)) < 0.01
     at = viewer.scene.query(found[None].astype(float))
-    assert f"| occupancy | {at.occupancy[0]:.2f} |" in said and "images/" in said and "margin" in said
+    assert f"<td>{at.occupancy[0]:.2f}</td>" in said and "images/" in said and "margin" in said
     assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
     viewer.shown.value = "map"
     viewer.show_points()

@@ -93,7 +93,7 @@ def boards(spec: str) -> list[Board]:
 def _count(text: str) -> tuple[int, int]:
     """Return columns and rows from a text such as 7x5; raise ValueError for another text."""
     across, by, down = text.partition("x")
-    if not (by and across.isdigit() and down.isdigit() and int(across) > 1 and int(down) > 1):
+    if not (by and across.isdecimal() and down.isdecimal() and int(across) > 1 and int(down) > 1):
         raise ValueError(f"{text} is no size such as 7x5")
     return int(across), int(down)
 

@@ -18,7 +18,6 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
     computed_field,
-    model_validator,
 )
 
 import jcr
@@ -58,6 +57,7 @@ from jcr.records import (
     RobotNoise,
     Uncertainty,
 )
+from jcr.records.checked import require_fields
 from jcr.records.json_fields import Matrix, Positive, rounded
 from jcr.records.json_file import read_json
 
@@ -254,14 +254,13 @@ class Calibration(Outcome):
     lengths: tuple[LengthCheck, ...] = ()
     """Known lengths, each compared with the robot's positions."""
 
-    @model_validator(mode="after")
-    def _is_of_one_mount(self) -> "Calibration":
-        """Return the calibration; raise ValueError unless exactly the two transforms of the camera's mount are set."""
+    def __post_init__(self) -> None:
+        """Raise InputError unless the scale is possible and exactly the two transforms of the mount are set."""
+        require_fields(self)
         own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
         own, other = (own, other) if self.mount == "gripper" else (other, own)
         if any(one is None for one in own) or any(one is not None for one in other):
-            raise ValueError(f"the transforms are not those of the mount {self.mount}")
-        return self
+            raise InputError(f"the transforms are not those of the mount {self.mount}")
 
     @computed_field
     @property

@@ -11,7 +11,7 @@ from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, shown
-from jcr.files import write_bytes
+from jcr.files import path_inside, write_bytes
 from jcr.records import Capture
 from jcr.records.capture_json import other_size
 from jcr.records.json_file import read_json
@@ -56,7 +56,7 @@ def with_added_images(added: Capture, path: Path, options: ReadOptions | None = 
                 raise InputError(f"{new.folder / image}: this image was added before; take a new one")
             known.add(content)
             names.append(f"{len(names):03d}{Path(image).suffix.lower()}")
-            write_bytes(added.folder / names[-1], content)
+            write_bytes(path_inside(added.folder, names[-1], str(added.folder)), content)
     poses = np.concatenate([added.base_from_gripper, new.base_from_gripper])
     return replace(added, images=tuple(names), base_from_gripper=poses)
 

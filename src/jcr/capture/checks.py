@@ -12,8 +12,8 @@ from numpy import ndarray
 from jcr.capture.images import read_image
 from jcr.capture.notations import far_faults, tolerated
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
-from jcr.capture.plain_files import contained
 from jcr.errors import InputError, first_few
+from jcr.files import capture_file
 from jcr.geometry import step_between
 from jcr.records import Capture
 from jcr.records.capture_json import other_size
@@ -38,7 +38,7 @@ def checked_capture(
     """
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
-        contained(folder, name, f"{where}: frame {k}")
+        capture_file(folder, name, f"{where}: frame {k}")
     names = [f"{where}: the pose of {name}" for name in images]
     found = {**(faults or {}), **far_faults(base_from_gripper[:, :3, 3], where, names)}
     sizes, digests = dict[int, tuple[int, int]](), dict[bytes, int]()

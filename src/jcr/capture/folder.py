@@ -122,7 +122,7 @@ def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: Read
     images = [found.images[k] for k in rows]
     require_frames(len(images), file, 0)
     is_decided = len(candidates) == 1
-    poses = candidates[0][1][rows] if is_decided else np.full((len(rows), 4, 4), np.nan)
+    poses = candidates[0][1][rows] if is_decided else np.tile(np.eye(4), (len(rows), 1, 1))
     placed = {rows.index(k): text for k, text in faults.items()}
     capture, kept = checked_capture(folder, images, poses, file, placed)
     taken = [rows[k] for k in kept]
@@ -133,6 +133,10 @@ def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: Read
             f"{len(unlisted)} images have no pose in {Path(file).name} and are left out: {first_few(unlisted)}"
         )
     intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
+    if not is_decided:
+        capture = replace(
+            capture, base_from_gripper=np.full((len(kept), 4, 4), np.nan), candidates=tuple(candidates)
+        )
     return replace(
         capture,
         source=chosen[0].table.file,
@@ -160,14 +164,15 @@ def _has_row(chosen: list[_Source], image: int) -> bool:
 def _unpaired(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
     """Return the capture of tables whose rows differ in number from the images; only the images can tell which fit."""
     file, images = str(chosen[0].table.file), list(found.images)
-    none = np.full((len(images), 4, 4), np.nan)
-    capture, _ = checked_capture(folder, images, none, file)
+    capture, _ = checked_capture(folder, images, np.tile(np.eye(4), (len(images), 1, 1)), file)
+    none = np.full((len(capture), 4, 4), np.nan)
     intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
     candidates = tuple(one for source in chosen for one in source.candidates)
     return replace(
         capture,
         source=chosen[0].table.file,
         intrinsics=intrinsics,
+        base_from_gripper=none,
         candidates=candidates,
         notes=(*found.notes, *more, *capture.notes),
     )

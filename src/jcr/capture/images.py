@@ -1,7 +1,9 @@
 """Reading and writing of images, and measures of their exposure and sharpness."""
 
+import io
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -17,6 +19,20 @@ from jcr.records.capture_json import other_size
 MAX_PIXELS = 64_000_000
 """Largest number of pixels of an image. No wrist camera has more; a larger file may be a decompression bomb, which is
 refused before it is unpacked."""
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
+"""Pillow's names of the formats that are read, by the content of the file. Others have readers that are little used, or
+that start programs (PostScript)."""
+MAX_SCANS = 100
+"""Largest number of scans of a JPEG with its previews; progressive ones have about ten."""
+ONE_CHANNEL = {
+    "1": np.uint8,
+    "L": np.uint8,
+    "I": np.uint16,
+    "I;16": np.uint16,
+    "I;16B": np.uint16,
+    "I;16L": np.uint16,
+}
+"""Type of the values of a grey image by Pillow's mode; older versions of Pillow read 16 bits as 32."""
 BLURRED = 0.25
 """Sharpness below which a frame is blurred, as a share of the median sharpness of the frames."""
 ORIENTATION = 0x0112
@@ -40,39 +56,89 @@ DARK, BRIGHT = 12, 243
 """Mean grey levels (0 to 255) below and above which an image is too dark or too bright to be used."""
 
 
-def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """Read an image as RGB; raise InputError if the file is not a readable image of 8 bits a channel.
+@contextmanager
+def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
+    """Open an image file, or the bytes of one, and yield it with its header read and its pixels not yet decoded.
 
-    An image with an EXIF tag of rotation is refused, because viewers and other readers would turn its axes.
+    Raises InputError, begun with `where`, if it is no image, has more than MAX_PIXELS pixels or several images, or if
+    decoding it under `with` fails.
     """
-    require_file(path)
+    if isinstance(source, Path):
+        require_file(source)
     try:
         with warnings.catch_warnings():
             # Pillow's own bomb warning would end a run that treats warnings as errors; our limit is lower.
             warnings.simplefilter("ignore")
-            with Image.open(path) as opened:
-                if opened.size[0] * opened.size[1] > MAX_PIXELS:
-                    raise Image.DecompressionBombError
+            file = source if isinstance(source, Path) else io.BytesIO(source)
+            with Image.open(file, formats=FORMATS) as opened:
+                require_pixels(opened.size, where)
+                if opened.format in ("JPEG", "MPO"):
+                    _require_few_scans(source, where)
                 # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
                 count = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and count > 1:
-                    raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
-                # Pillow reads coloured 16-bit images with a mode of 8 bits; only the tile names the 16 bits.
-                if ";16" in str(opened.tile) or opened.mode[0] in "IF":
-                    raise InputError(f"{path}: pixels of more than 8 bits a channel; save it with 8 bits")
-                orientation = opened.getexif().get(ORIENTATION, 1)
-                if orientation in range(2, 9):
-                    text = f"EXIF orientation {orientation}, by which viewers turn the image"
-                    raise InputError(f"{path}: {text}; remove the tag (exiftool -Orientation= FILES)")
-                return np.asarray(opened.convert("RGB"))
+                    raise InputError(f"{where}: holds {count} images; save one as PNG or JPEG")
+                yield opened
     except FileNotFoundError:
-        raise InputError(f"{path}: no such image; correct its name or add the file") from None
+        raise InputError(f"{where}: no such image; correct its name or add the file") from None
     except InputError:
         raise
-    except Image.DecompressionBombError:
-        raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
+    except Image.DecompressionBombError:  # Pillow's own limit is above ours, but for previews and tiles
+        raise InputError(
+            f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
+        ) from None
     except Exception as error:  # decoders raise errors of many types for a damaged file
-        raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
+        raise InputError(f"{where}: not a readable image ({error}); save it again as PNG or JPEG") from None
+
+
+def _require_few_scans(source: Path | bytes, where: str) -> None:
+    """Raise InputError, begun with `where`, if a JPEG has over MAX_SCANS scans; each decodes the whole image."""
+    data = source.read_bytes() if isinstance(source, Path) else source
+    if (count := data.count(b"\xff\xda")) > MAX_SCANS:  # the marker of a scan, which its data cannot hold
+        raise InputError(f"{where}: a JPEG of {count} scans; save it again")
+
+
+def require_pixels(size: tuple[int, int], where: str) -> None:
+    """Raise InputError, begun with `where`, if a `size` (width, height) is empty or has more than MAX_PIXELS pixels."""
+    if min(size) < 1:
+        raise InputError(f"{where}: {size[0]}x{size[1]} pixels, an empty image; take it again")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise InputError(f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image")
+
+
+def read_image(source: Path | bytes, where: str | None = None) -> UInt8[ndarray, "h w 3"]:
+    """Read an image file, or the bytes of one, as RGB; raise InputError if it is no image of 8 bits a channel.
+
+    An image with an EXIF tag of rotation is refused, because viewers and other readers would turn its axes. Messages
+    begin with `where`, by default the path.
+    """
+    where = where or str(source if isinstance(source, Path) else "image")
+    with opened_image(source, where) as opened:
+        # Pillow reads coloured 16-bit images with a mode of 8 bits; only the tile names the 16 bits.
+        if ";16" in str(getattr(opened, "tile", ())) or opened.mode[0] in "IF":
+            raise InputError(f"{where}: pixels of more than 8 bits a channel; save it with 8 bits")
+        orientation = opened.getexif().get(ORIENTATION, 1)
+        if orientation in range(2, 9):
+            text = f"EXIF orientation {orientation}, by which viewers turn the image"
+            raise InputError(f"{where}: {text}; remove the tag (exiftool -Orientation= FILES)")
+        return np.asarray(opened.convert("RGB"))
+
+
+def read_one_channel(source: Path | bytes, where: str) -> UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"]:
+    """Read the values of a grey image of 8 or 16 bits: labels, or depth (mm).
+
+    `source` is a file or the bytes of one. Raises InputError, begun with `where`, for any other file.
+    """
+    with opened_image(source, where) as opened:
+        kind = ONE_CHANNEL.get(opened.mode)
+        if kind is None:
+            raise InputError(
+                f"{where}: pixels of mode {opened.mode}; save it as PNG with one channel of 8 or 16 bits"
+            )
+        pixels = np.asarray(opened)
+        if pixels.dtype.itemsize > 2 and pixels.size and not 0 <= pixels.min() <= pixels.max() <= 65535:
+            raise InputError(f"{where}: values beyond 65535; save it as PNG with one channel of 16 bits")
+        return pixels.astype(kind)
 
 
 def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
@@ -80,11 +146,8 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 
     Raises InputError if the file is not a 16-bit grey image of `size` (width, height).
     """
-    require_file(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such depth image; correct its name in the capture or add it")
-    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+    depth = read_one_channel(path, str(path))
+    if depth.dtype != np.uint16:
         raise InputError(f"{path}: no depth image of 16 bits and one channel (mm); save it as 16-bit PNG")
     if (found := depth.shape[::-1]) != size:
         remedy = "align depth with colour (ROS: align_depth.enable, librealsense: rs.align)"
@@ -162,12 +225,6 @@ def encode_jpeg(pixels: UInt8[ndarray, "h w 3"]) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
-def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
-    """Return the variance of the Laplacian of RGB pixels or of an encoded file; 0 if the file cannot be decoded.
-
-    The variance falls as blur increases.
-    """
-    if isinstance(image, bytes):
-        bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
-        return 0.0 if bgr is None else sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))
+def sharpness(image: UInt8[ndarray, "h w 3"]) -> float:
+    """Return the variance of the Laplacian of an RGB image, which falls as blur increases."""
     return float(cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_64F).var())

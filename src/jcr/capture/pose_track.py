@@ -3,6 +3,7 @@
 from array import array
 from collections.abc import Callable
 from functools import partial
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +95,9 @@ class TfTree:
                 self._parent[child], self._samples[child] = parent, (array("q"), array("d"))
             stamp, t, q = stamped.header.stamp, stamped.transform.translation, stamped.transform.rotation
             stamps, numbers = self._samples[child]
-            stamps.append(stamp.sec * 10**9 + stamp.nanosec)
-            numbers.extend((t.x, t.y, t.z, q.x, q.y, q.z, q.w))
+            pose = array("d", (t.x, t.y, t.z, q.x, q.y, q.z, q.w))  # whole or none
+            stamps.append(index(stamp.sec) * 10**9 + index(stamp.nanosec))
+            numbers.extend(pose)
             if static:
                 self._static.add(child)
 

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.capture.checks import checked_capture
-from jcr.capture.images import BLURRED, encode_png, sharpness
+from jcr.capture.images import BLURRED, encode_png, read_image, sharpness
 from jcr.capture.intrinsics import read_intrinsics
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pose_track import NEVER
 from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance, pose_residuals
-from jcr.files import write_bytes
+from jcr.files import path_inside, write_bytes
 from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
@@ -32,8 +32,11 @@ UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
 """Errors of translation (m), rotation (rad) and log scale that have equal weight: 1 mm, 0.1°, 0.2 %."""
 WEAK = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
-Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"], str]
-"""Image of a frame: the frame's row, the bytes of the encoded file or RGB pixels, and the file's ending."""
+Picture = tuple[int, bytes | UInt8[ndarray, "h w 3"] | InputError, str]
+"""Image of a frame: the frame's row, the bytes of the encoded file or RGB pixels, and the file's ending. An image that
+cannot be read is the error with the reason."""
+UNREADABLE = -1.0
+"""Sharpness of an image that cannot be read."""
 Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
 
@@ -76,11 +79,19 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     worst = gap_ns[gap_ns < NEVER].max(initial=0) / 1e6
     stale = f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit} (gaps up to {worst:.0f} ms): "
 
+    faults = dict[int, str]()
+
     def sharpness_of(rows: Rows) -> Float[ndarray, " k"]:
         values = []
-        for k, (_, image, _) in enumerate(recording.images_of_rows(rows)):
-            values.append(sharpness(image))
+        for k, (row, image, _) in enumerate(recording.images_of_rows(rows)):
+            try:
+                values.append(sharpness(_pixels_of(image, f"{recording.source}: {recording.names[row]}")))
+            except InputError as error:
+                faults[row] = str(error)
+                values.append(UNREADABLE)
             report("frames", 0.1 + 0.7 * k / len(rows))
+        if len(faults) == len(values) > 0:
+            raise InputError(f"{faults[min(faults)]} (none of {len(values)} images can be read)")
         if len(values) < len(rows):
             raise InputError(
                 f"{recording.source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its "
@@ -93,13 +104,18 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     images = list[str]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         images.append(f"images/{recording.names[row]}{ending}")
-        write_bytes(into / images[-1], image if isinstance(image, bytes) else encode_png(image))
+        if isinstance(image, InputError):  # it was read before
+            raise image
+        data = image if isinstance(image, bytes) else encode_png(image)
+        write_bytes(path_inside(into, images[-1], str(recording.source)), data)
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     known = recording.intrinsics_of_size
     if options.camera_info is not None:
         known = partial(read_intrinsics, options.camera_info)
     capture, kept = checked_capture(into, images, poses[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
+    if faults:
+        notes = (*notes, f"left out: {len(faults)} images that cannot be read: {faults[min(faults)]}")
     return replace(
         capture,
         joints=None if recording.joints is None else recording.joints[rows[kept]],
@@ -107,6 +123,13 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         intrinsics=known(capture.image_size),
         notes=(*notes, *remarks, *capture.notes),
     )
+
+
+def _pixels_of(image: bytes | UInt8[ndarray, "h w 3"] | InputError, where: str) -> UInt8[ndarray, "h w 3"]:
+    """Return the RGB pixels of an image of a recording; raise InputError if it cannot be read."""
+    if isinstance(image, InputError):
+        raise image
+    return read_image(image, where) if isinstance(image, bytes) else image
 
 
 def best_frames(
@@ -119,9 +142,9 @@ def best_frames(
     """Return the ascending rows of at most `count` sharp frames from n in order of time, and remarks for the user.
 
     The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
-    as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows.
-    Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
-    necessary. Raises InputError if fewer than three frames are left.
+    as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows,
+    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame;
+    the slowest frames between stops are added if necessary. Raises InputError if fewer than three frames are left.
     """
     steps = np.asarray(motion_length(inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]))
     # A camera that is triggered at the stops has no frames between them: the arm's moves part the stops, too.
@@ -137,6 +160,7 @@ def best_frames(
     sharp = np.zeros(len(speed))
     sharp[rows] = sharpness_of(rows)
     sharpest = np.array([moment[sharp[moment].argmax()] for moment in moments], dtype=int)
+    sharpest = sharpest[sharp[sharpest] > UNREADABLE]
     least = BLURRED * np.median(sharp[sharpest]) if len(sharpest) else 0.0
     clear = sharpest[sharp[sharpest] >= least]
     views = clear[:0]

@@ -1,5 +1,8 @@
 """Intrinsics, images and depth from messages of ROS bags (rosbags) and nodes (rclpy), and from camera_info YAML."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from operator import index
 from typing import Annotated, Any
 
 import cv2
@@ -8,8 +11,9 @@ from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from pydantic import AliasChoices, AliasPath, BaseModel, BeforeValidator, ConfigDict, Field
 
+from jcr.capture.images import read_image, read_one_channel, require_pixels
 from jcr.capture.intrinsics import intrinsics_of_entry
-from jcr.errors import InputError
+from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.records import Intrinsics
 from jcr.records.json_file import validated_content
 
@@ -66,40 +70,64 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2)),
 }
 """Channels of each colour encoding of ROS, and OpenCV's code for the conversion to RGB; None if it is RGB already."""
+_PAIRED = (cv2.COLOR_YUV2RGB_UYVY, cv2.COLOR_YUV2RGB_YUY2)
+"""Conversions of images in which two pixels share their colour."""
 
 
 def read_ros_image(message: Any) -> UInt8[ndarray, "h w 3"]:
     """Return the RGB image of a sensor_msgs/Image or CompressedImage; raise InputError if it is not a colour image."""
     pixels, _ = image_of(message, "image")
-    if isinstance(pixels, bytes):
-        return np.asarray(cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
-    return pixels
+    return read_image(pixels, "image") if isinstance(pixels, bytes) else pixels
 
 
 def read_ros_camera_info(message: Any) -> Intrinsics | None:
     """Return the intrinsics of a sensor_msgs/CameraInfo; None if the camera was never calibrated."""
-    return intrinsics_of_ros(message, (message.width, message.height), "camera_info")
+    info: CameraInfo = validated_content(CameraInfo, message, "camera_info")
+    return intrinsics_of_ros(message, (info.width, info.height), "camera_info")
+
+
+@contextmanager
+def _as_message(where: str) -> Iterator[None]:
+    """Raise InputError, begun with `where`, where a message has other fields than the message of ROS.
+
+    A bag holds the definitions of its messages, so that a field may be missing, or be of any type.
+    """
+    try:
+        yield
+    except (AttributeError, TypeError, ValueError, OverflowError, MemoryError, cv2.error) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = " ".join(str(error).split())[:LONGEST_SHOWN]
+        raise InputError(
+            f"{where}: not an image message of ROS ({reason}); record the standard message"
+        ) from None
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """Return the image in a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth and for
-    encodings that jcr does not read.
+    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth, for encodings
+    that jcr does not read, and for damaged messages. The bytes of a file are not decoded.
     """
-    if hasattr(message, "format"):
-        data = bytes(message.data)
-        for magic, ending in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n", ".png")):
-            if data.startswith(magic):
-                return data, ending
-        raise InputError(f"{where}: compressed as {message.format!r}; jcr reads JPEG and PNG of colours")
-    encoding, (height, width) = message.encoding, (message.height, message.width)
-    if encoding not in _ENCODINGS:
-        raise InputError(f"{where}: encoding {encoding!r} is no colour image jcr knows; choose another topic")
-    channels, code = _ENCODINGS[encoding]
-    rows = _rows(message, width * channels, f"an image of {width}x{height} {encoding}", where)
-    pixels = rows.reshape(height, width, channels)
-    return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code), np.uint8), ".png"
+    with _as_message(where):
+        if hasattr(message, "format"):
+            data = bytes(message.data)
+            for magic, ending in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n", ".png")):
+                if data.startswith(magic):
+                    return data, ending
+            raise InputError(
+                f"{where}: compressed as {shown(message.format)}; jcr reads JPEG and PNG of colours"
+            )
+        if message.encoding not in _ENCODINGS:
+            raise InputError(
+                f"{where}: encoding {shown(message.encoding)} is no colour image; choose another topic"
+            )
+        channels, code = _ENCODINGS[message.encoding]
+        if code in _PAIRED and message.width % 2:  # two pixels share their colour
+            raise InputError(f"{where}: {message.encoding} of an odd width, {message.width}; record again")
+        pixels = _rows(message, channels, np.dtype(np.uint8), f"{message.encoding} image", where)
+        pixels = pixels.reshape(len(pixels), -1, channels)
+        return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code), np.uint8), ".png"
 
 
 def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
@@ -107,31 +135,41 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
     Depths in metres are rounded to mm. Raises InputError, begun with `where`, if the message is not a depth image.
     """
-    if hasattr(message, "format"):
-        # compressed_depth_image_transport writes its quantisation before the PNG.
-        data = bytes(message.data)
-        begin = data.find(b"\x89PNG\r\n")
-        depth = cv2.imdecode(np.frombuffer(data[max(begin, 0) :], np.uint8), cv2.IMREAD_UNCHANGED)
-        if begin < 0 or depth is None or depth.dtype != np.uint16 or "32FC1" in message.format:
-            raise InputError(f"{where}: depth as {message.format!r}; record 16UC1, raw or compressedDepth")
-        return np.asarray(depth)
-    kinds = {"16UC1": (np.uint16, 1.0), "mono16": (np.uint16, 1.0), "32FC1": (np.float32, 1e3)}
-    if message.encoding not in kinds:
-        raise InputError(f"{where}: encoding {message.encoding!r} is no depth; give 16UC1 (mm) or 32FC1 (m)")
-    kind, to_mm = kinds[message.encoding]
-    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    what = f"a depth image of {message.width}x{message.height}"
-    values = to_mm * _rows(message, message.width * order.itemsize, what, where).view(order).astype(float)
-    return np.nan_to_num(values, posinf=0.0, neginf=0.0).clip(0, 65535).round().astype(np.uint16)
+    with _as_message(where):
+        if hasattr(message, "format"):
+            # compressed_depth_image_transport writes its quantisation before the PNG.
+            data = bytes(message.data)
+            begin = data.find(b"\x89PNG\r\n")
+            depth = read_one_channel(data[begin:], where) if begin >= 0 else None
+            if depth is None or depth.dtype != np.uint16 or "32FC1" in message.format:
+                raise InputError(
+                    f"{where}: depth as {shown(message.format)}; record 16UC1, raw or compressedDepth"
+                )
+            return depth
+        kinds = {"16UC1": (np.uint16, 1.0), "mono16": (np.uint16, 1.0), "32FC1": (np.float32, 1e3)}
+        if message.encoding not in kinds:
+            raise InputError(
+                f"{where}: encoding {shown(message.encoding)} is no depth; give 16UC1 (mm) or 32FC1 (m)"
+            )
+        kind, to_mm = kinds[message.encoding]
+        order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+        values = to_mm * _rows(message, 1, order, "depth image", where).astype(float)
+        return np.nan_to_num(values, posinf=0.0, neginf=0.0).clip(0, 65535).round().astype(np.uint16)
 
 
-def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
-    """Return the pixel data of an image message, the first `used` bytes of each of its h rows, without padding.
+def _rows(message: Any, channels: int, kind: np.dtype, what: str, where: str) -> ndarray:
+    """Return the values of an image message without the padding of its rows, shape (h, w·channels) and type `kind`.
 
-    Raises InputError, begun with `where` and the name `what` of the data, if bytes are missing.
+    Raises InputError, begun with `where` and the name `what` of the data, if the image is empty, too large, or if bytes
+    are missing.
     """
-    data = np.frombuffer(message.data, np.uint8)  # rclpy gives an array.array
-    if message.step < used or data.size < message.height * message.step:
-        raise InputError(f"{where}: {what} is cut short; record again")
-    rows = data[: message.height * message.step].reshape(message.height, message.step)
-    return np.ascontiguousarray(rows[:, :used])
+    width, height, step = (int(index(number)) for number in (message.width, message.height, message.step))
+    require_pixels((width, height), where)
+    data, used = (
+        np.frombuffer(message.data, np.uint8),
+        width * channels * kind.itemsize,
+    )  # of rclpy an array.array
+    if step < used or data.size < height * step:
+        raise InputError(f"{where}: a {what} of {width}x{height} is cut short; record again")
+    rows = data[: height * step].reshape(height, step)
+    return np.ascontiguousarray(rows[:, :used]).view(kind)

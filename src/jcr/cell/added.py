@@ -9,7 +9,7 @@ from pathlib import Path
 from jcr.capture.formats.capture_json import camera_entries, read_intrinsics, with_cameras
 from jcr.capture.images import read_image, size_of_all
 from jcr.errors import InputError
-from jcr.files import write_bytes, write_text
+from jcr.files import path_inside, read_bytes, write_bytes, write_text
 from jcr.records import Capture, CellCamera
 from jcr.records.capture_json import NAME
 from jcr.records.json_file import read_json
@@ -61,7 +61,8 @@ def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> None:
     """Add the camera to the run folder: copy its images and write its entry to the file of added cameras."""
     folder = run_folder / FOLDER
     for image in camera.images:
-        write_bytes(folder / image, ((camera.folder or capture.folder) / image).read_bytes())
+        copy = path_inside(folder, image, str(folder))
+        write_bytes(copy, read_bytes((camera.folder or capture.folder) / image))
     every = (*read_added_cameras(run_folder, capture), camera)
     entries = camera_entries(replace(capture, others=every))
     del entries[capture.camera_name]

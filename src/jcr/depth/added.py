@@ -37,7 +37,7 @@ def extend(
     A camera pose is the added image's `base_from_gripper` times `gripper_from_camera`, converted to the recon frame.
     The added images are the last rows; their `image_index` counts from `capture_size`, the number of images of the
     capture. Pixels get confidence 0 if a later added image sees through their points, or shows a surface in front of
-    them. Raises InputError for an added image with depth at less than 0.5 % of its pixels.
+    them. Raises InputError for an added image that sees no point, or has depth at less than 0.5 % of its pixels.
     """
     dense, old, new = reconstruction.dense, len(reconstruction.recon_from_camera), len(added)
     pinhole = dense.intrinsics
@@ -49,6 +49,12 @@ def extend(
     images = undistorted(added.folder, added.images, reconstruction.intrinsics, pinhole)
     colors = np.concatenate([dense.colors, images])
     tracks = _with_projections(reconstruction.tracks, cameras, old, pinhole)
+    for k, name in enumerate(added.images):
+        if not (tracks.image == old + k).any():
+            raise InputError(
+                f"{added.folder / name}: sees no point of the reconstruction at its gripper pose; correct the pose, or "
+                "take an image that shows what other images show"
+            )
     neighbours = []
     for others in choose_neighbours(tracks, cameras, old + new - 1):
         latest = others[others >= old][: NEIGHBOURS // 2]

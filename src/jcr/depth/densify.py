@@ -19,6 +19,8 @@ from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 RISE = 0.4
 """Greatest height of objects beside a board, as a share of the distance from the board to the cameras."""
+NO_PLANE = (0.0, 0.0, 1.0)
+"""Plane that is searched in an image with no point before its camera, in which no depth is found anyway."""
 MOST_THREADS = 16
 """Largest number of images that are matched at once; each takes about 400 bytes per pixel during the matching."""
 
@@ -111,7 +113,12 @@ def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> 
     """
     planes = np.empty((len(recon_from_camera), 2, 3))
     for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
-        x = apply(camera_from_recon, tracks.points_in_recon[tracks.point[tracks.image == i]])
+        x = _before_camera(apply(camera_from_recon, tracks.points_in_recon[tracks.point[tracks.image == i]]))
+        if len(x) == 0:  # of an image that shares no point with others, the whole scene is searched
+            x = _before_camera(apply(camera_from_recon, tracks.points_in_recon))
+        if len(x) == 0:
+            planes[i] = NO_PLANE
+            continue
         ray, inverse_depth = x / x[:, 2:], 1 / x[:, 2]
         slope, residual = np.zeros(3), inverse_depth
         for _ in range(20):
@@ -123,6 +130,11 @@ def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> 
         planes[i] = slope
         planes[i, :, 2] += low - slack, high + slack
     return planes
+
+
+def _before_camera(x_in_camera: Float[ndarray, "n 3"]) -> Float[ndarray, "k 3"]:
+    """Return those of n points that lie before the camera."""
+    return x_in_camera[x_in_camera[:, 2] > 0]
 
 
 def dense_pointmaps(

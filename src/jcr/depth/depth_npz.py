@@ -78,6 +78,8 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
         require_shapes(
             {"depth": (depth, shape), "relative_std": (std, shape), "confidence": (confidence, shape)}
         )
+        if (confidence < 0).any() or (std < 0).any() or (depth[confidence > 0] <= 0).any():
+            raise ValueError("a depth, its standard deviation or its confidence is negative")
         matched, filled = (np.unpackbits(file[k], count=int(np.prod(shape))) for k in ("matched", "filled"))
         if capture is None:
             colors = np.full((*shape, 3), GREY, np.uint8)

@@ -3,7 +3,7 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,11 +128,8 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
     `options.undistort` and `options.link_images` choose.
     """
     folder.mkdir()
-    names = [Path(image).name for image in views.images]
-    if len(set(names)) < len(names):
-        names = [image.replace("/", "_") for image in views.images]
+    names = _file_names(views.images, ".png" if options.undistort else None)
     if options.undistort:
-        names = [f"{Path(name).stem}.png" for name in names]
         pinhole = pinhole_inside(views.intrinsics, max(views.intrinsics.width, views.intrinsics.height))
         undistort = undistortion(views.intrinsics, pinhole)
         for image, name in zip(views.images, names, strict=True):
@@ -145,6 +142,24 @@ def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> t
         else:
             shutil.copyfile(source, folder / name)
     return names, views.intrinsics
+
+
+def _file_names(images: Sequence[str], suffix: str | None) -> list[str]:
+    """Return a file name for each image, different ones even without regard to case; `suffix` replaces the images' own.
+
+    It is the image's own file name, or if two would be equal, its path in the capture with _ for /, or a number.
+    """
+
+    def ending(name: str) -> str:
+        """Return the name with the suffix."""
+        return name if suffix is None else f"{Path(name).stem}{suffix}"
+
+    own = [ending(Path(image).name) for image in images]
+    paths = [ending(image.replace("/", "_")) for image in images]
+    numbered = [f"{k:04d}{suffix or Path(image).suffix}" for k, image in enumerate(images)]
+    return next(
+        names for names in (own, paths, numbered) if len({name.casefold() for name in names}) == len(names)
+    )
 
 
 @contextmanager

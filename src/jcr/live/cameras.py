@@ -116,7 +116,7 @@ def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Ca
         with _open_realsense(source.partition(":")[2], size) as camera:
             yield camera
         return
-    is_device = source.isdigit()
+    is_device = source.isdecimal()
     is_file = not is_device and "://" not in source
     if is_file and not Path(source).is_file():
         raise InputError(f"--camera {source}: no such video file; name a file, a device number or a stream")

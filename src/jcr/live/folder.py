@@ -13,17 +13,14 @@ from jcr.calibration.checks.capture import STILL as MOVED
 from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all
 from jcr.capture.notations import far_faults
-from jcr.capture.plain_files import contained
 from jcr.errors import InputError
-from jcr.files import remove_unfinished, write_bytes, write_text
+from jcr.files import IMAGES, capture_file, path_inside, remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture
 from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
 from jcr.records.json_file import validated_content
 
-IMAGES = "images"
-"""Subfolder of the colour images."""
 Channels = Literal["rgb", "bgr"]
 """Order of the colour channels of an image."""
 
@@ -52,7 +49,7 @@ class LiveFolder:
         given = {"intrinsics": intrinsics, "robot": robot}
         update = {key: value for key, value in given.items() if value is not None}
         self._content = content.model_copy(update=update)
-        files = {name: contained(folder, name, str(file)) for name in self.names}
+        files = {name: capture_file(folder, name, str(file)) for name in self.names}
         sizes = {name: read_image(path).shape[1::-1] for name, path in files.items()}
         self.size = size_of_all(sizes, str(file)) if sizes else None
         remove_unfinished(folder / IMAGES)
@@ -62,7 +59,7 @@ class LiveFolder:
         self._ever = {one.image: one for one in self.images}
         # The next number is above those of all image files, including files that capture.json does not name.
         files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
-        numbers = [int(match[1]) for name in files if (match := re.match(r"images/(\d+)\.", name))]
+        numbers = [int(match[1]) for name in files if (match := re.match(r"images/([0-9]{1,9})\.", name))]
         self._next_number = max(numbers, default=-1) + 1
 
     @property
@@ -118,9 +115,9 @@ class LiveFolder:
             raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
         self._capture_of(images, size)
         try:
-            write_bytes(self.folder / new.image, encode_png(pixels))
+            write_bytes(path_inside(self.folder, new.image, str(self.folder)), encode_png(pixels))
             if new.depth is not None and depth_mm is not None:
-                write_bytes(self.folder / new.depth, encode_png(depth_mm))
+                write_bytes(path_inside(self.folder, new.depth, str(self.folder)), encode_png(depth_mm))
             self._change(images)
         except OSError:
             self._delete(new)
@@ -197,7 +194,7 @@ class LiveFolder:
     def _delete(self, one: FrameEntry) -> None:
         """Delete the files of an image: colour and depth."""
         for file in filter(None, (one.image, one.depth)):
-            contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
+            path_inside(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
 
 def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[ndarray, "h w 3"]:

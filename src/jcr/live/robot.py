@@ -112,7 +112,7 @@ def states_of(source: str) -> States | None:
         return None
     if kind == "ur":
         host, _, number = address.rpartition(":") if ":" in address else (address, "", str(UR_PORT))
-        if not host or not number.isdigit() or not int(number) < 65536:
+        if not host or not number.isdecimal() or len(number) > 5 or int(number) > 65535:
             raise InputError(f"--poses {source}: no address; write HOST:PORT such as 192.168.0.2:{UR_PORT}")
         return lambda: ur_states(host, int(number))
     read = franka_states if kind == "franka" else xarm_states

@@ -16,6 +16,7 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float
@@ -134,7 +135,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         path, _, query = path.partition("?")
         server, session, state = self.server, self.server.session, self.server.session.state
-        name = path.removeprefix("image/")
+        name = unquote(path.removeprefix("image/"))
         if path == "":
             self._send(whole_page(session).encode(), HTML)
         elif path == "state":
@@ -151,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(status=204)
         elif path == "report.html" and (report := server.report) is not None:
             self._send(report.read_bytes(), HTML)
-        elif name != path and name in state.names:
+        elif path.startswith("image/") and name in state.names:
             self._send(image_card(session.folder.folder / name), "image/jpeg")
         else:
             self._send(status=404)

@@ -125,7 +125,7 @@ def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: 
         if name not in arrays:
             raise InputError(f"{source}: no array {name!r}; needed are {', '.join(shapes)}")
         array, axes = arrays[name], shape.split()
-        asked = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
+        asked = [int(axis) if axis.isdecimal() else sizes.get(axis) for axis in axes]
         fits = array.ndim == len(axes) and array.dtype.kind in "fiu"
         if not fits or any(size not in (None, own) for size, own in zip(asked, array.shape, strict=True)):
             raise InputError(

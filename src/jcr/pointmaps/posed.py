@@ -53,7 +53,7 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
 
     The residual is in px. The model u = fx · x/z + cx is linear in the unknowns, and residuals are weighted robustly
     (Geman-McClure). The residual is infinite where half of the points lie behind their camera, or fewer than 100 lie in
-    front; the intrinsics are then a guess. It is infinite, too, for a focal length that is not positive.
+    front, or for a focal length that is not positive; the intrinsics are then a guess.
     """
     confidence = maps.confidence
     height, width = confidence.shape[1:]
@@ -77,8 +77,9 @@ def fit_pinhole(maps: PosedPointmaps) -> tuple[Intrinsics, float]:
             center[axis] = mean_px - focal[axis] * mean_ray
         misfit = ray * focal + center - pixel
     (fx, fy), (cx, cy) = focal.tolist(), center.tolist()
-    error = float("inf") if min(fx, fy) <= 0 else float(np.median(np.linalg.norm(misfit, axis=1)))
-    return Intrinsics(fx, fy, cx, cy, width, height), error
+    if min(fx, fy) <= 0:
+        return guessed_intrinsics((width, height)), float("inf")
+    return Intrinsics(fx, fy, cx, cy, width, height), float(np.median(np.linalg.norm(misfit, axis=1)))
 
 
 def published_covariance(maps: PosedPointmaps) -> Float[ndarray, "r r"]:

@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, Field, PlainSerializer, computed_field, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, computed_field
 
+from jcr.errors import InputError
 from jcr.findings import Finding, remedy, unobservable
 from jcr.records.capture import Intrinsics
+from jcr.records.checked import require_fields
 from jcr.records.json_fields import (
     Covariance7,
     Matrix,
@@ -41,12 +43,14 @@ class ImageVerdict:
     """Whether the calibration uses the image."""
     reason: str | None
     """Reason why the image is not used; None if it is."""
-    translation_residual_mm: float | None = None
+    translation_residual_mm: Spread | None = None
     """Distance between reported and predicted gripper position (mm); None for an image that is not registered."""
-    rotation_residual_deg: float | None = None
+    rotation_residual_deg: Spread | None = None
     """Angle between reported and predicted gripper orientation (degrees); None for an image that is not registered."""
-    reprojection_px: float | None = None
+    reprojection_px: Spread | None = None
     """Median reprojection error (px); None for an image that was not adjusted."""
+
+    __post_init__ = require_fields
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,8 @@ class Excitation:
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise:
@@ -103,6 +109,13 @@ class RobotNoise:
     """Size (rad) of the systematic errors: of the joint offsets of a known arm, else of the gripper's rotation."""
     systematic_left: Annotated[tuple[Metres, Radians], Field(alias="systematic_left_mm_deg")] = (0.0, 0.0)
     """Systematic errors of the poses per axis (m, rad), without the part that the hand-eye transform absorbs."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the errors are finite and not negative."""
+        require_fields(self)
+        sizes = self.translation, self.rotation, self.systematic, *self.systematic_left, *(self.given or ())
+        if not all(np.isfinite(sizes)) or min(sizes) < 0:
+            raise InputError("RobotNoise: an error that is negative or not finite; give standard deviations")
 
     @property
     def together(self) -> tuple[float, float]:
@@ -125,6 +138,8 @@ class JointOffsets:
     prior_std: float
     """Standard deviation of a joint's offset in the prior (rad), the same for all joints."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
@@ -134,6 +149,8 @@ class Share:
     rotation_deg: Spread
     covariance: PartCovariance7
     """Covariance in COVARIANCE_ORDER; the sum over all causes is the covariance of the calibration."""
+
+    __post_init__ = require_fields
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
@@ -184,14 +201,16 @@ class Budget:
 class LeaveOneOut:
     """Mean leave-one-out error: difference of each reported gripper pose from its prediction by the other images."""
 
-    translation_mm: float
+    translation_mm: Spread
     """Mean distance between predicted and reported gripper position."""
-    rotation_deg: float
+    rotation_deg: Spread
     """Mean angle between predicted and reported gripper orientation."""
-    reprojection_px: float | None
+    reprojection_px: Spread | None
     """Median reprojection error with the predicted poses (px); None if the images were not adjusted."""
     how: str
     """Method of the prediction, in words."""
+
+    __post_init__ = require_fields
 
     @property
     def length_m(self) -> float:
@@ -225,6 +244,8 @@ class DepthCheck:
     features: int
     """Number of features that were compared."""
 
+    __post_init__ = require_fields
+
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
         """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
 
@@ -252,6 +273,8 @@ class PointUncertainty:
     rotation_95_deg: Spread
     """Bound on the orientation error at the point (degrees), including the rotation about the ray."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointUncertaintyOverImage(PointUncertainty):
@@ -273,6 +296,8 @@ class SceneUncertainty:
     """Standard deviation per axis of a point's remaining error, the deformation of the scene (m)."""
     within_95_m: Spread
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
+
+    __post_init__ = require_fields
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
         """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors.
@@ -299,6 +324,8 @@ class GivenIntrinsicsResult:
     differs_mm: Spread
     """Distance (mm) of one central point's positions by given and estimated intrinsics, each with its transform."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
@@ -311,6 +338,8 @@ class ModelError:
     expressed: Square
     """Matrix (q,e): parameters (camera.parameters) that best fit each polynomial at the points of the images."""
 
+    __post_init__ = require_fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointCovariance:
@@ -321,12 +350,11 @@ class JointCovariance:
     order: tuple[str, ...]
     """Names of the rows: COVARIANCE_ORDER, then fx, fy, cx, cy and the distortion."""
 
-    @model_validator(mode="after")
-    def _is_square(self) -> "JointCovariance":
-        """Raise ValueError unless the covariance has a row and a column for each name in `order`."""
+    def __post_init__(self) -> None:
+        """Raise InputError unless the covariance has a row and a column for each name in `order`."""
+        require_fields(self)
         if self.covariance.shape != 2 * (len(self.order),):
-            raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
-        return self
+            raise InputError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -423,10 +451,12 @@ class Uncertainty:
 class PaperResiduals:
     """Mean residuals of AX = XB, where A and B are gripper and camera motions between consecutive used images."""
 
-    translation: float
+    translation: Spread
     """Mean translation residual δ_t (m)."""
-    rotation: float
+    rotation: Spread
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
+
+    __post_init__ = require_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -441,6 +471,8 @@ class LengthCheck:
     """Standard deviation of the stated length in percent, without that of the robot."""
     used: bool = False
     """Whether the length is a prior of the scale; none is if two lengths contradict each other."""
+
+    __post_init__ = require_fields
 
     @property
     def off(self) -> float:
@@ -460,11 +492,13 @@ class Attempt:
     backend: str
     images_registered: int | None
     """Number of registered images; None if the back end failed."""
-    reconstruct_s: float
+    reconstruct_s: Spread
     """Time of the reconstruction (s)."""
-    calibrate_s: float
+    calibrate_s: Spread
     """Time of the calibration (s); 0 if the back end failed."""
     why_not: str | None
     """Reason why the run does not keep this attempt; None if it does."""
     features: str | None = None
     """Features that were matched between images; None for back ends without a choice of features."""
+
+    __post_init__ = require_fields

@@ -8,8 +8,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 
+from jcr.errors import InputError
+from jcr.records.checked import require_counts, require_fields, require_finite, require_rows
 from jcr.records.json_fields import Positive, Spread
 
 DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]
@@ -54,13 +56,12 @@ class Intrinsics:
         values: dict[str, Any] = vars(self) | {"std": None if std is None else tuple(std.tolist())}
         return IntrinsicsAndStd(**values)
 
-    @model_validator(mode="after")
-    def _has_coefficients_of_model(self) -> "Intrinsics":
-        """Raise ValueError unless there are as many distortion coefficients as the model has."""
+    def __post_init__(self) -> None:
+        """Raise InputError unless the numbers are possible, with as many distortion coefficients as the model has."""
+        require_fields(self)
         names = COEFFICIENTS[self.model]
         if len(self.distortion) != len(names):
-            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
-        return self
+            raise InputError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
 
 
 @dataclass(frozen=True)
@@ -70,15 +71,14 @@ class IntrinsicsAndStd(Intrinsics):
     std: tuple[Spread, ...] | None = None
     """Standard deviations of fx, fy, cx, cy (px) and the distortion; None where the intrinsics were not estimated."""
 
-    @model_validator(mode="after")
-    def _has_std_of_each(self) -> "IntrinsicsAndStd":
-        """Raise ValueError unless each parameter has a standard deviation, or none has."""
+    def __post_init__(self) -> None:
+        """Raise InputError as for Intrinsics, and unless each parameter or none has a standard deviation."""
+        super().__post_init__()
         if self.std is not None and len(self.std) != 4 + len(self.distortion):
-            raise ValueError(
+            raise InputError(
                 f"{len(self.std)} standard deviations, but a {self.model} model has "
                 f"{4 + len(self.distortion)} parameters"
             )
-        return self
 
 
 Mount = Literal["gripper", "base"]
@@ -93,7 +93,7 @@ class CellCamera:
     mount: Mount
     images: tuple[str, ...]
     """Paths relative to `folder`."""
-    image_size: tuple[int, int]
+    image_size: tuple[Pixels, Pixels]
     """Width and height (px)."""
     intrinsics: Intrinsics | None = None
     """Given intrinsics; None: unknown, to be estimated."""
@@ -107,6 +107,14 @@ class CellCamera:
     """Name of another arm that carries the camera; None: the arm of the capture, or a fixed camera."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None
     """Gripper poses of the other arm in its own base frame, one for each image; None without another arm."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless there is a row of each array for each image."""
+        require_fields(self)
+        require_counts(
+            "CellCamera", len(self.images), frame=self.frame, base_from_gripper=self.base_from_gripper
+        )
+        require_finite("CellCamera", base_from_gripper=self.base_from_gripper)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +149,7 @@ class Capture:
     images: tuple[str, ...]
     """Paths relative to `folder`, which are also the names of the images in all later records."""
     base_from_gripper: Float[ndarray, "n 4 4"]
-    image_size: tuple[int, int]
+    image_size: tuple[Pixels, Pixels]
     """Width and height of all images (px)."""
     intrinsics: Intrinsics | None = None
     """Given intrinsics; None: unknown, to be estimated."""
@@ -174,6 +182,19 @@ class Capture:
     Until a reading is decided, `base_from_gripper` is NaN."""
     untaken: tuple[tuple[Reading, Float[ndarray, "n 4 4"]], ...] = ()
     """Readings of the same numbers that a name or an option ruled out, for the diagnosis of a rejected calibration."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless there is a finite gripper pose, and a row of each other array, for each image."""
+        require_fields(self)
+        require_counts(
+            "Capture", len(self.images), base_from_gripper=self.base_from_gripper, depths=self.depths
+        )
+        # Poses whose reading is not decided yet are NaN.
+        poses = {} if self.candidates else {"base_from_gripper": self.base_from_gripper}
+        require_finite("Capture", **poses, joints=self.joints)
+        for camera in self.others:
+            if camera.frame is not None:
+                require_rows("Capture", f"frame of camera {camera.name}", camera.frame, len(self.images))
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -209,6 +230,13 @@ class PosePairs:
     backend: str = "poses given"
     is_inverted: bool = False
     """Whether the gripper poses were inverted on reading, as `--pose-inverted` asks."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless there is a name for each pair of finite poses."""
+        require_fields(self)
+        require_counts("PosePairs", len(self.images), base_from_gripper=self.base_from_gripper)
+        poses = {"base_from_gripper": self.base_from_gripper, "recon_from_camera": self.recon_from_camera}
+        require_finite("PosePairs", **poses)
 
     def __len__(self) -> int:
         """Return the number of pairs."""

@@ -6,7 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.errors import InputError
 from jcr.records.capture import Intrinsics
+from jcr.records.checked import require_fields, require_finite, require_rows
+from jcr.records.json_fields import Positive
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,15 @@ class Body:
     x_in_body: Float[ndarray, "_ 3"]
     """Corners as printed, with z = 0, in metres; in units of the side if the side is unknown."""
 
+    def __post_init__(self) -> None:
+        """Raise InputError unless there is a finite corner for each point."""
+        require_fields(self)
+        require_finite("Body", x_in_body=self.x_in_body)
+        if len(self.point) != len(self.x_in_body):
+            raise InputError(
+                f"Body: {len(self.point)} points for {len(self.x_in_body)} corners; give one each"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Boards:
@@ -27,9 +39,9 @@ class Boards:
 
     spec: str
     """Value of the option `--board`."""
-    side: float
+    side: Positive
     """Side of a square or a tag (m); 1 if it is unknown."""
-    size_std: float | None
+    size_std: Positive | None
     """Relative standard deviation of the stated size, common to all bodies; None: the size is unknown."""
     bodies: tuple[Body, ...]
     """Bodies that two or more images show; empty if there are none."""
@@ -40,6 +52,10 @@ class Boards:
     """Value of `--board` that fits the images if no body was found; None if no other board is visible."""
     is_stretched: bool = False
     """Whether a calibration found the print stretched, so that its stretch and size have no prior; not stored."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the numbers are possible."""
+        require_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +77,16 @@ class Tracks:
     """Relative standard deviation of each observation's coordinates, up to a common factor; None: equal for all."""
     boards: Boards | None = None
     """Boards or tags whose corners are among the points; None without the option `--board`."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless each observation is finite and of a point that is there."""
+        require_fields(self)
+        require_finite("Tracks", x_px=self.x_px, points_in_recon=self.points_in_recon)
+        require_rows("Tracks", "point", self.point, len(self.points_in_recon))
+        if self.std_px is not None and not (self.std_px > 0).all():
+            raise InputError("Tracks: std_px has a standard deviation that is not positive")
+        for body in () if self.boards is None else self.boards.bodies:
+            require_rows("Tracks", f"point of body {body.number}", body.point, len(self.points_in_recon))
 
     @property
     def on_board(self) -> Bool[ndarray, " p"]:
@@ -107,6 +133,19 @@ class Pointmaps:
     depth_std: Float[ndarray, "m h w"] | None = None
     """Standard deviation of each depth z (recon units), 0 without a depth; None: unknown."""
 
+    def __post_init__(self) -> None:
+        """Raise InputError unless all arrays are on the pixel grid of the intrinsics, with confidences of 0 or more."""
+        require_fields(self)
+        if self.confidence.shape[1:] != (self.intrinsics.height, self.intrinsics.width):
+            size = f"{self.intrinsics.width}x{self.intrinsics.height}"
+            raise InputError(
+                f"Pointmaps: confidence of shape {self.confidence.shape}, intrinsics of {size} pixels"
+            )
+        for name in ("confidence", "depth_std"):
+            array = getattr(self, name)
+            if array is not None and not (array >= 0).all():
+                raise InputError(f"Pointmaps: {name} has values below 0 or NaN; set them to 0")
+
     @property
     def is_predicted(self) -> bool:
         """Whether the network of the back end predicted the pointmaps; otherwise the stage densify estimated them."""
@@ -140,7 +179,7 @@ class Reconstruction:
     """Pointmaps, predicted by the back end's network or estimated by the stage densify; None before that stage."""
     is_metric: bool = False
     """Whether the unit is nominally the metre."""
-    metric_std: float | None = None
+    metric_std: Positive | None = None
     """Relative standard deviation of a metric unit; None: unknown, or the unit is arbitrary."""
     notes: tuple[str, ...] = ()
     """Remarks of the back end, for example on images that were not registered."""
@@ -152,6 +191,24 @@ class Reconstruction:
     predicted_focal: tuple[float, float] | None = None
     """Focal length that a network predicted (px of the original image), and its relative standard deviation; None: the
     images determine the focal length, or nothing was predicted."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the cameras are finite, their rows ascend, and the tracks are of these images."""
+        require_fields(self)
+        m = len(self.image_index)
+        require_finite("Reconstruction", recon_from_camera=self.recon_from_camera)
+        if len(self.recon_from_camera) != m or (
+            self.pointmaps is not None and len(self.pointmaps.confidence) != m
+        ):
+            raise InputError(
+                f"Reconstruction: cameras or pointmaps are not those of {m} images; give one each"
+            )
+        if m and (self.image_index[0] < 0 or (np.diff(self.image_index) <= 0).any()):
+            raise InputError("Reconstruction: image_index does not ascend from 0 or more; sort the images")
+        require_rows("Reconstruction", "tracks.image", self.tracks.image, m)
+        if self.tracks.boards is not None:
+            elsewhere = np.array(self.tracks.boards.elsewhere, int)
+            require_rows("Reconstruction", "tracks.boards.elsewhere", elsewhere, m)
 
     @property
     def dense(self) -> Pointmaps:
@@ -181,6 +238,14 @@ class PointCloud:
     """Standard deviation of each point's depth in its image (m); None: unknown."""
     clears: Bool[ndarray, " n"] | None = None
     """Mask of points whose ray from the camera counts as free space; None: all points but those of reason PRIOR."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the numbers are finite, and labels and images are within their tables."""
+        require_fields(self)
+        numbers = "points_in_base", "confidence", "margin", "depth_std", "camera_centers_in_base"
+        require_finite("PointCloud", **{name: getattr(self, name) for name in numbers})
+        require_rows("PointCloud", "label", self.label, len(self.label_names))
+        require_rows("PointCloud", "image", self.image, len(self.camera_centers_in_base))
 
     @property
     def cleared(self) -> Bool[ndarray, " n"]:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
 from jcr.scene.fields import Field, Fields, Lattice
@@ -34,13 +33,9 @@ def build_scene(
 ) -> SceneMap:
     """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
 
-    Raises InputError if fewer than 100 points lie in the workspace, or a number is not finite. `device` is a torch
-    device, such as "cuda".
+    Raises InputError if fewer than 100 points lie in the workspace. `device` is a torch device, such as "cuda".
     """
     options = options or MapOptions()
-    for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
-        if not np.isfinite(numbers).all():
-            raise InputError("the cloud holds numbers that are not finite; remove those points")
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell

@@ -27,6 +27,8 @@ _AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
 """Type in a PointCloud of each type in the file."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 """PLY's name of each type in the file."""
+_LAYOUT = "format binary_little_endian 1.0"
+"""Line of the header that states the layout of the points."""
 _FIRST = "comment jcr cloud in the base frame, metres"
 """Line of the header that identifies a cloud of jcr."""
 
@@ -144,7 +146,7 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
     centers = cloud.camera_centers_in_base.tolist()
     header = [
         "ply",
-        "format binary_little_endian 1.0",
+        _LAYOUT,
         _FIRST,
         *(f"comment {name} {text}" for name, text in (notes or {}).items()),
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
@@ -159,25 +161,34 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 def read_cloud(path: Path) -> PointCloud:
     """Read a PLY file of `write_cloud`; raise InputError for any other file."""
     try:
-        header, _, body = read_bytes(path).partition(b"end_header\n")
+        header, _, body = read_bytes(path).partition(b"\nend_header\n")  # a label may be called end_header
         lines = header.decode().splitlines()
         names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
         vertices = np.frombuffer(body, [(name, f"<{_COLUMNS[name]}") for name in names])
         columns = {name: vertices[name].astype(_AS_READ[_COLUMNS[name]]) for name in names}
-        is_whole = _FIRST in lines and len(names) >= len(_COLUMNS) - 2
-        if not is_whole or not all(np.isfinite(column).all() for column in columns.values()):
-            raise ValueError
+        own = [line for line in lines if not line.startswith("comment")]
+        elements = [
+            f"element vertex {len(vertices)}",
+            *(f"property {_PLY_TYPES[_COLUMNS[name]]} {name}" for name in names),
+        ]
+        if own != ["ply", _LAYOUT, *elements] or _FIRST not in lines or len(names) < len(_COLUMNS) - 2:
+            raise ValueError  # cut between two points, or of another writer
         words = [line.split(maxsplit=3) for line in lines]
-        centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
+        cameras, labels = (
+            [word[2:] for word in words if word[:2] == ["comment", of]] for of in ("camera", "label")
+        )
+        if any([int(number) for number, _ in one] != list(range(len(one))) for one in (cameras, labels)):
+            raise ValueError
+        centers = [[float(x) for x in text.split()] for _, text in cameras]
         return PointCloud(
             points_in_base=np.stack([columns.pop(name) for name in "xyz"], 1),
             color=np.stack([columns.pop(name) for name in ("red", "green", "blue")], 1),
             camera_centers_in_base=np.array(centers, np.float64).reshape(-1, 3),
-            label_names=tuple(word[3] for word in words if word[:2] == ["comment", "label"]),
+            label_names=tuple(name for _, name in labels),
             **columns,
         )
-    except InputError:  # read_bytes refuses the path, such as a pipe
-        raise
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
     except (ValueError, IndexError):

@@ -28,7 +28,7 @@ FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 
 Unknown = Literal["occupied", "free", "report"]
 """Treatment of unseen space in a query: as solid, as empty, or reported as unknown."""
-FORMAT = "jcr.map/1"
+FORMAT = "jcr.map/2"
 """Format of the file that `SceneMap.save` writes and map_file.py reads."""
 
 
@@ -284,7 +284,7 @@ class SceneMap:
     def save(self, path: Path) -> None:
         """Write the map to a safetensors file; after an error there is no incomplete file."""
         about = {
-            "fields": [field.about for field in self.fields.of],
+            "networks": [field.about for field in self.fields.of],
             "lattices": [(lattice.cell, lattice.shape) for lattice in self.fields.lattices],
             "label_names": self.label_names,
             "cell": self.seen.cell,
@@ -293,13 +293,19 @@ class SceneMap:
         tensors = {f"fields.{name}": value for name, value in self.fields.state_dict().items()}
         tensors |= {"seen": self.seen.state, "lower": self.seen.lower}
         tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
-        metadata = {"format": FORMAT, "about": json.dumps(about), "digest": digest(tensors)}
-        write_bytes(path, save(tensors, metadata=metadata))
+        text = json.dumps(about)
+        write_bytes(
+            path, save(tensors, metadata={"format": FORMAT, "about": text, "digest": digest(tensors, text)})
+        )
 
 
-def digest(tensors: dict[str, Tensor]) -> str:
-    """Return a checksum (hexadecimal) over the names and values of all tensors of a map, to detect a damaged file."""
-    total = blake2b(digest_size=16)
+def digest(tensors: dict[str, Tensor], about: str) -> str:
+    """Return a checksum (hexadecimal) over all that a map's file holds, to detect a damaged file.
+
+    It covers the names, types, shapes and values of the tensors and the text `about`, with cell sizes and label names.
+    """
+    total = blake2b(f"{len(about)} {about}".encode(), digest_size=16)
     for name in sorted(tensors):
-        total.update(name.encode() + tensors[name].numpy().tobytes())
+        tensor = tensors[name]
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode() + tensor.numpy().tobytes())
     return total.hexdigest()

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from jcr.compiled import compiled
+from jcr.errors import InputError
 
 CROSSED, HIT = 1, 2
 """Bits of a cell's state: crossed by rays, hit by a ray's end; 0 = unseen."""
@@ -38,6 +39,19 @@ class SeenGrid:
     """Side (m) of a cell."""
     state: UInt8[Tensor, "nz ny nx"]
     """Bits CROSSED and HIT of each cell; 0 = unseen."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the grid has a place, cells of a size, and known states."""
+        if not (np.isfinite(self.cell) and self.cell > 0):
+            raise InputError(f"grid of seen space: cells of {self.cell:g} m; give a length above 0")
+        if self.lower.shape != (3,) or self.lower.dtype != torch.float32 or not self.lower.isfinite().all():
+            raise InputError("grid of seen space: no lower corner; give three finite numbers (m, float32)")
+        if self.state.dtype != torch.uint8 or self.state.ndim != 3 or 0 in self.state.shape:
+            raise InputError(
+                f"grid of seen space: states of shape {tuple(self.state.shape)}; give cells by z, y, x"
+            )
+        if int(self.state.max()) > (CROSSED | HIT):
+            raise InputError("grid of seen space: a state that is neither crossed nor hit")
 
     @property
     def size(self) -> Float[Tensor, "3"]:

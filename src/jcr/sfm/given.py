@@ -1,6 +1,6 @@
 """The back end `given`: camera poses of a COLMAP model, with its own points or with triangulated features."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,22 +27,15 @@ def reconstruct_given(
 ) -> Reconstruction:
     """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
-    Images are identified by their names. The points are those of the model, or with fewer than MIN_POINTS are
-    triangulated from SIFT matches. Raises InputError when the model contains fewer than three of the images,
-    RejectedError when too few points can be triangulated.
+    Images are identified by their names, with folders where the file name alone is ambiguous. The points are those of
+    the model, or with fewer than MIN_POINTS are triangulated from SIFT matches. Raises InputError when the model
+    contains fewer than three of the images, RejectedError when too few points can be triangulated.
     """
     report = progress or silent
     model = read_model(cameras)
     names = {model.image(image_id).name: image_id for image_id in sorted(model.reg_image_ids())}
-    # An image's name with folders matches the end of its path; otherwise the file name alone must match.
-    by_path = {Path(name).parts: image_id for name, image_id in names.items()}
-    by_file = {Path(name).name: image_id for name, image_id in names.items()}
-    known, ids = list[int](), list[int]()
-    for k, parts in enumerate(Path(image).parts for image in capture.images):
-        ends = (by_path[parts[j:]] for j in range(len(parts)) if parts[j:] in by_path)
-        if (image_id := next(ends, by_file.get(parts[-1]))) is not None:
-            known.append(k)
-            ids.append(image_id)
+    found = _images_of(names, capture.images, str(cameras))
+    known, ids = list(found), list(found.values())
     if len(known) < 3:
         raise InputError(f"{cameras}: knows {len(known)} of the capture's images; at least 3 are needed")
     recon_from_camera = poses_of(model, [image_id - 1 for image_id in ids])
@@ -69,6 +62,40 @@ def reconstruct_given(
         backend="given",
         notes=notes,
     )
+
+
+def _images_of(names: Mapping[str, int], images: Sequence[str], where: str) -> dict[int, int]:
+    """Return the id of the model's image for each image of the capture that the model has, by index in the capture.
+
+    `names` are the ids of the model's images by name. The longest name that is the end of an image's path is its own;
+    otherwise an image and a name with the same file name belong together. Raises InputError, begun with `where`, if
+    a name fits several images, or an image several names.
+    """
+    by_path = {Path(name).parts: name for name in names}
+    if len(by_path) < len(names):
+        raise InputError(f"{where}: two of its images have one path; name them differently")
+    chosen = dict[int, str]()
+    for k, parts in enumerate(Path(image).parts for image in images):
+        if name := next((by_path[parts[j:]] for j in range(len(parts)) if parts[j:] in by_path), None):
+            chosen[k] = name
+    by_file = dict[str, list[str]]()
+    for name in names.keys() - set(chosen.values()):
+        by_file.setdefault(Path(name).name, []).append(name)
+    for k in range(len(images)):
+        like = sorted(by_file.get(Path(images[k]).name, ()) if k not in chosen else ())
+        if len(like) > 1:
+            raise InputError(
+                f"{where}: {like[0]} and {like[1]} could both be {images[k]}; name them by their folders"
+            )
+        if like:
+            chosen[k] = like[0]
+    owners = dict[str, int]()
+    for k, name in sorted(chosen.items()):
+        if (owner := owners.setdefault(name, k)) != k:
+            raise InputError(
+                f"{where}: {name} could be {images[owner]} or {images[k]}; name them by their folders"
+            )
+    return {k: names[name] for k, name in sorted(chosen.items())}
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:

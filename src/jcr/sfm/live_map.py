@@ -1,9 +1,7 @@
 """Map of a capture that is being taken: new images are matched, and COLMAP's mapper continues the last map."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
-import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 from numpy import ndarray
@@ -96,5 +94,4 @@ class LiveMap:
         if self._model is None or not rows:
             return None
         intrinsics = intrinsics_of(self._model.camera(1), self._all_intrinsics[0], self._known)
-        made = reconstruction_of(self._model, rows, intrinsics)
-        return replace(made, image_index=np.array([self._places[row] for row in rows]))
+        return reconstruction_of(self._model, rows, intrinsics, [self._places[row] for row in rows])

@@ -109,14 +109,18 @@ def poses_of(model: pycolmap.Reconstruction, rows: Sequence[int]) -> Float[ndarr
 
 
 def reconstruction_of(
-    model: pycolmap.Reconstruction, rows: Sequence[int], intrinsics: Intrinsics
+    model: pycolmap.Reconstruction,
+    rows: Sequence[int],
+    intrinsics: Intrinsics,
+    image_index: Sequence[int] | None = None,
 ) -> Reconstruction:
     """Return the cameras and tracks of the model's images `rows` as a reconstruction with these intrinsics.
 
-    `rows` are indices of images of the capture; COLMAP's id of an image is its row + 1. All must be registered.
+    COLMAP's id of an image is its row + 1. All must be registered. `image_index` are the images' rows of the capture,
+    ascending; None: `rows`.
     """
     return Reconstruction(
-        image_index=np.array(rows),
+        image_index=np.array(rows if image_index is None else image_index),
         recon_from_camera=poses_of(model, rows),
         intrinsics=intrinsics,
         tracks=tracks_of(model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height)),

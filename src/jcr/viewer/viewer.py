@@ -148,9 +148,9 @@ class Viewer:
         self.tracks_in_base = base_from_recon(self.reconstruction.tracks.points_in_recon)
         server.scene.set_up_direction("+z")
         headline = head(self.calibration)["verdict"]
-        lines = [f"**{headline['verdict']}:** {headline['reason']}."]
-        lines += [f"No map yet: make one with `jcr map {run.out}`."] * (self.scene is None)
-        server.gui.add_markdown("\n\n".join(lines))
+        lines = [(f"{headline['verdict']}:", f"{headline['reason']}.")]
+        lines += [("", f"No map yet: make one with jcr map {run.out}")] * (self.scene is None)
+        server.gui.add_html(_lines(*lines))
         report("view", 0.1)
         self._add_capture()
         self.robot = None
@@ -211,7 +211,7 @@ class Viewer:
             server.scene.add_frame(f"/grippers/{k}", axes_length=0.03, axes_radius=0.001, **place)
         with gui.add_folder("Capture", expand_by_default=False):
             self.image = gui.add_slider("image", 0, len(self.calibration.images) - 1, 1, 0)
-            self._about_image = gui.add_markdown("")
+            self._about_image = gui.add_html("")
         self.image.on_update(lambda _: self.choose_image())
 
     def _add_points(self) -> None:
@@ -226,7 +226,7 @@ class Viewer:
         for control in (self.shown, self.by_label, self.show_tracks):
             control.on_update(lambda _: self.show_points())
         with gui.add_folder("Click a point", expand_by_default=False):
-            self.clicked = gui.add_markdown("Click a point to see its values.")
+            self.clicked = gui.add_html(_lines(("", "Click a point to see its values.")))
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
 
         @self.server.scene.on_click()
@@ -248,7 +248,7 @@ class Viewer:
             self.slice_of = gui.add_dropdown("slice", ("none", *SLICE_LEGENDS), initial_value="none")
             bottom, top = float(low[2].round(3)), float(high[2].round(3))
             self.slice_at = gui.add_slider("height (m)", bottom, top, 0.005, round(table_m + 0.02, 3))
-            self._slice_legend = gui.add_markdown("")
+            self._slice_legend = gui.add_html("")
         pitch = float(np.prod(high - low) / UNKNOWN_CELLS) ** (1 / 3)
         axes = [np.arange(a + pitch / 2, b, pitch) for a, b in zip(low, high, strict=True)]
         x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -262,7 +262,7 @@ class Viewer:
         self._slice = scene.add_image("/slice", empty, *size, wxyz=turned, visible=False)
         with gui.add_folder("Sphere to drag", expand_by_default=False):
             self.radius = gui.add_slider("radius (mm)", 5.0, 150.0, 5.0, 30.0)
-            self.answer = gui.add_markdown("")
+            self.answer = gui.add_html("")
         at = np.array([*_middle(self._solid)[:2], table_m + 0.15])
         self.gizmo = scene.add_transform_controls("/sphere", scale=0.12, disable_rotations=True, position=at)
         self.ball = scene.add_icosphere("/sphere/ball", 0.03, FREE, opacity=0.75)
@@ -278,8 +278,8 @@ class Viewer:
             row = self.image.value
             image = self.calibration.images[row]
             state = "used" if image.used else f"rejected: {image.reason}"
-            parts = filter(None, (f"**{image.image}**", state, image_numbers(image)))
-            self._about_image.content = " · ".join(parts)
+            about = " · ".join(filter(None, (state, image_numbers(image))))
+            self._about_image.content = _lines((image.image, about))
             for own, frustum in zip(self.image_index.tolist(), self.frusta, strict=True):
                 used = self.calibration.images[own].used
                 frustum.color = CHOSEN if own == row else CAMERA if used else REJECTED
@@ -329,7 +329,8 @@ class Viewer:
         assert self.scene is not None  # the control exists only with a map
         with self._lock:
             of, height = self.slice_of.value, self.slice_at.value
-            self._slice.visible, self._slice_legend.content = of != "none", SLICE_LEGENDS.get(of, "")
+            self._slice.visible = of != "none"
+            self._slice_legend.content = _lines(("", SLICE_LEGENDS.get(of, "")))
             if of == "none":
                 return
             low, high = self.scene.box
@@ -363,10 +364,12 @@ class Viewer:
             where = "outside of the workspace" if np.isnan(distance) else where
             seen = "unseen space" if at.unknown[0] else "seen space"
             verdict = "collides" if hit else "free"
-            self.answer.content = f"**{verdict}** at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}"
+            self.answer.content = _lines(
+                (verdict, f"at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}")
+            )
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
-        """Show the values of the map and the nearest measured point where a click hits a drawn point; return the text.
+        """Show the values of the map and the nearest measured point where a click hits a drawn point; return the HTML.
 
         `origin_in_base` (m) is the origin of the click's ray, `direction` its unit vector in the base frame. The point
         nearest to the origin within CLICK_RAD of the ray is hit. Without such a point, the text says so.
@@ -377,7 +380,7 @@ class Viewer:
             near = np.flatnonzero((along > 0.02) & (aside < np.maximum(CLICK_RAD * along, POINT_M / 2)))
             self._mark.visible = len(near) > 0
             if len(near) == 0:
-                self.clicked.content = "No point there."
+                self.clicked.content = _lines(("", "No point there."))
                 return self.clicked.content
             self._mark.position = point = self.points[near[along[near].argmin()]]
             rows = [("x, y, z (m)", ", ".join(f"{value:.4f}" for value in point))]
@@ -394,9 +397,16 @@ class Viewer:
                 rows.append(("measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}"))
                 if np.isfinite(cloud.margin[nearest]):
                     rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
-            table = "".join(f"\n| {name} | {value} |" for name, value in rows)
-            self.clicked.content = "| | |\n|---|---|" + table
+            self.clicked.content = render("values.html", {"rows": rows}, "jcr.viewer")
             return self.clicked.content
+
+
+def _lines(*lines: tuple[str, str]) -> str:
+    """Return the HTML of lines of text, each with its strong beginning (may be empty) and the rest.
+
+    viser shows HTML in the texts that it is given, also in Markdown; names of files and labels must stay text.
+    """
+    return render("lines.html", {"lines": lines}, "jcr.viewer")
 
 
 def _middle(points: Float[ndarray, "n 3"]) -> Value:

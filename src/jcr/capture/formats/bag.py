@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from jcr.capture.pose_track import Stamps, TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
-from jcr.errors import InputError
+from jcr.errors import LONGEST_SHOWN, InputError
 from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
@@ -24,6 +25,8 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SUFFIXES = (".bag", ".mcap", ".db3")
+LATEST_NS = 2**62
+"""Largest time stamp (ns): in the year 2116, far enough from the largest int64 for differences of two."""
 
 
 def recognises(path: Path) -> bool:
@@ -97,14 +100,16 @@ class _Bag:
                     self.tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
                 elif kind == JOINTS:
                     for name, value in zip(message.name, message.position, strict=False):
+                        if not isinstance(name, str):
+                            raise TypeError("a joint whose name is no text")
                         self.joints.setdefault(name, {}).setdefault(_stamp(message, at), float(value))
                 elif kind == INFO:
                     self.camera_info = self.camera_info or message
                 else:
                     stamps.append(_stamp(message, at))
                     recorded.append(at)
-            except AttributeError as error:
-                text = f"its {kind} is not the one of ROS ({error}); record the standard message"
+            except (AttributeError, TypeError, ValueError, OverflowError) as error:
+                text = f"its {kind} is not the one of ROS ({str(error)[:LONGEST_SHOWN]}); record the standard message"
                 raise InputError(f"{path}: {text}") from None
             report("frames", 0.1 * (at - reader.start_time) / span)
         if not stamps:
@@ -127,7 +132,7 @@ class _Bag:
             raise InputError(f"{self.path}: damaged ({error}); repair it with its recorder") from None
 
     def pictures(self, rows: Int[ndarray, " k"]) -> Iterator[Picture]:
-        """Yield the row, image (encoded bytes or RGB pixels) and file ending for each of k rows.
+        """Yield the row, image (encoded bytes, RGB pixels, or an error) and file ending for each of k rows.
 
         A row is the index of an image of the bag in the order of time stamps. Images that are not found are left out.
         """
@@ -135,7 +140,10 @@ class _Bag:
             at = int(self.log_ns[row])
             for _, _, message in self.messages(self.images, start=at, stop=at + 1):
                 if _stamp(message, at) == self.stamp_ns[row]:
-                    yield row, *image_of(message, f"{self.path}: {self.topic}")
+                    try:
+                        yield row, *image_of(message, f"{self.path}: {self.topic}")
+                    except InputError as error:
+                        yield row, error, ""
                     break
 
     def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
@@ -205,6 +213,12 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
 
 
 def _stamp(message: Any, log_ns: int) -> int:
-    """Return the time stamp (ns) in the header of a ROS message; `log_ns`, the time of recording, if the stamp is 0."""
+    """Return the time stamp (ns) in the header of a ROS message; `log_ns`, the time of recording, if the stamp is 0.
+
+    Raises TypeError or OverflowError for a stamp that is none.
+    """
     stamp = message.header.stamp
-    return stamp.sec * 10**9 + stamp.nanosec or log_ns
+    # A text of a bag with its own definitions would be repeated a billion times.
+    if abs(found := index(stamp.sec) * 10**9 + index(stamp.nanosec)) > LATEST_NS:
+        raise OverflowError(f"a time stamp of {found} ns")
+    return found or log_ns

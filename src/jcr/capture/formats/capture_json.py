@@ -11,10 +11,9 @@ from pydantic import TypeAdapter
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained
 from jcr.errors import InputError, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
-from jcr.files import write_new
+from jcr.files import capture_file, path_inside, read_bytes, write_new
 from jcr.records import Capture, CellCamera
 from jcr.records.capture_json import (
     CameraEntries,
@@ -172,7 +171,7 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
     images = [image for image in listed if image is not None]
     require_frames(len(images), where, 1)
     for image in images:
-        contained(capture.folder, image, where)
+        capture_file(capture.folder, image, where)
     if len(set(images)) < len(images) or set(images) & set(capture.images):
         raise InputError(f"{where}: an image is named twice, or is one of the frames' own")
     size = size_of_all({name: read_image(capture.folder / name).shape[1::-1] for name in images}, where)
@@ -254,7 +253,9 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
     urdf = capture.urdf
     if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
-        write_new(folder / URDF, urdf.read_bytes())  # so that the folder contains the whole capture
+        write_new(
+            path_inside(folder, URDF, str(folder)), read_bytes(urdf)
+        )  # so that the folder contains the whole capture
     optional = {
         "reading": capture.reading,
         "robot": capture.robot,
@@ -283,14 +284,18 @@ def kept(capture: Capture, folder: Path) -> Capture:
     if capture.source is None:
         return capture
     others = (name for camera in capture.others for name in camera.images)
-    for name in filter(None, (*capture.images, *(capture.depths or ()), *others)):
-        write_new(folder / name, (capture.folder / name).read_bytes())
+    names = [*filter(None, (*capture.images, *(capture.depths or ()), *others))]
+    where = str(capture.source)
+    sources = [capture_file(capture.folder, name, where) for name in names]
+    copies = [path_inside(folder, name, where) for name in names]
+    for source, copy in zip(sources, copies, strict=True):  # after every name was checked
+        write_new(copy, read_bytes(source))
     write(folder, capture, made_from=[str(capture.source)])
     return replace(read(folder), notes=capture.notes, untaken=capture.untaken)
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
     """Return the path `folder/name`; raise InputError, begun with `where`, if the folder has no such file."""
-    if not (file := contained(folder, name, where)).is_file():
+    if not (file := capture_file(folder, name, where)).is_file():
         raise InputError(f"{where}: {name} is not there; add it, or remove the key")
     return file

@@ -13,14 +13,15 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field
 
 from jcr.capture.documents import Table
+from jcr.capture.images import require_pixels
 from jcr.capture.options import ReadOptions, chosen_name
-from jcr.capture.plain_files import contained
 from jcr.capture.pose_track import interpolated_poses, speed
 from jcr.capture.readings import readings_of, undecided
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.urdf_chain import read_arm
-from jcr.errors import InputError
+from jcr.errors import InputError, shown
 from jcr.extras import extra
+from jcr.files import path_inside
 from jcr.progress import Progress
 from jcr.records import Capture
 from jcr.records.json_file import read_json, validated_content
@@ -29,6 +30,8 @@ INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
 """Key of the gripper pose in DROID: x, y, z (m), roll, pitch, yaw (rad) in the robot's base frame."""
 STATE = "observation.state"
+LATEST_S = 9e9
+"""Largest time stamp (s), about that of the largest int64 in ns (9.2e9); time since 1970 is 1.8e9."""
 
 
 class Feature(BaseModel):
@@ -133,22 +136,39 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
         chunk, number, *video = (listed[name][0] for name in columns)
         fields = {"chunk_index": chunk, "file_index": number}
         if video:
-            video_fields, start_s = {"chunk_index": video[0], "file_index": video[1]}, float(video[2])
+            video_fields = {"chunk_index": video[0], "file_index": video[1]}
+            start_s = float(
+                _seconds(video[2:], f"{path}: from_timestamp of episode {index} in meta/episodes")[0]
+            )
     table = _file(path, info.data_path, fields)
     if not table.is_file():
         raise InputError(f"{table}: not there, so there is no episode {index}; they are counted from 0")
     rows = _read_table(table, ["frame_index", "timestamp", key], index)
+    time_s = _seconds(rows["timestamp"], f"{table}: timestamp of episode {index}")
     try:
-        time_s, state = (np.array(rows[name], np.float64) for name in ("timestamp", key))
-        if not (len(time_s) and time_s.ndim == 1 and state.ndim == 2):
+        state, frame = np.array(rows[key], np.float64), np.array(rows["frame_index"])
+        if not (len(state) and state.ndim == 2 and frame.ndim == 1):
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         text = "is empty, no list, or has rows of different lengths; choose another episode"
         raise InputError(f"{table}: {key} of episode {index} {text}") from None
-    if not (np.isfinite(time_s).all() and np.isfinite(state).all()):
+    if not np.isfinite(state).all():
         raise InputError(f"{table}: {key} holds NaN or infinity; choose another episode")
+    if frame.dtype.kind not in "iu":
+        raise InputError(f"{table}: frame_index of episode {index} holds no whole numbers; download it again")
     video = _file(path, info.video_path or "", video_fields | {"video_key": camera}) if has_video else None
-    return Episode(index, np.array(rows["frame_index"]), time_s, state, table, video, start_s)
+    return Episode(index, frame, time_s, state, table, video, start_s)
+
+
+def _seconds(values: Sequence[Any], where: str) -> Float[ndarray, " n"]:
+    """Return times (s) from the cells of a table; raise InputError, begun with `where`, if one is no time."""
+    for row, value in enumerate(values):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not abs(value) <= LATEST_S:
+            raise InputError(
+                f"{where}: {shown(value)} in row {row} is no time in seconds; choose another episode"
+            )
+    return np.array(values, np.float64)
 
 
 def _read_table(
@@ -179,7 +199,7 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
         lambda field: str(fields.get(field[1], field[0])).zfill(int(field[2] or 0)),
         template,
     )
-    return contained(path, name, str(path / INFO))
+    return path_inside(path, name, str(path / INFO))
 
 
 def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
@@ -195,8 +215,9 @@ def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) ->
     found = _read_table(episode.table, ["frame_index", key], episode.index, numbers)
     images = dict(zip(found["frame_index"], found[key], strict=True))
     for row, number in zip(rows.tolist(), numbers, strict=True):
-        file = images[number].get("bytes") if isinstance(images[number], dict) else None
-        if not file:
+        cell = images.get(number)
+        file = cell.get("bytes") if isinstance(cell, dict) else None
+        if not file or not isinstance(file, bytes):
             what = f"holds no {key} of frame {number}; write the data set with embedded images"
             raise InputError(f"{episode.table}: {what}")
         yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
@@ -214,15 +235,19 @@ def _video_frames(
     try:
         with av.open(str(file)) as container:
             stream = container.streams.video[0]
+            require_pixels((stream.codec_context.width, stream.codec_context.height), str(file))
             stream.thread_type = "AUTO"
             container.seek(max(int((due[0] - tolerance_s) / stream.time_base), 0), stream=stream)
             for frame in container.decode(stream):
+                require_pixels((frame.width, frame.height), str(file))
                 while due and frame.time is not None and abs(frame.time - due[0]) <= tolerance_s:
                     yield np.asarray(frame.to_ndarray(format="rgb24"))
                     due.pop(0)
                 if not due or (frame.time is not None and frame.time > due[0] + tolerance_s):
                     break
-    except (av.FFmpegError, IndexError) as error:
+    except InputError:
+        raise
+    except (av.FFmpegError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{file}: not a readable video ({error}); download it again") from None
     if due:
         raise InputError(f"{file}: has no frame at {due[0]:.3f} s, as listed; download it again")

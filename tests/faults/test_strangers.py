@@ -1,0 +1,773 @@
+"""Files of strangers: what each promise of SECURITY.md refuses, by inputs that once broke it."""
+
+import json
+import math
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import time
+import urllib.request
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import capture_writers as writers
+import jcr
+from corpus import RUN_IMAGES, sound_run
+from corpus import small_capture as noise_capture
+from jcr.capture.formats import capture_json
+from jcr.capture.images import encode_png, read_image
+from jcr.capture.options import ReadOptions
+from jcr.capture.pairing import natural
+from jcr.capture.read import read_source
+from jcr.capture.ros import read_ros_depth, read_ros_image
+from jcr.cli import dispatch
+from jcr.errors import InputError, shown
+from jcr.geometry import transform
+from jcr.records import Intrinsics, Tracks
+from jcr.scene.cloud import read_cloud, write_cloud
+from jcr.segments.segments import read_labels
+from jcr.sfm.given import reconstruct_given
+from scenes import NO_TRACKS, capture_of, cloud_of, hand_eye_of, maps_of, reconstruction_of
+from scripted_capture import a_capture, still_frames
+from simulation.problems import hand_eye_problem
+
+SIZE = (96, 72)
+CAMERA = Intrinsics(90.0, 90.0, 47.5, 35.5, *SIZE)
+HUGE = (31_000, 31_000)
+"""Size of an image of 961 million pixels; as grey PNG of zeros it has 0.9 MB."""
+
+
+def png_of_zeros(width: int, height: int, bits: int, colours: int = 0) -> bytes:
+    """Return a PNG that is whole, whose zeros pack 1000 to 1; `colours` is PNG's type, 0 for grey and 2 for RGB."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    line = b"\0" * (1 + width * bits // 8 * (3 if colours == 2 else 1))
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(line) for _ in range(height)) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, bits, colours, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+def state(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# Names of files in files
+
+
+def table_capture(folder: Path, named: Callable[[str], str]) -> Path:
+    """Write images and a poses.csv whose image names are changed."""
+    capture = noise_capture(folder.with_name("images of " + folder.name), SIZE, 5, "")
+    writers.write_table(folder, capture)
+    file = folder / "poses.csv"
+    header, *rows = file.read_text().splitlines()
+    file.write_text(
+        "\n".join([header, *(f"{named(name)},{row}" for name, _, row in (r.partition(",") for r in rows))])
+    )
+    return folder
+
+
+def test_no_name_in_a_file_is_written_outside_of_the_run_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The names lead out of the capture and back in, and out of the run folder for good."""
+    capture = table_capture(tmp_path / "in/cap", lambda name: f"../../in/cap/{name}")
+    (tmp_path / "results/deep").mkdir(parents=True)
+    before = state(tmp_path)
+    assert dispatch(["calibrate", str(capture), str(tmp_path / "results/deep/out"), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and "leads out of" in said
+    assert state(tmp_path) == before and not list(tmp_path.glob("results/*/in"))
+
+
+def test_a_link_of_the_user_to_the_folder_of_the_images_is_followed(tmp_path: Path):
+    capture = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    (capture / "images").rename(tmp_path / "elsewhere")
+    (capture / "images").symlink_to(tmp_path / "elsewhere")
+    read = jcr.read_capture(capture)
+    assert len(read) == 5 and not read.notes
+    (tmp_path / "link").symlink_to(capture)
+    assert len(jcr.read_capture(tmp_path / "link")) == 5
+
+
+def test_other_links_must_not_lead_out(tmp_path: Path):
+    capture = noise_capture(tmp_path / "capture", SIZE, 5, "views/").folder
+    (capture / "views").rename(tmp_path / "private")
+    (capture / "views").symlink_to(tmp_path / "private")
+    with pytest.raises(InputError, match="leads out of"):
+        jcr.read_capture(capture)
+
+
+def test_a_run_folder_with_links_is_not_written_through(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    capture = table_capture(tmp_path / "cap", str)
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "victim/.lock").write_text("precious")
+    for name, target in (("capture", tmp_path / "victim"), (".lock", tmp_path / "victim/.lock")):
+        out = tmp_path / f"out of {name[-4:]}"
+        out.mkdir()
+        (out / name).symlink_to(target)
+        assert dispatch(["calibrate", str(capture), str(out), "--quiet"]) == 2
+        assert capsys.readouterr().err.startswith("error: ")
+    assert [path.name for path in (tmp_path / "victim").iterdir()] == [".lock"]
+    assert (tmp_path / "victim/.lock").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["0²0", "½", "٣", "௧", "a" * 60 + "⑦"])
+def test_digits_of_other_scripts_are_names(tmp_path: Path, name: str):
+    assert natural(f"{name}.png")
+    capture = noise_capture(tmp_path / "capture", SIZE, 5, "").folder
+    (capture / "capture.json").unlink()
+    (capture / "0.png").rename(capture / f"{name}.png")
+    with pytest.raises(InputError, match=r"no capture.json and no poses.csv"):
+        jcr.read_capture(capture)
+
+
+def test_devices_and_ports_are_decimal_numbers():
+    from jcr.live.cameras import open_camera
+    from jcr.live.robot import states_of
+
+    with pytest.raises(InputError, match="no such video file"), open_camera("²"):
+        pass
+    for port in ("²", "9" * 5000):
+        with pytest.raises(InputError, match="no address"):
+            states_of(f"ur:host:{port}")
+
+
+# Messages
+
+
+def test_messages_quote_80_characters_without_building_the_rest():
+    """A text of 10 to the power of 40 letters would never be built; one of itself has no end."""
+    deep: Any = ["lol"]
+    for _ in range(40):
+        deep = [deep] * 10
+    itself: dict[str, Any] = {}
+    itself["me"] = [itself]
+    start = time.process_time()
+    for value in (deep, itself, "x" * 10**8, 10**1000, [10**1000], {"k": "v" * 200}):
+        assert len(shown(value)) <= 81
+    assert time.process_time() - start < 1
+    small = {"a": [1, (2.5, None), "é"], b"b": {}}
+    assert shown(small) == repr(small)
+
+
+# Images
+
+
+MEASURED = """
+import resource, sys
+from pathlib import Path
+import jcr
+{imports}
+def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+before = peak()
+try:
+    {call}
+    print("read", end=" ")
+except jcr.InputError as error:
+    print("refused", end=" ")
+print(round(peak() - before))
+"""
+
+
+def peak_mb(imports: str, call: str) -> tuple[str, int]:
+    """Return whether a process read or refused, and how much its peak memory grew (MB)."""
+    program = MEASURED.format(imports=imports, call=call)
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    ended, grown = finished.stdout.split()
+    return ended, int(grown)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["depth", "label", "image in a bag", "image in bytes"])
+def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path, kind: str):
+    """Less than a megabyte as a file, 1.0 to 2.9 GB unpacked."""
+    file = tmp_path / "large.png"
+    if kind == "depth":
+        file.write_bytes(png_of_zeros(20_000, 20_000, 16))
+        call = (
+            "from jcr.capture.images import read_depth_images",
+            f"read_depth_images(Path({str(file)!r}), (20000, 20000))",
+        )
+    elif kind == "label":
+        capture = noise_capture(tmp_path, SIZE, 3)
+        (tmp_path / "labels").mkdir()
+        for k in range(3):
+            (tmp_path / f"labels/{k}.png").write_bytes(png_of_zeros(20_000, 20_000, 16))
+        paths = [*sys.path, str(Path(__file__).parent)]
+        imports = f"import sys; sys.path[:0] = {paths}\nfrom test_strangers import labelled"
+        call = imports, f"labelled(Path({str(capture.folder)!r}))"
+    else:
+        file.write_bytes(png_of_zeros(*HUGE, 8))
+        message = f"SimpleNamespace(format='png', data=Path({str(file)!r}).read_bytes())"
+        imports = "from types import SimpleNamespace\nfrom jcr.capture.ros import read_ros_image, image_of\n"
+        imports += "from jcr.capture.recording import sharpness"
+        call = imports, f"read_ros_image({message})"
+        if kind == "image in bytes":
+            call = (
+                imports + "\nfrom jcr.capture.images import read_image",
+                f"read_image(image_of({message}, 'x')[0], 'x')",
+            )
+    ended, grown = peak_mb(*call)
+    assert ended == "refused" and grown < 150
+
+
+def labelled(folder: Path) -> object:
+    """Read the labels of a capture whose three images registered."""
+    capture = capture_of(
+        np.stack([np.eye(4)] * 3), folder=folder, images=("0.png", "1.png", "2.png"), image_size=SIZE
+    )
+    maps = maps_of(np.zeros((3, *SIZE[::-1], 3)), CAMERA)
+    return read_labels(
+        capture, reconstruction_of(np.stack([np.eye(4)] * 3), intrinsics=CAMERA, pointmaps=maps)
+    )
+
+
+def test_a_file_that_starts_a_program_is_no_image(tmp_path: Path):
+    """Pillow reads PostScript by Ghostscript, whatever the file is called."""
+    file = tmp_path / "0.png"
+    Image.new("RGB", SIZE).save(file, format="EPS")
+    with pytest.raises(InputError, match="not a readable image"):
+        read_image(file)
+
+
+def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
+    """Each of the scans decodes all pixels again: 12 MB took 12 s."""
+    file = tmp_path / "0.jpg"
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(file, progressive=True)
+    assert read_image(file).shape == (480, 640, 3)
+    data = file.read_bytes()
+    last = data[data.rfind(b"\xff\xda") : -2]
+    file.write_bytes(data[:-2] + 200 * last[:500] + b"\xff\xd9")
+    with pytest.raises(InputError, match="a JPEG of 2[01][0-9] scans"):
+        read_image(file)
+
+
+@pytest.mark.parametrize("name", ["images/0.png\n", "images/" + 500 * "a/" + "0.png"])
+def test_names_that_no_line_holds_are_refused(tmp_path: Path, name: str):
+    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    content = json.loads((folder / "capture.json").read_text())
+    content["frames"][0]["image"] = name
+    (folder / "capture.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="no path inside the capture") as caught:
+        jcr.read_capture(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lock_that_is_a_pipe_blocks_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    capture = table_capture(tmp_path / "cap", str)
+    (tmp_path / "out").mkdir()
+    os.mkfifo(tmp_path / "out/.lock")
+    assert dispatch(["calibrate", str(capture), str(tmp_path / "out"), "--quiet"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def ros_image(height: int, width: int, encoding: str, data: bytes | None = None, /, **facts: Any) -> Any:
+    channels = {"rgb8": 3, "rgba8": 4, "16UC1": 2, "32FC1": 4, "yuv422": 2}.get(encoding, 1)
+    data = bytes(height * width * channels) if data is None else data
+    usual = {"step": width * channels, "is_bigendian": 0}
+    return SimpleNamespace(
+        **{"height": height, "width": width, "encoding": encoding, "data": data} | usual | facts
+    )
+
+
+def compressed(data: bytes, kind: str = "jpeg") -> Any:
+    return SimpleNamespace(format=kind, data=data)
+
+
+WRONG_MESSAGES: dict[str, tuple[Any, Callable[[Any], object]]] = {
+    "no pixels": (ros_image(0, 0, "mono8"), read_ros_image),
+    "no rows": (ros_image(0, 4, "rgba8"), read_ros_image),
+    "odd width of two pixels each": (ros_image(3, 5, "yuv422"), read_ros_image),
+    "negative size": (ros_image(-4, -4, "rgb8", b"\0" * 48), read_ros_image),
+    "size in words": (ros_image(2, 2, "rgb8", width="2"), read_ros_image),
+    "data of numbers": (ros_image(2, 2, "rgb8", data=None, step=None), read_ros_image),
+    "encoding that is a list": (ros_image(2, 2, "rgb8", b"\0" * 12, encoding=["rgb8"]), read_ros_image),
+    "a JPEG of three bytes": (compressed(b"\xff\xd8\xff"), read_ros_image),
+    "a JPEG that is cut": (
+        compressed(cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()[:200]),
+        read_ros_image,
+    ),
+    "empty depth": (ros_image(0, 0, "16UC1"), read_ros_depth),
+    "depth without data": (compressed(b"", "16UC1; compressedDepth"), read_ros_depth),
+    "depth that is cut": (compressed(b"\x89PNG\r\n", "16UC1; compressedDepth"), read_ros_depth),
+    "depth in colours": (compressed(encode_png(np.zeros((4, 4, 3), np.uint8)), "16UC1"), read_ros_depth),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_MESSAGES)
+def test_images_in_messages_are_read_or_refused(what: str):
+    message, read = WRONG_MESSAGES[what]
+    with pytest.raises(InputError, match="^(image|depth): ") as caught:
+        read(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_path: Path):
+    """Three images of each stop are damaged, as by a camera that is switched on."""
+    from jcr.capture.recording import Recording, capture_of_recording
+
+    poses = np.repeat(hand_eye_problem(np.random.default_rng(0), 6).base_from_gripper, 5, axis=0)
+    draw = np.random.default_rng(1)
+    good = [encode_png(draw.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)) for _ in range(30)]
+    damaged = {row: good[row][:300] for row in range(30) if row % 5 in (1, 2)}
+    recording = Recording(
+        source=tmp_path / "scan.bag",
+        options=ReadOptions(frames=6),
+        names=[str(k) for k in range(30)],
+        base_from_gripper=poses,
+        speed=np.zeros(30) + np.where(np.arange(30) % 5 == 0, 1.0, 0.0),
+        gap_ns=np.zeros(30, np.int64),
+        images_of_rows=lambda rows: ((row, damaged.get(row, good[row]), ".png") for row in rows.tolist()),
+    )
+    capture = capture_of_recording(recording, tmp_path / "into", lambda *_: None)
+    assert len(capture) == 6 and not {int(Path(name).stem) for name in capture.images} & damaged.keys()
+    (note,) = [note for note in capture.notes if "cannot be read" in note]
+    assert note.startswith("left out: ") and "not a readable image" in note
+    everything = replace(
+        recording, images_of_rows=lambda rows: ((row, b"\xff\xd8\xff", ".jpg") for row in rows.tolist())
+    )
+    with pytest.raises(InputError, match="not a readable image"):
+        capture_of_recording(everything, tmp_path / "nothing", lambda *_: None)
+
+
+# Data sets
+
+TIMES = {"null": None, "NaN": math.nan, "1e300": 1e300, "text": "soon", "infinity": math.inf}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", TIMES)
+@pytest.mark.parametrize("place", ["timestamp", "from_timestamp"])
+def test_times_of_a_data_set_are_seconds(tmp_path: Path, what: str, place: str):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    capture = noise_capture(tmp_path / "images", SIZE, 5)
+    pixels = [read_image(capture.folder / name) for name in capture.images for _ in range(3)]
+    states = np.repeat(writers.rows_as("rpy", capture.base_from_gripper), 3, axis=0)
+    names, codec = ["x", "y", "z", "roll", "pitch", "yaw"], None if place == "timestamp" else "mpeg4"
+    folder = writers.write_lerobot(
+        tmp_path / "set", [(pixels, states)], "v3.0", "observation.state", names, codec=codec
+    )
+    root = folder / ("data" if place == "timestamp" else "meta/episodes")
+    (file,) = root.rglob("*.parquet")
+    table = pq.read_table(file, partitioning=None)
+    (column,) = [name for name in table.column_names if name.endswith(place)]
+    values = table.column(column).to_pylist()
+    values[-1] = TIMES[what]
+    values = [str(value) for value in values] if what == "text" else values
+    pq.write_table(table.set_column(table.column_names.index(column), column, pa.array(values)), file)
+    with pytest.raises(InputError, match="no time in seconds"):
+        read_source(folder, ReadOptions(frames=3), into=tmp_path / "into")
+
+
+# Images are told apart by their paths
+
+
+def test_two_images_share_no_label_image(tmp_path: Path):
+    images = ("left/1.png", "right/1.png", "images/2.png")
+    (tmp_path / "labels/left").mkdir(parents=True)
+    (tmp_path / "labels/right").mkdir(parents=True)
+    for value, name in enumerate(("left/1", "right/1", "2"), start=1):
+        cv2.imwrite(str(tmp_path / f"labels/{name}.png"), np.full(SIZE[::-1], value, np.uint8))
+    poses = np.stack([np.eye(4)] * 3)
+    made = reconstruction_of(
+        poses, intrinsics=CAMERA, pointmaps=maps_of(np.zeros((3, *SIZE[::-1], 3)), CAMERA)
+    )
+    capture = capture_of(poses, folder=tmp_path, images=images, image_size=SIZE)
+    labels = read_labels(capture, made)
+    assert labels is not None and [np.unique(label).tolist() for label in labels[0]] == [[1], [2], [3]]
+    with pytest.raises(InputError, match="share one label image"):
+        read_labels(replace(capture, images=("images/1.jpg", "images/1.png", "2.png")), made)
+
+
+@pytest.mark.parametrize("undistort", [False, True])
+def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
+    from jcr.export.options import ExportOptions
+    from jcr.export.views import PosedImages, write_nerfstudio
+
+    images = ("1.jpg", "1.png", "1.PNG")
+    for k, name in enumerate(images):
+        Image.new("RGB", SIZE, (80 * k, 0, 0)).save(tmp_path / name)
+    poses = np.stack([transform(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(3)])
+    views = PosedImages(
+        folder=tmp_path, images=images, base_from_camera=poses, base_from_gripper=poses, intrinsics=CAMERA,
+        tracks=NO_TRACKS, points_in_base=np.zeros((0, 3)),
+    )  # fmt: skip
+    write_nerfstudio(
+        tmp_path / "out", views, cloud_of(np.zeros((1, 3))), {}, ExportOptions(undistort=undistort)
+    )
+    frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    files = [frame["file_path"] for frame in frames]
+    assert len({file.casefold() for file in files}) == 3
+    for k, frame in enumerate(frames):
+        assert frame["transform_matrix"][0][3] == k
+        assert abs(int(read_image(tmp_path / "out" / frame["file_path"])[0, 0, 0]) - 80 * k) < 4
+
+
+@pytest.mark.parametrize(
+    ("images", "names", "expected"),
+    [
+        (
+            ("left/1.png", "left/2.png", "left/3.png", "right/1.png"),
+            ("1.png", "2.png", "3.png"),
+            "1.png could be",
+        ),
+        (("1.png", "2.png", "3.png"), ("a/1.png", "b/1.png", "2.png", "3.png"), "could both be 1.png"),
+        (
+            ("left/1.png", "left/2.png", "left/3.png", "right/1.png"),
+            ("left/1.png", "left/2.png", "left/3.png"),
+            None,
+        ),
+    ],
+)
+def test_an_image_of_a_model_is_one_of_the_capture(
+    tmp_path: Path, images: tuple[str, ...], names: tuple[str, ...], expected: str | None
+):
+    import pycolmap
+
+    from jcr.sfm.model import colmap_camera
+
+    model = pycolmap.Reconstruction()
+    camera = colmap_camera(CAMERA, known=True)
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    points = np.random.default_rng(0).uniform([-0.2, -0.2, 1], [0.2, 0.2, 1.5], (60, 3))
+    for k, name in enumerate(names):
+        at = [0.1 * k, 0.0, 0.0]
+        seen = points - at
+        x_px = [90, 90] * seen[:, :2] / seen[:, 2:] + [48, 36]
+        image = pycolmap.Image(name=name, keypoints=x_px, camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.c_[np.eye(3), np.negative(at)]))
+    for j, point in enumerate(points):
+        track = pycolmap.Track()
+        for k in range(len(names)):
+            track.add_element(k + 1, j)
+        model.add_point3D(point, track)
+    (tmp_path / "model").mkdir()
+    model.write_binary(str(tmp_path / "model"))
+    capture = capture_of(np.stack([np.eye(4)] * len(images)), folder=tmp_path, images=images, image_size=SIZE)
+    if expected is not None:
+        with pytest.raises(InputError, match=expected):
+            reconstruct_given(capture, tmp_path / "model")
+    else:
+        assert reconstruct_given(capture, tmp_path / "model").image_index.tolist() == [0, 1, 2]
+
+
+# Dense depth
+
+
+def test_an_added_image_that_sees_no_point_is_named(tmp_path: Path):
+    from jcr.depth.added import extend
+    from jcr.depth.densify import densify, sweep_planes
+    from scenes import no_depth
+
+    capture = noise_capture(tmp_path / "capture", SIZE, 3)
+    cameras = np.stack([transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(3)])
+    draw = np.random.default_rng(0)
+    points = draw.uniform([-0.3, -0.2, 1.0], [0.3, 0.2, 1.2], (40, 3))
+    rows = np.repeat(np.arange(3), 40)
+    tracks = Tracks(
+        image=rows, x_px=np.ones((120, 2)), point=np.tile(np.arange(40), 3), points_in_recon=points
+    )
+    shape = 3, *SIZE[::-1]
+    maps = maps_of(np.ones((*shape, 3)), CAMERA, **no_depth(shape))
+    made = reconstruction_of(cameras, intrinsics=CAMERA, tracks=tracks, pointmaps=maps)
+    away = np.diag([1.0, -1.0, -1.0, 1.0])[None]  # the camera looks the other way
+    added = replace(capture.of_rows([0]), base_from_gripper=away)
+    with pytest.raises(InputError, match=r"0\.png: sees no point"):
+        extend(made, np.eye(4), hand_eye_of(np.eye(4)).base_from_recon, 3, added, lambda *_: None)
+    # A file may list an image without any track, and points behind a camera.
+    two = tracks.only(rows < 2)
+    assert np.isfinite(sweep_planes(two, cameras)).all()
+    assert np.isfinite(sweep_planes(replace(two, points_in_recon=-points), cameras)).all()
+    assert len(densify(capture, replace(made, tracks=two, pointmaps=None)).dense.confidence) == 3
+
+
+# Files of a run folder
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from jcr.scene.build import build_scene
+    from jcr.scene.options import MapOptions
+
+    draw = np.random.default_rng(3)
+    cloud = cloud_of(draw.random((400, 3)), label=np.ones(400, int), label_names=("none", "cup"))
+    file = tmp_path_factory.mktemp("map") / "map.safetensors"
+    build_scene(cloud, MapOptions(cell=0.2, max_seconds=0.1)).save(file)
+    return file
+
+
+def changed_map(
+    source: Path, file: Path, change: Callable[[dict[str, Any], dict[str, Any]], object], seals: bool
+) -> None:
+    """Write a map with other content; with `seals`, as its writer would, with the digest of the new content."""
+    from safetensors import safe_open
+    from safetensors.torch import save_file
+
+    from jcr.scene.scene_map import digest
+
+    with safe_open(source, "pt") as stored:
+        metadata = dict(stored.metadata())
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    about = json.loads(metadata["about"])
+    change(about, tensors)
+    metadata["about"] = json.dumps(about)
+    if seals:
+        metadata["digest"] = digest(tensors, metadata["about"])
+    save_file(tensors, file, metadata=metadata)
+
+
+MAP_CHANGES: dict[str, Callable[[dict[str, Any], dict[str, Any]], object]] = {
+    "cells ten times as large": lambda about, _: about.update(cell=10 * about["cell"]),
+    "cells of NaN": lambda about, _: about.update(cell=math.nan),
+    "cells of a negative side": lambda about, _: about.update(cell=-about["cell"]),
+    "cells of 0": lambda about, _: about.update(cell=0),
+    "a lattice of another spacing": lambda about, _: about["lattices"][1].__setitem__(0, 7.0),
+    "a name too many": lambda about, _: about["label_names"].append("mug"),
+    "names that are numbers": lambda about, _: about.update(label_names=[1, 2]),
+    "a corner at infinity": lambda _, tensors: tensors["lower"].fill_(math.inf),
+    "states of no meaning": lambda _, tensors: tensors["seen"].fill_(255),
+    "a network of NaN": lambda _, tensors: tensors["fields.of.0.hidden.bias"].fill_(math.nan),
+    "nodes that are not there": lambda _, tensors: tensors["fields.lattices.0.nodes"].fill_(10**9),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", MAP_CHANGES)
+@pytest.mark.parametrize("seals", [False, True])
+def test_a_map_that_was_changed_answers_nothing(tmp_path: Path, map_file: Path, what: str, seals: bool):
+    file = tmp_path / "map.safetensors"
+    changed_map(map_file, file, lambda *_: None, seals)
+    assert jcr.load_map(file).check_spheres(np.zeros((1, 3)), 0.01).shape == (1,)
+    changed_map(map_file, file, MAP_CHANGES[what], seals)
+    with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged|grid of seen space"):
+        jcr.load_map(file)
+
+
+def cloud_file(folder: Path, **facts: Any) -> Path:
+    draw = np.random.default_rng(0)
+    usual = {"label": np.arange(100) % 2, "label_names": ("none", "cup")}
+    write_cloud(folder / "cloud.ply", cloud_of(draw.random((100, 3)), **(usual | facts)))
+    return folder / "cloud.ply"
+
+
+def cell_of(name: str, value: int) -> Callable[[bytes], bytes]:
+    """Return a change of the last point's property of a cloud."""
+
+    def change(data: bytes) -> bytes:
+        header, mark, body = data.partition(b"end_header\n")
+        lines = [line.split() for line in header.decode().splitlines() if line.startswith("property")]
+        kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+        points = np.frombuffer(body, [(line[2], kinds[line[1]]) for line in lines]).copy()
+        points[name][-1] = value
+        return header + mark + points.tobytes()
+
+    return change
+
+
+CLOUD_CHANGES: dict[str, Callable[[bytes], bytes]] = {
+    "label 999": cell_of("label", 999),
+    "label -1": cell_of("label", -1),
+    "image 77": cell_of("image", 77),
+    "no point": lambda data: data.partition(b"end_header\n")[0] + b"end_header\n",
+    "a quarter": lambda data: data[: -75 * ((len(data) - data.index(b"end_header\n") - 11) // 100)],
+    "another byte order": lambda data: data.replace(b"little", b"big"),
+    "axes in another order": lambda data: data.replace(
+        b"float x\nproperty float y", b"float y\nproperty float x"
+    ),
+    "a camera that is not counted": lambda data: data.replace(b"comment camera 0", b"comment camera 1"),
+    "points twice": lambda data: data + data.partition(b"end_header\n")[2],
+}
+
+
+@pytest.mark.parametrize("what", CLOUD_CHANGES)
+def test_a_cloud_that_was_changed_is_refused(tmp_path: Path, what: str):
+    file = cloud_file(tmp_path)
+    assert len(read_cloud(file).label) == 100
+    file.write_bytes(CLOUD_CHANGES[what](file.read_bytes()))
+    with pytest.raises(InputError, match=r"cloud\.ply: "):
+        read_cloud(file)
+
+
+@pytest.mark.parametrize(
+    "name", ["end_header", "element vertex 3", "property int image", "format ascii 1.0", " "]
+)
+def test_a_label_may_be_called_as_a_line_of_the_header(tmp_path: Path, name: str):
+    names = ("none", name if name.strip() else "two words")
+    assert read_cloud(cloud_file(tmp_path, label_names=names)).label_names == names
+
+
+def test_depth_of_a_run_folder_is_checked(tmp_path: Path):
+    from jcr.depth.densify import pointmaps_of
+    from jcr.depth.depth_npz import read_depth, write_depth
+
+    shape = 2, *SIZE[::-1]
+    made = reconstruction_of(np.stack([np.eye(4)] * 2), intrinsics=CAMERA)
+    layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
+    colors = np.zeros((*shape, 3), np.uint8)
+    dense = pointmaps_of(np.ones(shape, np.float32), *layers, colors, made.recon_from_camera, CAMERA)
+    write_depth(tmp_path / "depth.npz", replace(made, pointmaps=dense), "x")
+    with np.load(tmp_path / "depth.npz") as file:
+        arrays = dict(file)
+    for name, value in (("confidence", -1.0), ("relative_std", -1.0), ("depth", -1.0)):
+        np.savez(tmp_path / "depth.npz", **arrays | {name: np.full_like(arrays[name], value)})
+        with pytest.raises(InputError, match=r"depth\.npz: damaged"):
+            read_depth(tmp_path / "depth.npz", made, None)
+
+
+# Pages
+
+
+@pytest.mark.slow
+def test_an_image_of_any_name_is_on_the_live_page(tmp_path: Path):
+    from jcr.live.server import LiveServer
+
+    names = ["a b.png", "a%20b.png", "50%.png", "q?x=1.png", "h#1.png", "<b>.png", "é'\".png"]
+    folder = noise_capture(tmp_path / "capture", SIZE, len(names), "").folder
+    content = json.loads((folder / "capture.json").read_text())
+    for frame, name in zip(content["frames"], names, strict=True):
+        (folder / frame["image"]).rename(folder / name)
+        frame["image"] = name
+    (folder / "capture.json").write_text(json.dumps(content))
+    session, scripted = a_capture(folder, still_frames(lambda: read_image(folder / names[0])))
+    session._report(scripted.update())
+    with LiveServer(session) as server:
+        page = json.loads(urllib.request.urlopen(f"{server.address}state", timeout=10).read())
+        html = page["parts"]["images"]
+        found = [part.split('"')[0] for part in html.split('src="')[1:]]
+        assert len(found) == len(names) and "<b>" not in html
+        for url in found:
+            with urllib.request.urlopen(f"{server.address}{url}", timeout=10) as answer:
+                assert answer.headers["Content-Type"] == "image/jpeg"
+
+
+MARKUP = "<img src=x onerror=alert(1)>{1+1}**b**[a](javascript:x).png"
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
+    from jcr.result import load_run
+    from jcr.viewer.viewer import Viewer, open_server
+
+    run = load_run(small_done)
+    images = tuple(replace(one, image=MARKUP) for one in run.calibration.images)
+    capture = tmp_path / "capture"
+    shutil.copytree(run.capture.folder, capture)
+    for one in run.capture.images:
+        (capture / one).rename(capture / (own := f"{len(list(capture.iterdir()))}{MARKUP}"))
+        images = tuple(replace(i, image=own) for i in images)
+    scene = run.scene
+    assert scene is not None
+    scene.label_names = tuple(MARKUP for _ in scene.label_names)
+    run = run.with_parts(scene=scene)
+    server = open_server(0, "test")
+    try:
+        viewer = Viewer(server, run)
+        viewer.calibration = replace(viewer.calibration, images=images)
+        viewer.choose_image()
+        viewer.by_label.value = True
+        viewer.show_points()
+        cloud = viewer.points
+        viewer.click(cloud.mean(0) + [0, 0, 1.0], np.array([0.0, 0.0, -1.0]))
+        middle = cloud[np.linalg.norm(cloud - cloud.mean(0), axis=1).argmin()]
+        clicked = viewer.click(middle + [0, 0, 0.5], np.array([0.0, 0.0, -1.0]))
+        assert "javascript" in clicked and "javascript" in viewer._about_image.content
+        for text in (clicked, viewer._about_image.content, viewer._legend.content):
+            assert "<img" not in text and "&lt;img" in text or "javascript" not in text
+        # Markdown would make a link and bold letters of it; HTML does not.
+        assert type(viewer._about_image).__name__ == type(viewer.clicked).__name__ == "GuiHtmlHandle"
+    finally:
+        server.stop()
+
+
+# Records
+
+
+GOOD = {"fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"fx": -1.0}, {"fx": 0.0}, {"fy": math.nan}, {"cx": math.inf}, {"cy": "240"}, {"width": 0}, {"height": 10**6},
+        {"width": 6.5}, {"distortion": (0.1,)}, {"distortion": (math.nan,) * 5}, {"model": "kannala"},
+        {"distortion": (0.0,) * 5, "model": "fisheye"},
+    ],
+)  # fmt: skip
+def test_intrinsics_check_their_numbers_when_they_are_made(wrong: dict[str, Any]):
+    for _ in range(10):  # after some calls the tests' own checks of types rest
+        assert Intrinsics(**GOOD).fx == 600
+    with pytest.raises(InputError) as caught:
+        Intrinsics(**GOOD | wrong)
+    assert "\n" not in str(caught.value)
+
+
+RECORDS: dict[str, Callable[[], object]] = {
+    "a pose too few": lambda: capture_of(np.stack([np.eye(4)] * 3), images=("a.png", "b.png")),
+    "a pose of NaN": lambda: capture_of(np.full((3, 4, 4), np.nan)),
+    "poses of another shape": lambda: capture_of(np.zeros((3, 3, 4))),
+    "a depth too few": lambda: capture_of(np.stack([np.eye(4)] * 3), depths=("a.png",)),
+    "a point that is not there": lambda: replace(
+        NO_TRACKS,
+        image=np.zeros(1, int),
+        point=np.ones(1, int),
+        x_px=np.zeros((1, 2)),
+        points_in_recon=np.zeros((1, 3)),
+    ),
+    "images that do not ascend": lambda: reconstruction_of(
+        np.stack([np.eye(4)] * 2), image_index=np.array([1, 0])
+    ),
+    "a label that is not there": lambda: cloud_of(np.zeros((1, 3)), label=np.ones(1, int)),
+    "a camera that is not there": lambda: cloud_of(np.zeros((1, 3)), image=np.ones(1, int)),
+    "images of no size": lambda: capture_of(np.stack([np.eye(4)] * 3), image_size=(0, -1)),
+    "noise below 0": lambda: jcr.RobotNoise(translation=-1.0, rotation=0.0, estimated=False),
+    "a scale of 0": lambda: hand_eye_of(np.eye(4), scale=0.0),
+    "transforms of two mounts": lambda: hand_eye_of(np.eye(4), on_base=np.eye(4)),
+}
+
+
+@pytest.mark.parametrize("what", RECORDS)
+def test_records_check_their_fields_when_they_are_made(what: str):
+    for _ in range(10):  # after some calls the tests' own checks of shapes rest
+        capture_of(np.stack([np.eye(4)] * 3))
+    with pytest.raises(InputError):
+        RECORDS[what]()
+
+
+def test_names_of_a_run_are_used_as_they_are(tmp_path: Path):
+    """The run folder of a stranger: its calibration names images that its capture does not have."""
+    out = sound_run(tmp_path / "run")
+    content = json.loads((out / "calibration.json").read_text())
+    assert len(content["images"]) == RUN_IMAGES
+    content["images"][0]["image"] = "../../secret.png"
+    (out / "calibration.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="has changed since"):
+        jcr.load_run(out).of_wrist_camera()
+
+
+def test_copies_are_made_after_every_name_was_checked(tmp_path: Path):
+    capture = noise_capture(tmp_path / "capture", SIZE, 3)
+    wrong = replace(
+        capture, images=("images/0.png", "images/1.png", "../secret.png"), source=tmp_path / "table.csv"
+    )
+    (tmp_path / "secret.png").write_bytes(b"x")
+    with pytest.raises(InputError, match="leads out of"):
+        capture_json.kept(wrong, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
