@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, read_content, validated
+from jcr.capture.transform_file import read_transform
 from jcr.distributions import chi2
 from jcr.errors import InputError, first_fault
 from jcr.geometry import require_rigid, step_between
 from jcr.records.json_fields import Matrix, Spread3
+from jcr.records.json_file import read_json
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ class _Reference(BaseModel):
 def compare(calibration: Comparable, other: Comparable) -> Difference:
     """Return the step from `calibration` to `other`, and a χ² test whether their covariances explain the step.
 
-    Each argument is a result, a Calibration, a path (run folder, calibration.json, or a JSON file with
-    gripper_from_camera), or a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
+    Each argument is a result, a Calibration, a path (run folder, calibration.json, a JSON file with
+    gripper_from_camera, or a file that `read_transform` reads), or a 4×4 gripper_from_camera. Raises InputError if one of them has no gripper_from_camera.
 
     The step Δ is translation (m), then rotation vector (rad), along gripper axes. Its χ² is ΔᵀV⁻¹Δ, where V is the sum
     of the covariances Pₖ of both by all causes of error k. The share of cause k in χ² is ΔᵀV⁻¹PₖV⁻¹Δ / χ². Without any
@@ -135,8 +137,8 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
 def read_hand_eye(path: Path) -> StatedTransform:
     """Read gripper_from_camera and its covariance from a run folder, calibration.json or reference.json.
 
-    A reference.json may state standard deviations `std_mm` and `std_deg` along the axes of the gripper. Raises
-    InputError for a file without gripper_from_camera.
+    A reference.json may state standard deviations `std_mm` and `std_deg` along the axes of the gripper. Another file
+    holds a transform as jcr.capture.transform_file reads it. Raises InputError for a file without a transform.
     """
     file = path
     if path.is_dir():
@@ -144,7 +146,9 @@ def read_hand_eye(path: Path) -> StatedTransform:
         file = next((path / name for name in names if (path / name).is_file()), path / names[0])
     if not file.is_file():
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
-    content = read_content(file)
+    content = _content_of(file)
+    if content is None:
+        return StatedTransform(read_transform(file))
     if "format" in content:
         return _stated(validated(content, file), str(file))
     try:
@@ -157,3 +161,14 @@ def read_hand_eye(path: Path) -> StatedTransform:
         return StatedTransform(found.gripper_from_camera)
     std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
     return StatedTransform(found.gripper_from_camera, {OTHER: np.diag(std**2)})
+
+
+def _content_of(file: Path) -> dict[str, object] | None:
+    """Return the content of a JSON file that states gripper_from_camera or a format of jcr; None for another file."""
+    if file.suffix.lower() != ".json":
+        return None
+    content = read_json(file)
+    is_ours = file.name == "calibration.json" or (
+        isinstance(content, dict) and "gripper_from_camera" in content
+    )
+    return read_content(file) if is_ours else None

@@ -14,7 +14,7 @@ from jcr.capture.documents import Table
 from jcr.capture.intrinsics import intrinsics_of_capture
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import Pairing, poses_at_images
-from jcr.capture.readings import readings_of, source_of, undecided
+from jcr.capture.readings import readings_of, source_of, undecided, untaken_readings
 from jcr.errors import InputError, first_few
 from jcr.records import Capture, Reading
 
@@ -138,8 +138,17 @@ def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: Read
         source=chosen[0].table.file,
         intrinsics=intrinsics,
         reading=candidates[0][0] if is_decided else None,
+        untaken=_untaken(chosen[0], taken, file) if is_decided else (),
         candidates=() if is_decided else tuple((reading, of_all[taken]) for reading, of_all in candidates),
         notes=(*notes, *more, *capture.notes),
+    )
+
+
+def _untaken(source: _Source, images: list[int], where: str) -> tuple[tuple[Reading, _Poses], ...]:
+    """Return the readings that names or options ruled out, with their poses of the images with the given indices."""
+    others = untaken_readings(source.table, source.candidates[0][0], where, source.paired.skipped)
+    return tuple(
+        (one, poses_at_images(poses, source.paired, np.inf, where)[0][images]) for one, poses in others
     )
 
 

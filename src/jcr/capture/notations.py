@@ -40,6 +40,7 @@ class Maker(NamedTuple):
 
 # "euler:xyz" about fixed axes is Rz(third)·Ry(second)·Rx(first); "euler:ZYX" is Rz(first)·Ry(second)·Rx(third).
 MAKERS = {
+    "rpy": Maker("euler:xyz", "ROS, REP 103 and URDF: roll, pitch, yaw about fixed axes"),
     "ur": Maker("rotvec", "Universal Robots, The URScript Programming Language, pose p[x, y, z, rx, ry, rz]"),
     "franka": Maker("matrix:columns", "Franka, libfranka, RobotState::O_T_EE: column-major 4x4"),
     "xarm": Maker("euler:xyz", "UFACTORY, xArm Developer Manual: roll, pitch, yaw about fixed axes"),
@@ -77,18 +78,21 @@ def notation_of(name: str) -> str:
     )
 
 
-def in_words(notation: str, angle: str) -> str:
-    """Return a notation of a rotation in words, such as "angles in degrees, R = Rz·Ry·Rx"; `angle` is "deg" or "rad"."""
-    unit = {"deg": "degrees", "rad": "radians"}[angle]
+def in_words(notation: str, angle: str = "") -> str:
+    """Return a notation of a rotation in words, such as "angles zyx in degrees, R = Rx·Ry·Rz".
+
+    `angle` is the unit "deg" or "rad"; empty: none is stated.
+    """
+    unit = {"deg": " in degrees", "rad": " in radians", "": ""}[angle]
     if notation == "rotvec":
-        return f"rotation vector in {unit}"
+        return f"rotation vector{unit}"
     if notation.startswith("quat:"):
         return f"quaternion {', '.join(notation[5:])}"
     if notation.startswith("matrix"):
         return "rotation matrix by columns" if notation.endswith("columns") else "rotation matrix"
     sequence = notation[6:]
     product = sequence[::-1] if sequence.islower() else sequence
-    return f"angles {sequence} in {unit}, R = {'·'.join(f'R{axis.lower()}' for axis in product)}"
+    return f"angles {sequence}{unit}, R = {'·'.join(f'R{axis.lower()}' for axis in product)}"
 
 
 def rotations_of(
@@ -100,7 +104,7 @@ def rotations_of(
     than 1 % is no rotation; nor is a mirrored matrix.
     """
     made = np.full((len(numbers), 3, 3), np.nan)
-    sound = np.isfinite(numbers).all(1) & (np.abs(numbers) < HUGE).all(1)
+    sound = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < HUGE).all(axis=1))
     if notation.startswith("quat:"):
         sound &= np.abs(np.linalg.norm(np.where(sound[:, None], numbers, 0.0), axis=1) - 1) < UNIT_TOLERANCE
         order = [notation[5:].index(axis) for axis in "xyzw"]

@@ -3,6 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from os.path import commonprefix
 
@@ -318,6 +319,14 @@ def readings_of(
     sets = pose_columns(table, skipped)
     if options.pose_columns is not None:
         sets = [one for one in sets if one.name == options.pose_columns.lower()]
+    moving = [
+        one
+        for one in sets
+        if np.ptp(numbers[:, one.position], axis=0).max(initial=0.0) > 0 or len(numbers) < 2
+    ]
+    sets = moving or sets  # a position that never changes is something else, such as an arm's configuration
+    if options.pose_convention != "auto":  # all makers write the position first
+        sets = [one for one in sets if one.position < one.rotation or len(one.rotation) == 9] or sets
     best = max((relevance(table, one) for one in sets), default=0)
     for columns in sets:
         if relevance(table, columns) == best:
@@ -363,6 +372,29 @@ def _readings_of_columns(
             yield reading, poses
         if inverted:
             yield replace(reading, inverted=True), inverse(poses)
+
+
+def untaken_readings(
+    table: Table, taken: Reading, where: str, skipped: frozenset[int] = frozenset()
+) -> list[Candidate]:
+    """Return all other readings of the columns that a reading took: every notation of as many numbers, both directions.
+
+    They show what a wrong name or option would have been. Arguments are those of `readings_of`.
+    """
+    numbers, found = numbers_of_table(table), list[Candidate]()
+    for columns in pose_columns(table, skipped):
+        count = len(columns.rotation)
+        if columns.name != taken.columns or count != NUMBERS[taken.notation]:
+            continue
+        every = tuple(notation for notation, width in NUMBERS.items() if width == count)
+        own = replace(columns, notations=every, is_named=False, length=taken.units.split("-")[0], angle=None)
+        with suppress(InputError):
+            found += _readings_of_columns(replace(table, words=""), own, numbers, ReadOptions(), where)
+    return [
+        one
+        for one in _distinct(found)
+        if (one[0].notation, one[0].inverted) != (taken.notation, taken.inverted)
+    ]
 
 
 def _allowed(columns: PoseColumns, asked: str | None, words: str) -> tuple[str, ...]:

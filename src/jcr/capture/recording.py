@@ -123,7 +123,10 @@ def best_frames(
     Each stop of the arm (below 5 mm/s) gives at most one frame; the slowest frames between stops are added if
     necessary. Raises InputError if fewer than three frames are left.
     """
-    still = _runs(usable & (speed < STILL))
+    steps = np.asarray(motion_length(inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]))
+    # A camera that is triggered at the stops has no frames between them: the arm's moves part the stops, too.
+    moved = np.append(steps > SAME_VIEW, False)
+    still = _runs(usable & (speed < STILL), moved)
     moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]
     if len(moments) < count:  # add the slowest frame of each of about 4 · count equal pieces of the motion
         moving = _runs(usable & (speed >= STILL))
@@ -194,7 +197,13 @@ def _most_informative(
     return chosen
 
 
-def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
-    """Return the runs of consecutive rows at which `mask` is True, each as an ascending array of row indices."""
+def _runs(mask: Bool[ndarray, " n"], ends: Bool[ndarray, " n"] | None = None) -> list[Rows]:
+    """Return the runs of consecutive rows at which `mask` is True, each as an ascending array of row indices.
+
+    A run also ends at a row at which `ends` is True.
+    """
     rows = np.flatnonzero(mask)
-    return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]
+    parts = np.diff(rows) > 1
+    if ends is not None and len(rows):
+        parts = parts | ends[rows[:-1]]
+    return [run for run in np.split(rows, np.flatnonzero(parts) + 1) if len(run)]

@@ -102,7 +102,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"
     lines = [f"{verdict}: {outcome}. {about}"]
-    if undecided:
+    if isinstance(capture, Capture) and capture.candidates:
         readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
         lines += labelled("Poses", f"{readings} (jcr check without --poses-only, or jcr run)")
     elif isinstance(capture, Capture) and capture.reading is not None:
@@ -171,8 +171,9 @@ def _check_facts(found: "Examination") -> dict[str, Any]:
 class CompareCommand:
     """Compare two calibrations: their difference in mm and degrees, and whether their covariances explain it.
 
-    Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's reference.json, or
-    the folder that holds one; with `std_mm` and `std_deg` if its errors are known). With --verbose: χ², the squared
+    Each is a run folder, a calibration.json, any JSON with a `gripper_from_camera` (a capture's reference.json, or
+    the folder that holds one; with `std_mm` and `std_deg` if its errors are known), a file of `jcr export` or
+    easy_handeye, or a document with a 4×4 matrix. With --verbose: χ², the squared
     difference in units of both covariances, and p, the probability of a larger one if nothing else is wrong. For two
     calibrations of one arm p is too large, because they share systematic errors. The exit status is 3 if one of the
     two is rejected, or if the reported errors do not explain the difference.

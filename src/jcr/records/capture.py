@@ -172,6 +172,8 @@ class Capture:
 
     A pose is NaN where a row holds none. r is the number of images, or of rows where rows and images differ in number.
     Until a reading is decided, `base_from_gripper` is NaN."""
+    untaken: tuple[tuple[Reading, Float[ndarray, "n 4 4"]], ...] = ()
+    """Readings of the same numbers that a name or an option ruled out, for the diagnosis of a rejected calibration."""
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -186,6 +188,7 @@ class Capture:
             base_from_gripper=self.base_from_gripper[chosen],
             joints=None if self.joints is None else self.joints[chosen],
             depths=None if self.depths is None else tuple(self.depths[row] for row in chosen),
+            untaken=tuple((reading, poses[chosen]) for reading, poses in self.untaken),
             others=(),
         )
 

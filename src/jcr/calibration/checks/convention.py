@@ -12,14 +12,18 @@ from numpy import ndarray
 from jcr.calibration.case import Case
 from jcr.capture.notations import EULERS, NUMBERS, in_words, rotations_of
 from jcr.capture.notations import numbers_of as written_in
-from jcr.capture.pairing import AS_TEXT, other_orders
+from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, other_orders
+from jcr.capture.readings import options_of, text_of
 from jcr.estimation.pose_misfit import Misfit, angle_gap, pair_angles, pose_misfit
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, inverse, rotation_angle, transform
 from jcr.records import Reading
 
-FITTED = 12
+FITTED = 60
 """Largest number of readings, ranked by screw congruence, that are fitted; each takes 10 ms."""
+SAME_ANGLE = np.radians(0.1)
+"""Step (rad) to which differences of angles are rounded for the ranking, so that usual mistakes come first among equals;
+many readings differ by names of axes only, which leaves all angles equal."""
 FITS_MM = 3.0
 """Misfit (mm) up to which the given poses count as correct: the noise of a low-cost arm."""
 BETTER = 3.0
@@ -46,7 +50,7 @@ def check_convention(case: Case) -> Case:
         return case
     observable = case.hand_eye.observability.observable
     poses = capture.base_from_gripper
-    return case.after(better_reading(poses, camera, observable, capture.images, rows, capture.reading))
+    return case.after(better_reading(poses, camera, observable, capture.images, rows, capture.untaken))
 
 
 def of_camera(gripper_from_camera: Poses) -> Finding | None:
@@ -74,7 +78,7 @@ def better_reading(
     observable: bool = True,
     names: Sequence[str] | None = None,
     rows: Int[ndarray, " m"] | None = None,
-    reading: Reading | None = None,
+    untaken: Sequence[tuple[Reading, Poses]] = (),
 ) -> tuple[Finding, ...]:
     """Return a finding of the reading or order of the poses that fits much better than the given one; else nothing.
 
@@ -83,17 +87,18 @@ def better_reading(
     degenerate motions may fit another reading by chance.
 
     `rows` holds the index of the gripper pose of each of the m camera poses; None: both arrays have the same order and
-    length, as pairs of poses without images have. `names` are the images' names, by which other programs sort. `reading`
-    states how the poses were read from a file.
+    length, as pairs of poses without images have. `names` are the images' names, by which other programs sort. `untaken`
+    are other readings of the same numbers; without them, numbers are made from the poses.
     """
     is_pairs, rows = rows is None, np.arange(len(base_from_gripper)) if rows is None else rows
     given = pose_misfit(base_from_gripper[rows], recon_from_camera)
     if given.mm < FITS_MM:
         return ()
     angles, ranked = pair_angles(recon_from_camera), list[tuple[float, _Alternative]]()
-    for one in _alternatives(base_from_gripper, rows, names, reading):
+    for one in _alternatives(base_from_gripper, rows, names, untaken):
         if len(one[3]) > 3:
-            ranked.append((angle_gap(pair_angles(one[2]), angles[np.ix_(one[3], one[3])]), one))
+            gap = angle_gap(pair_angles(one[2]), angles[np.ix_(one[3], one[3])])
+            ranked.append((round(gap / SAME_ANGLE), one))
     ranked.sort(key=lambda pair: pair[0])
     fits = [(pose_misfit(one[2], recon_from_camera[one[3]]), one) for _, one in ranked[:FITTED]]
     if not fits:
@@ -116,44 +121,41 @@ def better_reading(
 
 
 def _alternatives(
-    every: Poses, rows: Int[ndarray, " m"], names: Sequence[str] | None, reading: Reading | None
+    every: Poses,
+    rows: Int[ndarray, " m"],
+    names: Sequence[str] | None,
+    untaken: Sequence[tuple[Reading, Poses]],
 ) -> Iterator[_Alternative]:
-    """Yield other readings and orders of all gripper poses `every`, usual mistakes first; `rows` as in better_reading."""
+    """Yield other readings and orders of all gripper poses `every`, usual mistakes first; other arguments as above."""
     own, each = every[rows], np.arange(len(rows))
-    again = "" if reading is None or reading.inverted else "add --pose-inverted"
-    yield (INVERSES, again or "take --pose-inverted out, or correct them at their source", inverse(own), each)
+    if not untaken:
+        yield (INVERSES, "add --pose-inverted", inverse(own), each)
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     flip = "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses"
     yield (MIRRORED, flip, mirror @ own @ mirror, each)
+    for reading, poses in untaken:
+        known = np.flatnonzero(np.isfinite(poses[rows]).all((1, 2)))
+        yield (text_of(reading), f"give {options_of(reading)}", poses[rows][known], known)
     for how, order in other_orders(names or [f"{k:04d}" for k in range(len(every))]):
         inside = order[rows] >= 0
-        remedy = (
-            "add a column image with the images' names" if AS_TEXT in how or "number" in how else AT_SOURCE
-        )
+        remedy = "add a column image with the images' names" if how in (AS_TEXT, AS_NUMBERS) else AT_SOURCE
         yield (how, remedy, every[order[rows][inside]], each[inside])
-    for taken, meant, in_degrees in _mistakes(reading):
+    for taken, meant, in_degrees in () if untaken else _mistakes():
         numbers = written_in(own[:, :3, :3], taken)
         read = rotations_of(np.degrees(numbers) if in_degrees else numbers, meant)
-        unit = " in radians that were taken as degrees" if in_degrees else ""
-        were = "" if taken == meant else f" that were taken as {in_words(taken, 'rad')}"
-        option = f"add --pose-convention {meant}" if reading is not None and not in_degrees else ""
-        words = f"{in_words(meant, 'rad').replace(' in radians', '')}{unit or were}"
-        yield (
-            words,
-            option or (f"{AT_SOURCE}, or add --pose-convention {meant} where a file is read"),
-            transform(read, own[:, :3, 3]),
-            each,
+        were = (
+            "in radians that were taken as degrees" if in_degrees else f"that were taken as {in_words(taken)}"
         )
+        remedy = (
+            AT_SOURCE if in_degrees else f"{AT_SOURCE}; from a file, --pose-convention {meant} reads them"
+        )
+        yield (f"{in_words(meant)} {were}", remedy, transform(read, own[:, :3, 3]), each)
 
 
-def _mistakes(reading: Reading | None) -> Iterator[tuple[str, str, bool]]:
-    """Yield the notation in which numbers were taken, that in which they were meant, and whether degrees were radians.
-
-    With a known reading, the numbers were taken in its notation.
-    """
+def _mistakes() -> Iterator[tuple[str, str, bool]]:
+    """Yield the notation that was taken, the one that was meant, and whether degrees were taken for radians."""
     yield from (("matrix", "matrix:columns", False), ("rotvec", "rotvec", True))
-    taken = tuple(NUMBERS) if reading is None else (reading.notation,)
-    for one in taken:
+    for one in NUMBERS:
         for other in NUMBERS:
             if other != one and NUMBERS[one] == NUMBERS[other] and not one.startswith("matrix"):
                 yield one, other, False

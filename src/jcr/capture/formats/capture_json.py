@@ -286,7 +286,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
     for name in filter(None, (*capture.images, *(capture.depths or ()), *others)):
         write_new(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, made_from=[str(capture.source)])
-    return replace(read(folder), notes=capture.notes)
+    return replace(read(folder), notes=capture.notes, untaken=capture.untaken)
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:

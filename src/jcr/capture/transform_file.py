@@ -1,0 +1,90 @@
+"""Reading of one rigid transform from a file: exports for ROS, results of easy_handeye, or a matrix in any document."""
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.capture.documents import read_record_tables, read_tables
+from jcr.capture.documents.table import decode_text, read_limited
+from jcr.capture.notations import poses_of_rows
+from jcr.capture.options import ReadOptions
+from jcr.capture.readings import numbers_of_table, readings_of
+from jcr.errors import InputError
+from jcr.geometry import transform
+
+ARGUMENTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Arguments of ROS 2's static_transform_publisher."""
+ARRAYS = (".npy", ".npz", ".mat")
+
+
+def read_transform(file: Path) -> Float[ndarray, "4 4"]:
+    """Read the rigid transform (m) in a file: the camera's pose in the gripper frame, as `jcr export` writes it.
+
+    Read are a static_transform_publisher's arguments, the only fixed joint of a URDF, translation and rotation in YAML
+    or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several.
+    """
+    text = "" if file.suffix.lower() in ARRAYS else decode_text(file, read_limited(file))
+    found = [*_of_arguments(text), *_of_urdf(text)]
+    if not found:
+        found = [*_of_matrix(file), *_of_record(file)]
+    if not found:
+        raise InputError(
+            f"{file}: holds no transform; give translation and rotation, a 4x4 matrix, or what `jcr export` writes"
+        )
+    if any(not np.allclose(found[0], other, rtol=0, atol=1e-9) for other in found[1:]):
+        raise InputError(f"{file}: holds several transforms; give a file with one")
+    return found[0]
+
+
+def _of_arguments(text: str) -> list[Float[ndarray, "4 4"]]:
+    """Return the transforms of static_transform_publisher's named arguments in a launch file or a command."""
+    columns = [re.findall(rf'--{name}[\s",=]+([-+.\deE]+)', text) for name in ARGUMENTS]
+    rows = zip(*columns, strict=False)
+    return [_from_quaternion([float(number) for number in row]) for row in rows]
+
+
+def _from_quaternion(numbers: list[float]) -> Float[ndarray, "4 4"]:
+    """Return the transform of x, y, z (m) and a quaternion x, y, z, w."""
+    return transform(Rotation.from_quat(numbers[3:]).as_matrix(), np.array(numbers[:3]))
+
+
+def _of_urdf(text: str) -> list[Float[ndarray, "4 4"]]:
+    """Return the transforms of a URDF's fixed joints that have an origin."""
+    if "<robot" not in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
+        return []
+    try:
+        joints = ElementTree.fromstring(text).findall("joint[@type='fixed']")
+    except ElementTree.ParseError:
+        return []
+    made = []
+    for origin in (one for joint in joints for one in joint.findall("origin")):
+        xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
+        made.append(transform(Rotation.from_euler("xyz", rpy).as_matrix(), xyz))
+    return made
+
+
+def _of_matrix(file: Path) -> list[Float[ndarray, "4 4"]]:
+    """Return the transforms of the 4x4 matrices in a document."""
+    made = []
+    for table in read_tables(file):
+        numbers = numbers_of_table(table)
+        if numbers.shape in ((4, 4), (1, 16)) and np.allclose(numbers.reshape(4, 4)[3], (0, 0, 0, 1)):
+            made.append(poses_of_rows(numbers.reshape(1, 16), "matrix", where=str(file))[0])
+    return made
+
+
+def _of_record(file: Path) -> list[Float[ndarray, "4 4"]]:
+    """Return the transforms of a document that is one record, such as a translation and a quaternion."""
+    for table in read_record_tables([file]):
+        readings = readings_of(table, ReadOptions(), str(file))[1]
+        stated = [
+            poses[0] for reading, poses in readings if reading.decided_by == "names" or len(readings) == 2
+        ]
+        if stated:
+            return stated[:1]
+    return []
