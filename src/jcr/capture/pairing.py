@@ -145,7 +145,11 @@ def _by_cells(table: Table, images: Sequence[str]) -> Pairing | None:
         enough = NEARLY * min(len(images), len(table.rows))
         if count >= max(enough, 1) and count > most:
             most = count
-            name = "names of rows" if column is None else f"column {table.columns[column] or column + 1}"
+            name = (
+                "names of rows"
+                if column is None
+                else f"column {table.columns[column] or f'no. {column + 1}'}"
+            )
             skipped = (
                 frozenset(() if column is None else (column,))
                 | _counting_columns(table)

@@ -325,7 +325,9 @@ def readings_of(
         if np.ptp(numbers[:, one.position], axis=0).max(initial=0.0) > 0 or len(numbers) < 2
     ]
     sets = moving or sets  # a position that never changes is something else, such as an arm's configuration
-    if options.pose_convention != "auto":  # all makers write the position first
+    if (
+        options.pose_convention != "auto" or _maker_in(table.words) is not None
+    ):  # all makers write the position first
         sets = [one for one in sets if one.position < one.rotation or len(one.rotation) == 9] or sets
     best = max((relevance(table, one) for one in sets), default=0)
     for columns in sets:
@@ -360,7 +362,8 @@ def _readings_of_columns(
         poses = poses_of(position, rotation, notation, f"{length}-{angle}")
         if int(np.isnan(poses[:, 0, 0]).sum()) > tolerated(len(poses)):
             continue
-        decided_by = "option" if asked else "names" if columns.is_named and len(notations) == 1 else "numbers"
+        is_stated = columns.is_named or _maker_in(table.words) is not None
+        decided_by = "option" if asked else "names" if is_stated and len(notations) == 1 else "numbers"
         reading = Reading(
             file=source_of(table),
             columns=columns.name,
@@ -408,20 +411,28 @@ def _allowed(columns: PoseColumns, asked: str | None, words: str) -> tuple[str, 
         if is_matrix and len(columns.notations) == 1:
             return columns.notations
         return (asked,) if NUMBERS[asked] == len(columns.rotation) else ()
-    for word, maker in (("robtarget", "abb"), ("p[", "ur"), ("movej p", "ur"), ("movel p", "ur")):
-        if word in words and MAKERS[maker].notation in columns.notations:
-            return (MAKERS[maker].notation,)
+    maker = _maker_in(words)
+    if maker is not None and MAKERS[maker].notation in columns.notations:
+        return (MAKERS[maker].notation,)
     return columns.notations
+
+
+def _maker_in(words: str) -> str | None:
+    """Return the maker whose word for a pose stands around the numbers: `p[…]` is UR's, robtarget is ABB's; or None."""
+    names = set(words.split())
+    return "abb" if "robtarget" in names else "ur" if "p" in names else None
 
 
 def _directions(table: Table, columns: PoseColumns, options: ReadOptions) -> tuple[bool, bool]:
     """Return whether the poses may be base_from_gripper, and whether they may be its inverse."""
-    text = "_".join((table.file.stem, table.place, columns.name)).lower().replace(".", "_")
+    key = "" if table.keys is None else table.keys[0]
+    text = "_".join((table.file.stem, table.place, key, columns.name)).lower().replace(".", "_")
     if options.pose_inverted:
         return False, True
     if INVERSE.search(text):
         return False, True
-    is_stated = columns.is_named or DIRECT.search(text) is not None or options.pose_convention != "auto"
+    by_maker = options.pose_convention != "auto" or _maker_in(table.words) is not None
+    is_stated = columns.is_named or DIRECT.search(text) is not None or by_maker
     return True, not is_stated
 
 
