@@ -243,8 +243,16 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
                     )
                 )
         if found:
-            return found[:1] if len(columns) == 16 else found
+            return found[:1] if len(columns) == 16 else _most_exact(found, numbers)
     return []
+
+
+def _most_exact(found: list[PoseColumns], numbers: Numbers) -> list[PoseColumns]:
+    """Return the poses whose quaternions have the most exact length; those of shifted columns are near 1 by chance."""
+    if len(found[0].rotation) != 4:
+        return found
+    off = [float(np.nanmax(np.abs(np.linalg.norm(numbers[:, one.rotation], axis=1) - 1))) for one in found]
+    return [one for one, size in zip(found, off, strict=True) if size <= 10 * min(off) + 1e-5]
 
 
 _Layout = tuple[Sequence[int], Sequence[int], tuple[str, ...], Sequence[int]]
