@@ -24,9 +24,10 @@ from jcr.camera import (
     undistortion,
     unproject,
     with_parameters,
+    without_distortion,
     zoomed,
 )
-from jcr.records import Intrinsics
+from jcr.records import Intrinsics, IntrinsicsAndStd
 
 WIDE = Intrinsics(634.6, 634.1, 641.95, 358.99, 1280, 720, (-0.0606, 0.0727, -0.00025, 0.00053, -0.0236))
 BARREL = Intrinsics(300.0, 310.0, 322.0, 236.0, 640, 480, (-0.22, 0.04, 0.001, -0.002, -0.002))
@@ -173,3 +174,9 @@ def test_a_fisheye_is_smooth_on_its_axis_and_its_pinhole_grid_ends_before_its_bo
     assert grid.model == "pinhole" and np.abs(rays(grid)).max() < 1.8
     seen = project(FISHEYE, rays(grid))
     assert (seen > -0.5).all() and (seen < [FISHEYE.width - 0.5, FISHEYE.height - 0.5]).all()
+
+
+def test_intrinsics_with_std_lose_distortion_and_std_together():
+    """A camera with twelve coefficients and their standard deviations has a pinhole without these."""
+    found = IntrinsicsAndStd(600, 601, 320, 240, 640, 480, (0.1,) * 12, "thin_prism", std=(1.0,) * 16)
+    assert without_distortion(found) == Intrinsics(600, 601, 320, 240, 640, 480)

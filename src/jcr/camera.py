@@ -66,12 +66,13 @@ def is_distorted(camera: Intrinsics) -> bool:
 def with_thin_prism(camera: Intrinsics) -> Intrinsics:
     """Return a pinhole or rational camera converted to the thin prism model, with the same projection."""
     padded = [*camera.distortion, *[0.0] * (len(COEFFICIENTS["thin_prism"]) - len(camera.distortion))]
-    return replace(camera, distortion=tuple(padded), model="thin_prism")
+    numbers = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    return Intrinsics(*numbers, tuple(padded), "thin_prism")
 
 
 def without_distortion(camera: Intrinsics) -> Intrinsics:
     """Return the pinhole camera without distortion that has the same focal lengths and principal point."""
-    return replace(camera, distortion=(0.0,) * 5, model="pinhole")
+    return Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
