@@ -6,7 +6,7 @@ A reading or an order that fits is reported, and never applied.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
@@ -16,7 +16,7 @@ from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, other_orders
 from jcr.capture.readings import options_of, text_of
 from jcr.estimation.pose_misfit import Misfit, angle_gap, pair_angles, pose_misfit
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import Poses, inverse, rotation_angle, transform
+from jcr.geometry import Poses, Transform, inverse, rotation_angle, transform
 from jcr.records import Reading
 
 FITTED = 60
@@ -53,7 +53,7 @@ def check_convention(case: Case) -> Case:
     return case.after(better_reading(poses, camera, observable, capture.images, rows, capture.untaken))
 
 
-def of_camera(gripper_from_camera: Poses) -> Finding | None:
+def of_camera(gripper_from_camera: Transform) -> Finding | None:
     """Return the finding that camera and gripper frame coincide, as where a board's poses were read; None otherwise."""
     metres = float(np.linalg.norm(gripper_from_camera[:3, 3]))
     radians = float(rotation_angle(gripper_from_camera[:3, :3]))
@@ -74,7 +74,7 @@ def inverted_pair(misfit: Misfit, text: str) -> Finding:
 
 def better_reading(
     base_from_gripper: Poses,
-    recon_from_camera: Poses,
+    recon_from_camera: Float[ndarray, "m 4 4"],
     observable: bool = True,
     names: Sequence[str] | None = None,
     rows: Int[ndarray, " m"] | None = None,
@@ -109,6 +109,8 @@ def better_reading(
         return ()
     texts = [
         f"{1e3 * one.metres:.1f} mm and {np.degrees(one.radians):.2f}° per axis over {count} images"
+        if np.isfinite(one.mm)
+        else "no fit"
         for one, count in ((fit, len(poses)), (given, len(rows)))
     ]
     if is_pairs and words == INVERSES:
