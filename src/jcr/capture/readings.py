@@ -408,8 +408,8 @@ def _allowed(columns: PoseColumns, asked: str | None, words: str) -> tuple[str, 
         if is_matrix and len(columns.notations) == 1:
             return columns.notations
         return (asked,) if NUMBERS[asked] == len(columns.rotation) else ()
-    for word, maker in ((r"\brobtarget\b", "abb"), (r"(?:move\w )?p\b", "ur")):  # words have no brackets
-        if re.match(rf"(?:const )?{word}", words) and MAKERS[maker].notation in columns.notations:
+    for word, maker in ((r".*\brobtarget\b", "abb"), (r"(move\w )?p\b", "ur")):  # words have no brackets
+        if re.match(word, words) and MAKERS[maker].notation in columns.notations:
             return (MAKERS[maker].notation,)
     return columns.notations
 
