@@ -29,14 +29,16 @@ def rows_as(convention: str, poses: np.ndarray) -> np.ndarray:
     written = {
         ("matrix",): poses.reshape(-1, 16),
         ("franka",): np.swapaxes(poses, 1, 2).reshape(-1, 16),
-        ("quat-xyzw",): np.hstack([position, quaternion["xyzw"]]),
-        ("quat-wxyz", "realman"): np.hstack([position, quaternion["wxyz"]]),
+        ("quat:xyzw",): np.hstack([position, quaternion["xyzw"]]),
+        ("quat:wxyz",): np.hstack([position, quaternion["wxyz"]]),
         ("abb",): np.hstack([mm, quaternion["wxyz"]]),
-        ("rotation-vector", "ur"): np.hstack([position, vector]),
+        ("rotvec", "ur"): np.hstack([position, vector]),
         ("xarm-axis-angle",): np.hstack([mm, np.degrees(vector)]),
-        ("rpy", "unitree"): np.hstack([position, rpy]),
-        ("xarm", "fanuc", "yaskawa"): np.hstack([mm, np.degrees(rpy)]),
-        ("kuka",): np.hstack([mm, np.degrees(rpy[:, ::-1])]),
+        ("rpy", "unitree", "realman", "aubo"): np.hstack([position, rpy]),
+        ("xarm", "fanuc", "yaskawa", "techman", "jaka"): np.hstack([mm, np.degrees(rpy)]),
+        ("kuka", "epson"): np.hstack([mm, np.degrees(rpy[:, ::-1])]),
+        ("doosan", "kawasaki"): np.hstack([mm, rotation.as_euler("ZYZ", degrees=True)]),
+        ("staubli", "mecademic"): np.hstack([mm, rotation.as_euler("XYZ", degrees=True)]),
     }
     return next(rows for conventions, rows in written.items() if convention in conventions)
 
@@ -67,7 +69,7 @@ def write_camera_info(capture: Capture, folder: Path) -> None:
 def write_table(
     folder: Path,
     capture: Capture,
-    convention: str = "quat-xyzw",
+    convention: str = "quat:xyzw",
     header: str | None = "image,x,y,z,qx,qy,qz,qw",
     separator: str = ",",
 ) -> Path:
@@ -98,7 +100,7 @@ def write_tum(
     write_camera_info(capture, folder)
     lines = [header] if header else []
     separator = ", " if "," in header else " "
-    rows = rows_as("quat-xyzw", capture.base_from_gripper).tolist()
+    rows = rows_as("quat:xyzw", capture.base_from_gripper).tolist()
     for k, (name, row) in enumerate(zip(capture.images, rows, strict=True)):
         stamp = start + k * 10**9
         shutil.copy(capture.folder / name, folder / "images" / f"{stamp}{Path(name).suffix}")
@@ -152,7 +154,7 @@ def write_easy_handeye2(
                 "translation": dict(zip("xyz", row[:3], strict=True)),
                 "rotation": dict(zip("xyzw", row[3:], strict=True)),
             }
-            for row in rows_as("quat-xyzw", poses).tolist()
+            for row in rows_as("quat:xyzw", poses).tolist()
         ]
 
     pairs = zip(parts(base_from_gripper), parts(inverse(recon_from_camera)), strict=True)
@@ -165,7 +167,7 @@ def write_easy_handeye2(
 def write_list(folder: Path, capture: Capture) -> Path:
     """poses.json with named images."""
     begin(folder, capture)
-    keys, rows = ("x", "y", "z", "qx", "qy", "qz", "qw"), rows_as("quat-xyzw", capture.base_from_gripper)
+    keys, rows = ("x", "y", "z", "qx", "qy", "qz", "qw"), rows_as("quat:xyzw", capture.base_from_gripper)
     named = zip(capture.images, rows.tolist(), strict=True)
     poses = [{"image": name, "pose": dict(zip(keys, row, strict=True))} for name, row in named]
     (folder / "poses.json").write_text(json.dumps({"poses": poses}))

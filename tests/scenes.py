@@ -119,21 +119,27 @@ def mirrored(poses: ndarray) -> ndarray:
 MISTAKES: dict[str, tuple[Change, str]] = {
     "inverses": (inverse, "inverse"),
     "reversed": (lambda g: g[::-1].copy(), "reverse order"),
-    "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
+    "late by one": (lambda g: np.roll(g, 1, 0), "one ahead of the images"),
     "left-handed base": (mirrored, "mirrored ones"),
-    "transposed": (rotated(lambda r: r.inv()), "transposed rotations"),
+    "transposed": (
+        rotated(lambda r: r.inv()),
+        "rotation matrix by columns that were taken as rotation matrix",
+    ),
     "w first": (
         rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [3, 0, 1, 2]])),
-        "quaternions w, x, y, z",
+        "quaternion w, x, y, z that were taken as quaternion x, y, z, w",
     ),
-    "w last": (rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [1, 2, 3, 0]])), "quaternions x, y, z, w"),
+    "w last": (
+        rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [1, 2, 3, 0]])),
+        "quaternion x, y, z, w that were taken as quaternion w, x, y, z",
+    ),
     "Euler order": (
         rotated(lambda r: Rotation.from_euler("xyz", r.as_euler("ZYX"))),
-        "Euler angles ZYX that were taken as xyz",
+        "angles ZYX, R = Rz·Ry·Rx that were taken as angles xyz",
     ),
     "vectors, radians for degrees": (
         rotated(lambda r: Rotation.from_rotvec(np.radians(r.as_rotvec()))),
-        "rotation vectors in radians that were taken as degrees",
+        "rotation vector in radians that were taken as degrees",
     ),
 }
 """Mistakes in writing gripper poses that another reading explains, and how that is named."""

@@ -178,5 +178,5 @@ def test_a_fisheye_is_smooth_on_its_axis_and_its_pinhole_grid_ends_before_its_bo
 
 def test_intrinsics_with_std_lose_distortion_and_std_together():
     """A camera with twelve coefficients and their standard deviations has a pinhole without these."""
-    found = IntrinsicsAndStd(600, 601, 320, 240, 640, 480, (0.1,) * 12, "thin_prism", std=(1.0,) * 16)
-    assert without_distortion(found) == Intrinsics(600, 601, 320, 240, 640, 480)
+    found = IntrinsicsAndStd(600.0, 601.0, 320.0, 240.0, 640, 480, (0.1,) * 12, "thin_prism", (1.0,) * 16)
+    assert without_distortion(found) == Intrinsics(600.0, 601.0, 320.0, 240.0, 640, 480)

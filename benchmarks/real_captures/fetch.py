@@ -33,7 +33,7 @@ from jcr.records import Capture, Intrinsics
 RECIPES = Path(__file__).with_name("recipes.toml")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 """Number in a text, of any notation that the repositories use."""
-WIDTHS = {"matrix": 16, "quat-xyzw": 7}
+WIDTHS = {"matrix": 16, "quat:xyzw": 7}
 """Numbers of a pose, by its convention, where these are not six."""
 
 

@@ -102,7 +102,7 @@ def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path:
     for k in range(11):
         grey = np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8)
         Image.fromarray(grey).save(folder / "data" / f"view_{k}.png")
-    rows = rows_as("rotation-vector", poses)
+    rows = rows_as("rotvec", poses)
     (folder / "data" / "poses.txt").write_text("\n".join(", ".join(map(repr, row)) for row in rows.tolist()))
 
     def git(*words: str) -> str:
@@ -119,7 +119,7 @@ def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path:
         licence="MIT",
         images="data/view_*.png",
         poses="data/poses.txt",
-        convention="rotation-vector",
+        convention="rotvec",
         use_images="1:",
         use_poses=[1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
         intrinsics=[60.0, 61.0, 31.5, 23.5],

@@ -6,9 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr.calibration.checks.convention import BY_NUMBER, BY_TEXT, MIRRORED, better_reading
-from jcr.capture.pairing import paired_by_name
-from jcr.findings import sentence
+from jcr.calibration.checks.convention import MIRRORED, better_reading
+from jcr.capture.notations import numbers_of, poses_of
+from jcr.capture.pairing import AS_NUMBERS, AS_TEXT
+from jcr.findings import FindingKind, sentence
+from jcr.geometry import inverse
+from jcr.records import Reading
 from scenes import MISTAKES
 from simulation.problems import hand_eye_problem
 
@@ -26,11 +29,13 @@ def test_each_mistake_is_named(mistake: str):
     problem = hand_eye_problem(
         np.random.default_rng(1), 9, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
     )
-    (found,) = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
+    # Rows of images: pairs of poses do not tell inverses of the gripper from inverses of the marker.
+    (found,) = better_reading(write(problem.base_from_gripper), problem.recon_from_camera, rows=np.arange(9))
     assert re.search(words, sentence(found)) and found.value is not None
     # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
     assert misfit(found.details["fits"]) < 1.0 and found.value < 0.5e-3
-    assert misfit(found.details["given"]) > 10.0
+    assert found.details["given"] == "no fit" or misfit(found.details["given"]) > 10.0
+    assert found.kind is FindingKind.POSE_CONVENTION
 
 
 @pytest.mark.slow
@@ -48,11 +53,11 @@ def test_rows_in_another_order_of_the_images_names_are_named():
     by_text = sorted(range(12), key=lambda k: names[k])
     # Rows of a table in order of the names as text, images paired as people count; and the other way round.
     for images, rows, order in (
-        (names, poses[by_text], BY_TEXT),
-        ([names[k] for k in by_text], poses, BY_NUMBER),
+        (names, poses[by_text], AS_TEXT),
+        ([names[k] for k in by_text], poses, AS_NUMBERS),
     ):
         cameras = problem.recon_from_camera[[int(Path(name).stem) - 1 for name in images]]
-        (found,) = better_reading(rows, cameras, by_name=paired_by_name(images, rows))
+        (found,) = better_reading(rows, cameras, names=images, rows=np.arange(12))
         assert found.details["reading"] == order and "add a column image" in sentence(found)
 
 
@@ -70,3 +75,49 @@ def test_the_order_counts_images_without_a_camera_pose():
 def test_sound_poses_are_left_alone(noise):
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)
     assert better_reading(problem.base_from_gripper, problem.recon_from_camera) == ()
+
+
+@pytest.mark.slow
+def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
+    """ZYZ angles that were read as ZYX: the remedy is an option that reads the file."""
+    problem = hand_eye_problem(np.random.default_rng(5), 10, robot_noise=(2e-4, 5e-4))
+    numbers, position = (
+        numbers_of(problem.base_from_gripper[:, :3, :3], "euler:ZYZ"),
+        problem.base_from_gripper[:, :3, 3],
+    )
+    kinds = ("euler:XYZ", "euler:ZYZ", "rotvec")
+    untaken = [(Reading(file="poses.csv", notation=one), poses_of(position, numbers, one)) for one in kinds]
+    (found,) = better_reading(
+        poses_of(position, numbers, "euler:ZYX"),
+        problem.recon_from_camera,
+        rows=np.arange(10),
+        untaken=untaken,
+    )
+    assert (
+        found.details["remedy"] == "give --pose-convention euler:ZYZ" and misfit(found.details["fits"]) < 1.0
+    )
+
+
+@pytest.mark.slow
+def test_inverted_samples_name_both_possibilities():
+    """Of pairs without images, the gripper's or the marker's poses may be inverted: G⁻¹·X = Z·C and G·Z = X·C⁻¹."""
+    problem = hand_eye_problem(np.random.default_rng(6), 10)
+    near = np.linalg.norm(problem.gripper_from_camera[:3, 3])
+    for gripper, cameras in (
+        (inverse(problem.base_from_gripper), problem.recon_from_camera),
+        (problem.base_from_gripper, inverse(problem.recon_from_camera)),
+    ):
+        (found,) = better_reading(gripper, cameras)
+        assert found.kind is FindingKind.INVERTED_PAIR and found.severity == "rejects"
+        distances = (found.value, found.details["other"])
+        assert min(abs(float(one) - near) for one in distances if one is not None) < 1e-6
+
+
+@pytest.mark.slow
+def test_poses_of_the_camera_itself_are_named():
+    """A board's inverse pose, given for the robot's: gripper_from_camera would be the identity."""
+    problem = hand_eye_problem(np.random.default_rng(7), 10)
+    (found,) = better_reading(
+        inverse(problem.base_from_camera), problem.recon_from_camera, rows=np.arange(10)
+    )
+    assert found.kind is FindingKind.POSES_OF_CAMERA and found.severity == "rejects"

@@ -8,11 +8,12 @@ import yaml
 from pydantic import TypeAdapter
 
 import jcr
-from jcr.capture.plain_files import validated_content
-from jcr.capture.ros import intrinsics_of_ros, read_camera_info
+from jcr.capture.intrinsics import read_intrinsics
+from jcr.capture.ros import intrinsics_of_ros
 from jcr.export import ros
 from jcr.records import Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.json_file import validated_content
 
 SIZE = (640, 480)
 RATIONAL = Intrinsics(
@@ -30,7 +31,7 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration(intrinsics:
         parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
     )
     (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount))
-    assert read_camera_info(tmp_path / "camera_info.yaml", SIZE) == intrinsics
+    assert read_intrinsics(tmp_path / "camera_info.yaml", SIZE) == intrinsics
     printed = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
     assert printed["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
     file = TypeAdapter(Intrinsics)

@@ -110,7 +110,7 @@ def intrinsics_of_entry(entry: dict[str, Any], size: tuple[int, int], where: str
     known = MODELS.get(model)
     if known is None and not any(coefficients):
         known = "pinhole"
-    if known == "pinhole" and len(coefficients) > 5:
+    if model in ("", "opencv", "pinhole") and len(coefficients) > 5:  # other names state the number
         known = "rational"
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(

@@ -59,7 +59,7 @@ ZONE_NS = 900 * 10**9
 AT_REST = 0.005
 """Largest speed (m/s) of an arm at rest, as in jcr.capture.recording."""
 DATE = re.compile(
-    r"(\d{4})[-_.:]?(\d\d)[-_.:]?(\d\d)[T _-]+(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[.,_](\d{1,9}))?"
+    r"(?<!\d)(\d{4})[-_.:]?(\d\d)[-_.:]?(\d\d)[T _-]+(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[.,_](\d{1,9}))?"
 )
 """Date and time in a name or a cell, with any separators."""
 
@@ -272,7 +272,8 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
             "header",
             "ros",
         }
-        if len(set(map(str, cells))) < len(cells) / 2:
+        is_fraction = bool(words & {"nanosec", "nsecs", "nsec"})
+        if len(set(map(str, cells))) < len(cells) / 2 and not is_fraction:
             continue  # a turn of an axis, such as KUKA's T
         numeric = [cell for cell in cells if isinstance(cell, float)]
         rising = len(numeric) == len(cells) and bool((np.diff(numeric) >= 0).all())
@@ -285,7 +286,7 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
                 continue
         texts = [repr(cell) if isinstance(cell, float) else str(cell) for cell in cells]
         with suppress(InputError):
-            if words & {"nanosec", "nsecs", "nsec"}:
+            if is_fraction:
                 parts["nanosec"] = k, [int(Decimal(text)) for text in texts]
                 continue
             found[k] = [stamp_ns(text) for text in texts]

@@ -15,7 +15,7 @@ SHARE = 0.8
 """Share of the images that the misfit counts; the worst fifth may have wrong poses."""
 MM_PER_DEG = 5.0
 """Millimetres of translation that count as much as one degree, as at a gripper 0.3 m from the scene."""
-LIMIT = (0.02, np.radians(3.0))
+LIMIT = (0.02, float(np.radians(3.0)))
 """Largest rms error per axis (m, rad) of a working robot, as jcr.calibration.hand_eye accepts."""
 
 

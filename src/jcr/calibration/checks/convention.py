@@ -6,7 +6,7 @@ A reading or an order that fits is reported, and never applied.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
@@ -82,7 +82,7 @@ def inverted_pair(misfit: Misfit, text: str) -> Finding:
 
 def better_reading(
     base_from_gripper: Poses,
-    recon_from_camera: Poses,
+    recon_from_camera: Float[ndarray, "m 4 4"],
     observable: bool = True,
     names: Sequence[str] | None = None,
     rows: Int[ndarray, " m"] | None = None,
@@ -117,6 +117,8 @@ def better_reading(
         return ()
     texts = [
         f"{1e3 * one.metres:.1f} mm and {np.degrees(one.radians):.2f}° per axis over {count} images"
+        if np.isfinite(one.mm)
+        else "no fit"
         for one, count in ((fit, len(poses)), (given, len(rows)))
     ]
     if is_pairs and words == INVERSES:

@@ -1,0 +1,340 @@
+"""Readings: numbers to poses in every notation, units, names of columns, the robot's pose beside others, directions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jcr
+from capture_writers import rows_as
+from jcr.capture.documents import Table, read_tables
+from jcr.capture.notations import (
+    EULERS,
+    MAKERS,
+    NUMBERS,
+    angle_unit,
+    length_unit,
+    numbers_of,
+    poses_of,
+    poses_of_rows,
+)
+from jcr.capture.options import ReadOptions
+from jcr.capture.readings import Candidate, pose_columns, readings_of, text_of
+from jcr.geometry import inverse
+from simulation.problems import hand_eye_problem
+
+POSES = hand_eye_problem(np.random.default_rng(3), 12).base_from_gripper
+POSITION, ROTATION = POSES[:, :3, 3], POSES[:, :3, :3]
+X, Y, Z = np.eye(3)
+
+
+def as_numbers(notation: str, length: float = 1.0, angle: float = 1.0) -> np.ndarray:
+    """Return positions and rotations of the poses in a notation and in other units."""
+    numbers = numbers_of(ROTATION, notation)
+    return np.hstack([length * POSITION, (angle if NUMBERS[notation] == 3 else 1.0) * numbers])
+
+
+def table_of(numbers: np.ndarray, columns: str = "", **facts: object) -> Table:
+    """Return a table with these column names, separated by spaces; without names if empty."""
+    names = tuple(columns.split()) if columns else (None,) * numbers.shape[1]
+    rows = tuple(map(tuple, numbers.tolist()))
+    usual = {"file": Path("poses.csv"), "place": "", "keys": None, "words": ""}
+    return Table(columns=names, rows=rows, **(usual | facts))  # pyright: ignore[reportArgumentType]
+
+
+def read(table: Table, **options: object) -> list[Candidate]:
+    """Return the readings of a table."""
+    return readings_of(table, ReadOptions(**options), "poses.csv")[1]  # pyright: ignore[reportArgumentType]
+
+
+def notations(found: list[Candidate]) -> list[str]:
+    return [reading.notation + ("⁻¹" if reading.inverted else "") for reading, _ in found]
+
+
+@pytest.mark.parametrize(
+    ("convention", "row", "axes"),
+    [
+        # Where the gripper's axes x, y and z point in the base, worked out by hand from the makers' definitions.
+        ("ur", [0.1, 0.2, 0.3, 0, np.pi, 0], (-X, Y, -Z)),
+        ("xarm-axis-angle", [100, 200, 300, 0, 180, 0], (-X, Y, -Z)),
+        ("kuka", [100, 200, 300, 90, 90, 0], (-Z, -X, Y)),  # A about z, then B about the new y
+        ("epson", [100, 200, 300, 90, 90, 0], (-Z, -X, Y)),
+        ("fanuc", [100, 200, 300, 90, 0, 90], (Y, Z, X)),  # W about fixed x, then R about fixed z
+        ("rpy", [0.1, 0.2, 0.3, np.pi / 2, 0, np.pi / 2], (Y, Z, X)),
+        ("staubli", [100, 200, 300, 90, 0, 90], (Z, -X, -Y)),  # rx about x, then rz about the new z
+        ("mecademic", [100, 200, 300, 90, 0, 90], (Z, -X, -Y)),
+        (
+            "doosan",
+            [100, 200, 300, 90, 90, 0],
+            (-Z, -X, Y),
+        ),  # A about z, B about the new y, C about the new z
+        ("doosan", [100, 200, 300, 0, 90, 90], (Y, Z, X)),
+        ("kawasaki", [100, 200, 300, 0, 90, 90], (Y, Z, X)),
+        ("abb", [100, 200, 300, 0, 1, 0, 0], (X, -Y, -Z)),
+        ("quat:xyzw", [0.1, 0.2, 0.3, 1, 0, 0, 0], (X, -Y, -Z)),
+        ("franka", [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 0.1, 0.2, 0.3, 1], (Y, -X, Z)),
+        ("matrix", [0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1], (Y, -X, Z)),
+    ],
+)
+def test_known_poses(convention: str, row: list[float], axes: tuple[np.ndarray, ...]):
+    (pose,) = poses_of_rows(np.array([row], float), convention)
+    np.testing.assert_allclose(pose[:3, :3].T, axes, atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 3], [0.1, 0.2, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_every_maker_is_read_as_it_writes(maker: str):
+    """The writer of the tests states the notations a second time."""
+    np.testing.assert_allclose(poses_of_rows(rows_as(maker, POSES), maker), POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize("notation", NUMBERS)
+@pytest.mark.parametrize(
+    ("units", "length", "angle"), [("m-rad", 1, 1), ("mm-deg", 1e3, np.degrees(1)), ("cm-rad", 100, 1)]
+)
+def test_notations_and_units_are_inverted_by_the_writer(
+    notation: str, units: str, length: float, angle: float
+):
+    numbers = as_numbers(notation, length, angle)
+    np.testing.assert_allclose(poses_of(numbers[:, :3], numbers[:, 3:], notation, units), POSES, atol=1e-9)
+
+
+def test_rows_that_are_no_transform_are_nan():
+    quaternion = np.array([[0, 0, 0, 1.005], [0, 0, 0, 1.02], [0, 0, 0, np.nan], [0, 0, 1e200, 0]])
+    assert np.isnan(poses_of(np.zeros((4, 3)), quaternion, "quat:xyzw")[:, 0, 0]).tolist() == [
+        False,
+        True,
+        True,
+        True,
+    ]
+    mirror, shear = np.diag([1.0, 1, -1]), np.eye(3) + 0.03 * np.outer(X, Y)
+    matrices = np.stack([np.eye(3), mirror, shear]).reshape(3, 9)
+    assert np.isnan(poses_of(np.zeros((3, 3)), matrices, "matrix")[:, 0, 0]).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize("name", ["kukka", "euler:xx", "euler:abc", "euler:", "quat", "euler:zyx "])
+def test_an_unknown_notation_lists_those_there_are(name: str):
+    with pytest.raises(
+        jcr.InputError, match=r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"
+    ):
+        poses_of_rows(np.zeros((1, 6)), name)
+
+
+@pytest.mark.parametrize(
+    ("scale", "stated", "unit"),
+    [(1, None, "m"), (1e3, None, "mm"), (100, "cm", "cm"), (1e3, "mm", "mm"), (1, "m", "m")],
+)
+def test_units_of_length_follow_from_the_size(scale: float, stated: str | None, unit: str):
+    assert length_unit(scale * POSITION, stated, "poses.csv") == unit
+
+
+@pytest.mark.parametrize(
+    ("position", "stated", "words"),
+    [
+        (POSITION, "mm", "too near for mm; these look like metres: give --pose-units m-rad"),
+        (POSITION, "cm", "too near for cm; these look like metres"),
+        (1e3 * POSITION, "m", "these look like millimetres: give --pose-units mm-rad"),
+        # An arm on a vehicle 35 m from the origin of a map, in metres; whatever unit is stated.
+        *(
+            (POSITION + [35, 2, 0], stated, "base frame is far away: subtract one offset")
+            for stated in (None, "mm", "cm")
+        ),
+        (POSITION + [35, 2, 0], "m", "far away: subtract one offset"),
+        (1e3 * POSITION + [35e3, 0, 0], "mm", "far away: subtract one offset"),
+    ],
+)
+def test_units_that_the_numbers_contradict_and_far_base_frames_are_refused(
+    position: np.ndarray, stated: str | None, words: str
+):
+    with pytest.raises(jcr.InputError, match=f"poses.csv: .*{words}") as caught:
+        length_unit(position, stated, "poses.csv")
+    assert "\n" not in str(caught.value)
+
+
+def test_units_of_angles_follow_from_the_size():
+    numbers = numbers_of(ROTATION, "euler:ZYX")
+    for factor, unit in ((1.0, "rad"), (np.degrees(1.0), "deg")):
+        assert angle_unit(factor * numbers, "euler:ZYX", None, "") == unit
+        assert angle_unit(factor * numbers, "euler:ZYX", unit, "") == unit
+    with pytest.raises(jcr.InputError, match="look like degrees: give --pose-units m-deg"):
+        angle_unit(np.degrees(numbers), "euler:ZYX", "rad", "poses.csv")
+    with pytest.raises(jcr.InputError, match="look like radians: give --pose-units m-rad"):
+        angle_unit(0.5 * numbers, "euler:ZYX", "deg", "poses.csv")
+    assert angle_unit(numbers_of(ROTATION, "quat:wxyz"), "quat:wxyz", "deg", "") == "rad"
+
+
+QUATERNION, RPY, VECTOR = as_numbers("quat:xyzw"), as_numbers("euler:xyz"), as_numbers("rotvec")
+MM_DEG, W_FIRST = as_numbers("euler:xyz", 1e3, np.degrees(1)), as_numbers("quat:wxyz")
+XYZ, MESSAGE = "x y z", "pose.position.x pose.position.y pose.position.z pose.orientation."
+NAMED = {
+    "usual": (QUATERNION, f"{XYZ} qx qy qz qw", "quat:xyzw"),
+    "w named first": (W_FIRST, f"{XYZ} qw qx qy qz", "quat:xyzw"),
+    "tum": (QUATERNION, "tx ty tz qx qy qz qw", "quat:xyzw"),
+    "ethz": (QUATERNION, "x y z q_x q_y q_z q_w", "quat:xyzw"),
+    "ros topic": (QUATERNION, MESSAGE + f" {MESSAGE}".join("xyzw").replace(f" {MESSAGE}", " pose.orientation."), "quat:xyzw"),
+    "rosbag csv": (QUATERNION, " ".join(f"field.pose.{part}" for part in (
+        "position.x", "position.y", "position.z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")),
+        "quat:xyzw"),
+    "easy_handeye": (QUATERNION, " ".join(f"robot.{part}" for part in (
+        "translation.x", "translation.y", "translation.z", "rotation.x", "rotation.y", "rotation.z", "rotation.w")),
+        "quat:xyzw"),
+    "underscores": (QUATERNION, " ".join(f"pose_{part}" for part in (
+        "position_x", "position_y", "position_z", "orientation_x", "orientation_y", "orientation_z", "orientation_w")),
+        "quat:xyzw"),
+    "list with order": (W_FIRST, "xyz.0 xyz.1 xyz.2 quat_wxyz.0 quat_wxyz.1 quat_wxyz.2 quat_wxyz.3", "quat:wxyz"),
+    "rpy": (RPY, f"{XYZ} roll pitch yaw", "euler:xyz"),
+    "rpy in any order": (RPY[:, [5, 4, 3, 2, 1, 0]], "yaw pitch roll z y x", "euler:xyz"),
+    "units after _": (MM_DEG, "x_mm y_mm z_mm roll_deg pitch_deg yaw_deg", "euler:xyz"),
+    "units in brackets": (MM_DEG, "X[mm] Y[mm] Z[mm] Roll[deg] Pitch[deg] Yaw[deg]", "euler:xyz"),
+    "fanuc": (MM_DEG, "X Y Z W P R", "euler:xyz"),
+    "kawasaki": (as_numbers("euler:ZYZ", 1e3, np.degrees(1)), "X Y Z O A T", "euler:ZYZ"),
+    "epson": (as_numbers("euler:ZYX", 1e3, np.degrees(1)), "X Y Z U V W", "euler:ZYX"),
+    "lerobot": (VECTOR, "ee.x ee.y ee.z ee.wx ee.wy ee.wz", "rotvec"),
+    "tvec rvec": (VECTOR, "tvec.0 tvec.1 tvec.2 rvec.0 rvec.1 rvec.2", "rotvec"),
+    "R and t": (np.hstack([POSITION, ROTATION.reshape(-1, 9)]),
+                "t.0 t.1 t.2 " + " ".join(f"R.{i}.{j}" for i in range(3) for j in range(3)), None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_names_of_columns_state_the_notation(name: str):
+    numbers, columns, notation = NAMED[name]
+    found = read(table_of(numbers, columns))
+    np.testing.assert_allclose(found[0][1], POSES, atol=1e-9)
+    if notation is not None:
+        ((reading, _),) = found
+        assert (reading.notation, reading.inverted, reading.decided_by) == (notation, False, "names")
+        assert text_of(reading).startswith((reading.columns and f"{reading.columns}: ") + "x y z in m")
+
+
+UNDECIDED = {
+    "q0": (W_FIRST, f"{XYZ} q0 q1 q2 q3", "quat:wxyz", {"quat:wxyz", "quat:xyzw"}),
+    "q1": (QUATERNION, f"{XYZ} q1 q2 q3 q4", "quat:xyzw", {"quat:wxyz", "quat:xyzw"}),
+    "kuka": (as_numbers("euler:ZYX", 1e3, np.degrees(1)), "X Y Z A B C", "euler:ZYX", set(EULERS)),
+    "rx ry rz": (VECTOR, f"{XYZ} rx ry rz", "rotvec", {"rotvec", *EULERS}),
+    "ur log": (VECTOR, " ".join(f"actual_TCP_pose_{k}" for k in range(6)), "rotvec", {"rotvec", *EULERS}),
+    "unnamed": (RPY, "", "euler:xyz", {"rotvec", *EULERS}),
+}
+
+
+@pytest.mark.parametrize("name", UNDECIDED)
+def test_names_that_leave_notations_give_each_of_them(name: str):
+    """The images decide; an option leaves one."""
+    numbers, columns, right, possible = UNDECIDED[name]
+    found = read(table_of(numbers, columns))
+    assert {reading.notation for reading, _ in found} == possible and len(found) >= len(possible)
+    assert sum(np.abs(poses - POSES).max() < 1e-9 for _, poses in found) == 1
+    direct = [one for one in read(table_of(numbers, columns), pose_convention=right)]
+    assert notations(direct) == [right] and direct[0][0].decided_by == "option"
+    np.testing.assert_allclose(direct[0][1], POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize("columns", [16, 12])
+def test_matrices_without_names(columns: int):
+    """The last row of sixteen numbers shows whether they are written by rows or by columns."""
+    for written in (POSES, np.swapaxes(POSES, 1, 2)) if columns == 16 else (POSES[:, :3],):
+        found = read(table_of(written.reshape(12, -1)))
+        assert sorted(reading.inverted for reading, _ in found) == [False, True]
+        np.testing.assert_allclose(found[0][1], POSES, atol=1e-9)
+
+
+def test_numbers_exclude_what_cannot_be():
+    """A quaternion is found among more numbers by its length; angles beyond 2π are no radians."""
+    joints = np.random.default_rng(0).uniform(-3, 3, (12, 6))
+    found = read(table_of(np.hstack([joints, QUATERNION])))
+    assert {reading.notation for reading, _ in found} == {"quat:xyzw", "quat:wxyz"}
+    assert sum(np.abs(poses - POSES).max() < 1e-9 for _, poses in found) == 1
+    assert {reading.units for reading, _ in read(table_of(MM_DEG))} == {"mm-deg"}
+    assert pose_columns(table_of(np.arange(24.0).reshape(12, 2))) == []
+
+
+def test_units_stated_by_a_name_or_an_option_are_refused_where_numbers_contradict():
+    with pytest.raises(jcr.InputError, match=r"poses.csv: .*too near for mm"):
+        read(table_of(RPY, "x_mm y_mm z_mm roll pitch yaw"))
+    with pytest.raises(jcr.InputError, match="look like degrees"):
+        read(table_of(MM_DEG, "x y z roll_rad pitch_rad yaw_rad"))
+    with pytest.raises(jcr.InputError, match="too near for cm"):
+        read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_units="cm-rad")
+    ((reading, poses),) = read(
+        table_of(as_numbers("euler:xyz", 100), f"{XYZ} roll pitch yaw"), pose_units="cm-rad"
+    )
+    assert reading.units == "cm-rad" and np.allclose(poses, POSES, atol=1e-9)
+
+
+def test_columns_without_the_numbers_of_the_notation_are_named():
+    with pytest.raises(
+        jcr.InputError, match="no columns hold the 4 numbers of --pose-convention abb; .*euler:xyz"
+    ):
+        read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_convention="abb")
+
+
+BOARD = hand_eye_problem(np.random.default_rng(4), 12).base_from_gripper
+OTHER = np.hstack([BOARD[:, :3, 3], Rotation.from_matrix(BOARD[:, :3, :3]).as_quat()])
+PARTS = "x y z qx qy qz qw".split()
+
+
+@pytest.mark.parametrize(
+    ("robot", "other"),
+    [("robot", "board"), ("tcp", "target"), ("ee_pose", "marker_pose"), ("end2base", "board2cam"), ("flange", "camera"),
+     ("robot_coords", "board_pose"), ("gripper", "tag"), ("ToolPose", "CameraPose")],
+)  # fmt: skip
+def test_the_robots_pose_is_read_beside_a_boards(robot: str, other: str):
+    names = [f"{name}.{part}" for name in (other, robot) for part in PARTS]
+    found = read(table_of(np.hstack([OTHER, QUATERNION]), " ".join(names)))
+    assert len(found) == 1
+    np.testing.assert_allclose(found[0][1], POSES, atol=1e-9)
+
+
+def test_two_poses_that_could_be_the_robots_are_both_read_and_a_name_chooses():
+    names = " ".join(f"{name}.{part}" for name in ("flange", "tcp") for part in PARTS)
+    table = table_of(np.hstack([OTHER, QUATERNION]), names)
+    assert [reading.columns for reading, _ in read(table)] == ["flange", "tcp"]
+    ((reading, poses),) = read(table, pose_columns="tcp")
+    assert reading.columns == "tcp" and np.allclose(poses, POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("place", "file", "inverted"),
+    [
+        ("base_from_gripper", "a.json", [False]),
+        ("T_gripper2base", "a.json", [False]),
+        ("end2base", "a.json", [False]),
+        ("", "O_T_EE.txt", [False]),
+        ("gripper_from_base", "a.json", [True]),
+        ("base2gripper", "a.json", [True]),
+        ("", "base_in_gripper.npy", [True]),
+        ("", "poses.npy", [False, True]),
+        ("T", "a.json", [False, True]),
+    ],
+)
+def test_words_state_the_direction(place: str, file: str, inverted: list[bool]):
+    table = table_of(POSES.reshape(12, 16), place=place, file=Path(file))
+    found = read(table)
+    assert [reading.inverted for reading, _ in found] == inverted
+    for reading, poses in found:
+        np.testing.assert_allclose(poses, inverse(POSES) if reading.inverted else POSES, atol=1e-9)
+    ((reading, poses),) = read(table, pose_inverted=True)
+    assert reading.inverted and np.allclose(poses, inverse(POSES), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "convention"),
+    [
+        ("movej(p[{}], a=1.2)", "ur"),
+        ("{k}.png, p[{}]", "ur"),
+        ("{k}.png; p [{}]", "ur"),
+        ('{k}.png\t"p[{}]"', "ur"),
+        ("CONST robtarget p{k}:=[[{xyz}],[{rest}],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];", "abb"),
+    ],
+)
+def test_a_makers_word_beside_the_numbers_states_the_notation(text: str, convention: str, tmp_path: Path):
+    lines = []
+    for k, row in enumerate(rows_as(convention, POSES).tolist()):
+        cells = [*map(repr, row)]
+        parts = {"k": k, "xyz": ",".join(cells[:3]), "rest": ",".join(cells[3:])}
+        lines.append(text.format(", ".join(cells), **parts))
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    found = [one for table in read_tables(tmp_path / "poses.txt") for one in read(table)]
+    assert {reading.notation for reading, _ in found} == {MAKERS[convention].notation}
+    assert any(np.abs(poses - POSES).max() < 1e-9 for reading, poses in found if not reading.inverted)
