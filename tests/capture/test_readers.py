@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
+from jcr.capture.formats.table import read_pose_table
+from jcr.capture.plain_files import read_yaml
 from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
-from jcr.capture.controllers import CONVENTIONS, poses_from_numbers
-from jcr.capture.formats.table import read_pose_table
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import PoseTable, stamp_ns
-from jcr.capture.plain_files import read_yaml
 from jcr.capture.read import FORMATS, format_of, read_source
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs

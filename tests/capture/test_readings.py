@@ -271,7 +271,7 @@ def test_columns_without_the_numbers_of_the_notation_are_named():
 
 BOARD = hand_eye_problem(np.random.default_rng(4), 12).base_from_gripper
 OTHER = np.hstack([BOARD[:, :3, 3], Rotation.from_matrix(BOARD[:, :3, :3]).as_quat()])
-PARTS = "x y z qx qy qz qw".split()
+PARTS = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
 @pytest.mark.parametrize(
