@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.checks.convention import BETTER, of_camera
@@ -148,7 +148,9 @@ def _taken(
 
 
 def _ranked(
-    candidates: Sequence[tuple[Reading, Poses]], recon_from_camera: Poses, image_index: Int[ndarray, " m"]
+    candidates: Sequence[tuple[Reading, Poses]],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    image_index: Int[ndarray, " m"],
 ) -> list[_Fit]:
     """Return the readings with their misfits, best first.
 

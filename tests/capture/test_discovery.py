@@ -1,0 +1,324 @@
+"""Folders of images and numbers as people hold them, and the decision of the images between readings, orders and rows."""
+
+import json
+import shutil
+import unicodedata
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import jcr
+from capture_writers import rows_as
+from in_process import run_jcr
+from jcr.capture.discovery import find_images
+from jcr.capture.documents import Table
+from jcr.capture.notations import numbers_of
+from jcr.capture.options import ReadOptions
+from jcr.capture.readings import readings_of
+from jcr.geometry import inverse, transform
+from jcr.pipeline.decision import decide
+from jcr.records import Capture
+from places import ROOT, SHARED
+from scenes import capture_of
+from simulation.problems import HandEyeProblem, hand_eye_problem
+
+COUNT = 6
+POSES = hand_eye_problem(np.random.default_rng(3), COUNT).base_from_gripper
+NAMES = [f"{k}.png" for k in range(8, 8 + COUNT)]
+"""8.png … 13.png, whose order as text is another one."""
+HEADER = "x,y,z,qx,qy,qz,qw"
+ROWS = [",".join(map(repr, row)) for row in rows_as("quat:xyzw", POSES).tolist()]
+
+
+def draw(folder: Path, names: list[str] = NAMES, size: tuple[int, int] = (32, 24), seed: int = 0) -> Path:
+    """Write images of noise."""
+    random = np.random.default_rng(seed)
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(random.integers(0, 255, (*size[::-1], 3), dtype=np.uint8)).save(folder / name)
+    return folder
+
+
+def write(file: Path, lines: list[str]) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def in_images(folder: Path, *others: str) -> Path:
+    """Write the images below images/ and other pictures beside them."""
+    return draw(draw(folder / "a", [f"images/{name}" for name in NAMES]), [*others], (16, 12), 9)
+
+
+def each(folder: Path, name: str) -> None:
+    """Write a matrix for each image."""
+    for k, pose in enumerate(POSES):
+        text = "\n".join(" ".join(map(repr, row)) for row in pose.tolist())
+        write(folder / name.format(k, stem=NAMES[k][:-4]), [text])
+
+
+def index(folder: Path) -> None:
+    """Write poses under names that say nothing, and a file that pairs them with the images."""
+    lines = []
+    for k, (name, row) in enumerate(zip(NAMES, rows_as("quat:xyzw", POSES).tolist(), strict=True)):
+        keys = HEADER.split(",")
+        write(folder / f"data/{'dbfaec'[k]}.yaml", [f"{key}: {value!r}" for key, value in zip(keys, row, strict=True)])
+        lines += [f"- {{image: images/{name}, pose: data/{'dbfaec'[k]}.yaml}}"]
+    write(folder / "index.yaml", lines)
+
+
+Layout = Callable[[Path], object]
+LAYOUTS: dict[str, Layout] = {
+    "any name": lambda f: write(in_images(f) / "tcp_pose_Fri_Nov_25.txt", [HEADER, *ROWS]),
+    "subfolder": lambda f: write(in_images(f) / "robot/log/data.csv", [HEADER, *ROWS]),
+    "beside the images": lambda f: write(in_images(f) / "images/numbers.dat", [HEADER, *ROWS]),
+    "above": lambda f: [in_images(f), write(f / "poses.txt", [HEADER, *ROWS])],
+    "images and poses in one folder": lambda f: write(draw(f / "a") / "p.txt", [HEADER, *ROWS]),
+    "image column, another order": lambda f: write(
+        in_images(f) / "p.csv", [f"{HEADER},Bild", *(f"{row},{name}" for row, name in zip(ROWS, NAMES, strict=True))][::1]
+    ),
+    "a file for each image": lambda f: each(in_images(f), "robot/{stem}.txt"),
+    "a file for each image, counted": lambda f: each(in_images(f), "poses/pos{}.txt"),
+    "index": lambda f: index(in_images(f)),
+    "empty rows and a preamble": lambda f: write(
+        in_images(f) / "p.csv", ["# my robot", "", HEADER, *ROWS, ",,,,,,", ""]
+    ),
+    "masks, depth and thumbnails": lambda f: write(
+        in_images(f, *(f"masks/{name}" for name in NAMES), *(f"depth/{name}" for name in NAMES), "images/thumb.png")
+        / "p.csv", [HEADER, *ROWS],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_folders_are_read_without_options(layout: str, tmp_path: Path):
+    LAYOUTS[layout](tmp_path)
+    got = jcr.read_capture(tmp_path / "a")
+    assert [Path(name).name for name in got.images] == NAMES
+    fitting = [got.base_from_gripper] if got.reading else [poses for _, poses in got.candidates]
+    assert any(np.allclose(poses, POSES, rtol=0, atol=1e-9) for poses in fitting)
+    assert any("paired with the images" in note for note in got.notes)
+
+
+def test_names_in_another_unicode_form_and_rows_in_another_order(tmp_path: Path):
+    names = [unicodedata.normalize("NFD", f"Büro {name}") for name in NAMES]
+    draw(tmp_path, names)
+    order = [4, 1, 5, 0, 3, 2]
+    rows = [f"{unicodedata.normalize('NFC', names[k])},{ROWS[k]}" for k in order]
+    write(tmp_path / "p.csv", [f"photo,{HEADER}", *rows])
+    got = jcr.read_capture(tmp_path)
+    np.testing.assert_allclose(got.base_from_gripper, POSES[[names.index(name) for name in got.images]], atol=1e-9)
+
+
+def test_images_left_out_and_chosen_are_stated(tmp_path: Path):
+    draw(tmp_path, [f"rgb/{name}" for name in NAMES])
+    draw(tmp_path, [f"other/{name}" for name in (*NAMES, "14.png")], seed=1)
+    draw(tmp_path, ["rgb/preview.png"], (16, 12))
+    draw(tmp_path, [".hidden.png", "rgb/8_mask.png", "Masks/8.png", "rgb/depth_8.png"])
+    images, notes = find_images(tmp_path)
+    assert images == tuple(f"rgb/{name}" for name in NAMES)
+    assert "images taken from rgb/, not from other" in notes
+    assert any("1 images of another size than 32x24 are left out: rgb/preview.png" in note for note in notes)
+
+
+def test_pictures_in_other_formats_are_named(tmp_path: Path):
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"ftypheic")
+    with pytest.raises(jcr.InputError, match="holds no images .*it holds HEIC pictures: convert them to PNG or JPEG"):
+        jcr.read_capture(tmp_path)
+
+
+def test_a_folder_without_poses_says_what_to_add(tmp_path: Path):
+    write(draw(tmp_path / "a") / "readme.txt", ["hello"])
+    with pytest.raises(jcr.InputError, match=r"no gripper poses for its 6 images \(8.png … 13.png\) in readme.txt; add"):
+        jcr.read_capture(tmp_path / "a")
+
+
+def test_a_copy_of_the_poses_in_another_file_counts_once(tmp_path: Path):
+    write(draw(tmp_path) / "poses.csv", [HEADER, *ROWS])
+    (tmp_path / "poses.json").write_text(json.dumps(np.round(POSES, 6).tolist()))
+    got = jcr.read_capture(tmp_path)
+    assert got.reading is not None and got.reading.file == "poses.csv"
+
+
+PROBLEM = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4))
+NOTATIONS = ("quat:xyzw", "quat:wxyz", "rotvec", "euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ", "matrix", "matrix:columns")  # fmt: skip
+
+
+def undecided(poses: np.ndarray, notation: str = "rotvec", images: int | None = None, name: str = "p.csv") -> Capture:
+    """Return the capture of poses that are written in a notation, in mm and degrees, without names."""
+    turned = numbers_of(poses[:, :3, :3], notation) * (np.degrees(1.0) if notation[:3] in ("rot", "eul") else 1.0)
+    rows = tuple(map(tuple, np.hstack([1e3 * poses[:, :3, 3], turned]).tolist()))
+    table = Table(file=Path(name), place="", columns=(None,) * len(rows[0]), rows=rows, keys=None, words="")
+    candidates = tuple(readings_of(table, ReadOptions(), name)[1])
+    nothing = np.full((images or len(poses), 4, 4), np.nan)
+    return replace(capture_of(nothing), source=Path(name), candidates=candidates)
+
+
+def decided(capture: Capture, problem: HandEyeProblem = PROBLEM, rows: np.ndarray | None = None) -> Capture:
+    rows = np.arange(len(capture)) if rows is None else rows
+    return decide(capture, problem.recon_from_camera[rows], rows)
+
+
+def assert_refused(capture: Capture, words: str, problem: HandEyeProblem = PROBLEM, rows: np.ndarray | None = None):
+    with pytest.raises(jcr.InputError, match=words) as caught:
+        decided(capture, problem, rows)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("notation", "inverted"), [*((one, False) for one in NOTATIONS), ("euler:xyz", True), ("matrix", True)]
+)
+def test_the_right_reading_is_taken_among_all(notation: str, inverted: bool):
+    poses = PROBLEM.base_from_gripper
+    got = decided(undecided(inverse(poses) if inverted else poses, notation))
+    assert got.reading is not None and not got.candidates and got.reading.decided_by == "images"
+    assert (got.reading.notation, got.reading.inverted, got.reading.units[:2]) == (notation, inverted, "mm")
+    assert got.reading.misfit_mm is not None and got.reading.misfit_mm < 1.0 and got.reading.next_best is not None
+    np.testing.assert_allclose(got.base_from_gripper, poses, atol=1e-9)
+
+
+def test_images_without_a_camera_pose_do_not_change_the_reading():
+    rows = np.array([0, 1, 3, 4, 5, 7, 8, 10, 11])
+    got = decided(undecided(PROBLEM.base_from_gripper, "euler:ZYZ"), rows=rows)
+    assert got.reading is not None and got.reading.notation == "euler:ZYZ" and len(got) == 12
+
+
+def test_two_wrong_poses_of_twelve_do_not_change_the_reading():
+    poses = PROBLEM.base_from_gripper.copy()
+    poses[[2, 7]] = poses[[7, 2]]
+    got = decided(undecided(poses, "euler:ZYX"))
+    assert got.reading is not None and got.reading.notation == "euler:ZYX"
+
+
+def test_readings_that_both_fit_are_refused_with_the_option_for_each():
+    """The flange and the tool's tip move together, and the images do not show which is meant."""
+    tip = PROBLEM.base_from_gripper @ transform(np.eye(3), np.array([0.0, 0.0, 0.15]))
+    flange, tool = (
+        tuple((replace(one, columns=name), poses) for one, poses in undecided(given).candidates[:1])
+        for name, given in (("flange", PROBLEM.base_from_gripper), ("tcp", tip))
+    )
+    words = "--pose-columns flange --pose-convention rotvec .*--pose-columns tcp --pose-convention rotvec .*: say which"
+    assert_refused(replace(undecided(tip), candidates=(*flange, *tool)), f"p.csv: .*{words}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (np.arange(12)[::-1], "listed in reverse order of the images"),
+        (np.r_[0, np.arange(11)], r"one ahead of the images \(image k has pose k \+ 1\)"),
+        (np.r_[np.arange(1, 12), 11], r"one behind the images \(image k has pose k − 1\)"),
+        (np.argsort([str(k) for k in range(12)]), "as text"),
+    ],
+)
+def test_another_order_is_named_and_never_taken(order: np.ndarray, words: str):
+    """Row k holds the pose of image order[k]."""
+    capture = undecided(PROBLEM.base_from_gripper[order], "euler:xyz")
+    assert_refused(capture, f"p.csv: the poses fit the images .*when they are .*{words}")
+
+
+@pytest.mark.slow
+def test_poses_of_another_capture_and_permuted_ones_fit_no_reading():
+    other = hand_eye_problem(np.random.default_rng(8), 12).base_from_gripper
+    for poses in (other, PROBLEM.base_from_gripper[np.random.default_rng(2).permutation(12)]):
+        for notation in ("rotvec", "quat:wxyz"):
+            assert_refused(undecided(poses, notation), "p.csv: the poses fit the images in no reading")
+
+
+@pytest.mark.slow
+def test_rows_too_many_and_too_few_are_named():
+    poses = PROBLEM.base_from_gripper
+    extra = np.insert(poses, 4, transform(np.eye(3), np.array([0.4, 0.1, 0.6])), axis=0)
+    assert_refused(undecided(extra, "euler:xyz", images=12), "13 poses for 12 images .*row 5 .*remove it from the file")
+    assert_refused(undecided(extra, "matrix", images=12, name="p.npy"), r"row 5 .*numpy\.delete\(.*, \[4\], 0\)")
+    assert_refused(undecided(np.delete(poses, 7, 0), "euler:xyz", images=12), "11 poses for 12 images .*7.png have no pose: remove")
+    other = hand_eye_problem(np.random.default_rng(8), 13).base_from_gripper
+    assert_refused(undecided(other, "euler:xyz", images=12), "13 poses for 12 images .*in no choice of them the poses fit")
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_poses_of_the_camera_such_as_a_boards_are_never_taken(inverted: bool):
+    cameras = PROBLEM.base_from_camera
+    assert_refused(undecided(cameras if inverted else inverse(cameras), "rotvec"), "the poses are those of the camera itself")
+
+
+def test_a_board_beside_the_robot_is_not_taken():
+    robot, board = undecided(PROBLEM.base_from_gripper), undecided(inverse(PROBLEM.base_from_camera), name="b.csv")
+    got = decided(replace(robot, candidates=(*board.candidates, *robot.candidates)))
+    assert got.reading is not None and got.reading.file == "p.csv"
+
+
+def test_four_images_decide_nothing():
+    problem = hand_eye_problem(np.random.default_rng(1), 4)
+    assert_refused(undecided(problem.base_from_gripper, "euler:ZYX"), "say which", problem)
+
+
+Case = tuple[str, tuple[str, ...], int, str]
+CASES: tuple[Case, ...] = (
+    *(("controller_notation", (".", "--poses", f"{name}.txt", *(("--pose-convention", way) if way else ())), 0, words)
+      for name, way, words in (("list", "ur", "rotation vector in radians; by option"), ("kuka", "kuka", "angles ZYX"),
+                               ("abb", "abb", "quaternion w, x, y, z"), ("fanuc", "fanuc", "angles xyz in degrees"),
+                               ("blocks", "matrix", "rotation matrix; by option"), ("fanuc", "", "by names"),
+                               ("list", "", "NOT DECIDED"), ("kuka", "", "NOT DECIDED"), ("abb", "", "NOT DECIDED"))),
+    ("far_base_frame", (".",), 2, "the base frame is far away: subtract one offset"),
+    ("far_base_frame", (".", "--pose-units", "cm-rad"), 2, "the base frame is far away"),
+    ("far_base_frame", (".", "--pose-units", "mm-rad"), 2, "the base frame is far away"),
+    ("image_column_other_name", (".",), 0, "paired with the images by the column img"),
+    ("lerobot_names_ignored", (".", "--pose-convention", "rpy"), 0, "up to 920 mm and 117°"),
+    ("lerobot_names_ignored", (".",), 0, "up to 920 mm and 117°"),
+    ("lerobot_video_path_null", (".",), 0, "up to 920 mm and 117°"),
+    ("opencv_yaml", (".",), 0, "intrinsics given"),
+    ("opencv_yaml", (".", "--poses", "named.csv", "--camera-info", "intrinsics.yml"), 0, "intrinsics given"),
+    ("pose_file_per_image", (".",), 0, "paired with the images by the names of rows"),
+    ("pose_file_per_image", (".", "--poses", "poses"), 0, "2 readings of poses are possible"),
+    ("stamps_not_matched", (".",), 0, "paired with the images by time stamps"),
+    ("bag_images_only_at_stops", ("bag", "--base-frame", "base_link", "--gripper-frame", "tool0"), 0, "up to"),
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("case", "words", "status", "said"), CASES, ids=lambda one: str(one)[:40])
+def test_small_inputs_of_others_have_the_right_outcome(case: str, words: tuple[str, ...], status: int, said: str):
+    folder = SHARED / "inputs" / "cases" / case
+    if not folder.is_dir():
+        pytest.skip(f"the inputs of others are not at {folder}")
+    done = run_jcr("check", "--poses-only", *words, cwd=folder)
+    text = " ".join((done.stdout + done.stderr).split())
+    assert done.returncode == status and said in text, text
+    assert ("good to calibrate" in text) == (status == 0 and "NOT DECIDED" not in text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [(), ("--pose-inverted",)])
+def test_an_inverted_marker_is_never_accepted(way: tuple[str, ...], tmp_path: Path):
+    file = SHARED / "inputs" / "cases" / "samples_marker_pose_inverted" / "marker_from_camera.samples"
+    if not file.is_file():
+        pytest.skip(f"the inputs of others are not at {file}")
+    done = run_jcr("calibrate", shutil.copy(file, tmp_path), tmp_path / "out", *way)
+    assert done.returncode == 3 and "either the gripper poses or the marker poses are inverted" in done.stdout
+    assert "0.452 m" in done.stdout and "0.0793 m" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case", "way", "option"),
+    [
+        ("zyz", (), "ZYZ"),
+        ("euler_as_vector", ("--pose-convention", "xarm-axis-angle"), "euler:xyz"),
+        ("vector_as_euler", ("--pose-convention", "yaskawa"), "rotvec"),
+    ],
+)
+def test_the_convention_that_fits_is_found(case: str, way: tuple[str, ...], option: str, tmp_path: Path):
+    folder = SHARED / "inputs" / "cases" / "convention_not_found" / case
+    if not folder.is_dir():
+        pytest.skip(f"the inputs of others are not at {folder}")
+    shutil.copytree(folder, tmp_path / "a")
+    shutil.copytree(ROOT / "examples/tabletop/images", tmp_path / "a/images", dirs_exist_ok=True)
+    done = run_jcr("check", tmp_path / "a", *way)
+    assert option in done.stdout + done.stderr and "check the pairing" not in done.stdout, done.stdout
+    assert done.returncode == (3 if way else 0)
