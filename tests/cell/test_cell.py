@@ -31,6 +31,7 @@ from jcr.geometry import inverse, rotation_exp, scale_translation, step_between,
 from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 from scenes import carried_capture, reconstruction_of
+from simulation.arms import ArmErrors
 from simulation.cells import FIXED_CAMERA, Kind, cell_problem
 from simulation.faults import Faults, moved_parts, reported_poses
 from simulation.poses import gripper_poses, random_hand_eye
@@ -75,6 +76,28 @@ def test_the_stated_accuracy_of_a_fixed_camera_follows_from_its_own_covariance()
     assert held_out.translation_mm < 3 * np.sqrt(3) * 1e3 * hand_eye.robot_noise.together[0]
     error = step_between(x, problem.truth["base_from_camera"])
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8
+
+
+@pytest.mark.slow
+def test_each_arm_of_a_cell_has_errors_of_its_own_size():
+    """With one size for both, the arm of 0.1 mm was stated to ±4.8 mm, eight times too large, and the other one too exact."""
+    squared, stated = [], []
+    for seed in range(4):
+        errors = [ArmErrors((1e-4, np.radians(0.02))), ArmErrors((3e-3, np.radians(0.6)))]
+        problem = cell_problem("arms", errors[0], COUNT, seed, points=150, second=errors[1])
+        solution = answered(problem, seed)
+        for name, of in wanted(problem).items():
+            found, covariance = solution.transform(of)
+            step = step_between(found, problem.truth[name])
+            squared.append(step @ np.linalg.solve(covariance, step))
+            stated.append(1e3 * np.sqrt(np.diag(covariance)[:3]).max())
+    good, bad, _ = np.array(squared).reshape(4, 3).T
+    # The mean of four draws of chi2 of 6 is between 3 and 10.6 with a probability of 99 %.
+    assert 2.0 < good.mean() < 10.6 and 2.0 < bad.mean() < 10.6
+    assert np.median(stated[::3]) < 1.0 < np.median(stated[1::3])
+    sizes = solution.equations, solution.log_sizes
+    own = [sizes[0].noise(sizes[1], arm).translation for arm in range(2)]
+    assert own[0] < 5e-4 and 1.5e-3 < own[1] < 6e-3
 
 
 @pytest.fixture(scope="module")

@@ -318,6 +318,9 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         systematic=everywhere.left(systematic),
         given=problem.robot_noise_floor,
         confirmed=everywhere.left(columns @ columns.T) if columns.size else None,
+        arm=np.repeat(np.arange(len(problem.arms)), [len(one.rigs) for one in problem.arms])
+        if len(problem.arms) > 1
+        else None,
     )
     return PoseEquations(every, region, used, by_rig, (follow, to_mean, covariance))
 
