@@ -80,7 +80,7 @@ def test_the_stated_accuracy_of_a_fixed_camera_follows_from_its_own_covariance()
 
 @pytest.mark.slow
 def test_each_arm_of_a_cell_has_errors_of_its_own_size():
-    """With one size for both, the arm of 0.1 mm was stated to ±4.8 mm, eight times too large, and the other one too exact."""
+    """With one size for both, the arm of 0.1 mm was stated to ±4.8 mm, eight times too large."""
     squared, stated = [], []
     for seed in range(4):
         errors = [ArmErrors((1e-4, np.radians(0.02))), ArmErrors((3e-3, np.radians(0.6)))]
