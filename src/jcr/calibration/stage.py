@@ -24,6 +24,7 @@ from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
+from jcr.estimation.closed_form import ONE_AXIS
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
 from jcr.estimation.problem import offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
@@ -60,8 +61,6 @@ OF_ADJUSTMENT = (
 """Checks of CHECKS that test the adjustment; the others test the images, and poses that are not adjusted."""
 HEIGHT_STD = 1e-3
 """Standard deviation (m) of a height measured with a ruler."""
-ONE_AXIS = np.radians(6)
-"""Largest rms deviation of the rotation axis (rad) for which a motion is planar, and smallest rotation it needs."""
 CONTRADICTED = (4.0, 0.02)
 """Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
 fraction of the scale; both limits are exceeded."""
@@ -161,8 +160,8 @@ def fit_poses(
         camera_errors="none",
         names=[capture.images[row] for row in rows],
     )
-    if offset is None and metric_std is not None:
-        free, scale = solve(), (1.0, metric_std)
+    if metric_std is not None:
+        free, scale = solve(offset=offset), (1.0, metric_std)
         off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
         sigmas, share = CONTRADICTED
         if free.converged and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
