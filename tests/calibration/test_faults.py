@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.checks.effects import as_remark
+from jcr.calibration.adjust import with_adjusted_images
+from jcr.calibration.checks.effects import as_remark, check_effects
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fit_poses
@@ -165,6 +166,24 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.uncertainty.budget.faults) == 0
     error = step_between(hand_eye.base_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
+
+
+def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_adjustment_settled(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    capture, reconstruction = reconstructed(
+        faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0]), estimated=False
+    )
+    robot, options = errors_of(capture.base_from_gripper), CalibrateOptions()
+    case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
+    case = case.after((Finding.of(FindingKind.FEW_USED, "warns", "reconstruction", value=12.0, of=20.0),))
+    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    assert kinds >= {FindingKind.FEW_USED, FindingKind.ZOOM} and FindingKind.NOT_SETTLED not in kinds
+    monkeypatch.setattr("jcr.estimation.solve.ROUNDS", 1)
+    case = replace(case, adjusted=None)
+    case = with_adjusted_images(replace(case, hand_eye=case.pose_fit, fit=None))
+    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
 
 
 def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large():

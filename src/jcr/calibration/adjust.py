@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import image_verdicts, judged, leave_one_out
+from jcr.calibration.hand_eye import JUDGED, image_verdicts, judged, leave_one_out
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.image_equations import median_reprojection_px
@@ -84,17 +84,30 @@ def with_adjusted_images(case: Case) -> Case:
     case = replace(case, adjusted=found)
     if not case.hand_eye.observability.observable:
         return case
-    refined = judged(refined_by(case, found))
-    if not found.settled:
-        # The iterations ended before the steps and the estimated sizes of the errors converged.
-        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
-        size = {"value": found.last_step, "rounds": float(found.iterations)}
-        unsettled = Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size)
-        refined = refined.with_findings(unsettled)
+    refined = readjusted(case, found)
     nearer, than = refined.held_out, case.hand_eye.held_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined, fit=case.pose_fit)
+
+
+def readjusted(case: Case, found: Solution) -> Calibration:
+    """Return the calibration that the adjustment `found` of a case gives, with the findings of earlier checks.
+
+    Kinds JUDGED are derived again, and a finding states whether this adjustment settled.
+    """
+    derived = JUDGED | {FindingKind.NOT_SETTLED}
+    kept = tuple(one for one in case.hand_eye.findings if one.kind not in derived)
+    refined = replace(refined_by(case, found), findings=kept)
+    for one in kept:
+        refined = refined.with_finding(one)
+    refined = judged(refined)
+    if found.settled:
+        return refined
+    # The iterations ended before the steps and the estimated sizes of the errors converged.
+    severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+    size = {"value": found.last_step, "rounds": float(found.iterations)}
+    return refined.with_findings(Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size))
 
 
 def adjust_case(
@@ -172,7 +185,7 @@ def with_intrinsics_considered(case: Case) -> Calibration:
 def refined_by(case: Case, found: Solution) -> Calibration:
     """Return the calibration that the adjustment `found` of a case gives, with the findings of the fit to camera poses.
 
-    The findings of the kinds JUDGED still describe the fit; `judged` derives them again. For an arm that carries the
+    `readjusted` replaces these findings. For an arm that carries the
     scene, gripper_from_camera stands for base_from_camera, and base_from_recon for gripper_from_object.
     """
     fit, used, x = case.pose_fit, case.used, found.state.x[0]

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjust_case, refined_by
+from jcr.calibration.adjust import adjust_case, readjusted
 from jcr.calibration.case import Case, some_points
-from jcr.calibration.hand_eye import judged, poses_agree
+from jcr.calibration.hand_eye import poses_agree
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
 from jcr.camera import parameter_names, parameters, with_thin_prism
@@ -473,7 +473,7 @@ def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Ca
     adjusted, adopted = with_effects(fewer, model, findings)
     if adjusted is None:
         return case.after(findings)
-    before, refined = case.hand_eye, judged(refined_by(fewer, adjusted))
+    before, refined = case.hand_eye, readjusted(fewer, adjusted)
     if not refined.converged:
         return case.after(findings)
     of_camera = {one.kind for one in findings if one.kind.row.group == "camera"} - {FindingKind.INTRINSICS}
