@@ -17,6 +17,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
+from jcr.records import CameraEvidence
 from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
@@ -184,6 +185,26 @@ def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_a
     case = with_adjusted_images(replace(case, hand_eye=case.pose_fit, fit=None))
     kinds = {one.kind for one in check_effects(case).hand_eye.findings}
     assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
+
+
+def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covariance_of_given_cameras():
+    """Camera poses counted as exact: those that images correct doubled the ±, stated errors were left out."""
+    problem = bent_problem(arm_named("ur5e"), "factory-calibrated", 10, 2, (1e-3, np.radians(0.2)))
+    capture = capture_of(
+        problem.base_from_gripper, intrinsics=OBSERVED_BY, robot="ur5e", joints=problem.joints
+    )
+    seen = observed(problem, np.random.default_rng(2), 150, 0.5)
+    by_images = calibrate_reconstruction(capture, reconstruction_of(problem.recon_from_camera, tracks=seen))
+    std = np.tile(np.repeat([1e-3 / problem.scale, np.radians(0.2)], 3), 10)
+    stated = CameraEvidence(recon_from_camera=problem.recon_from_camera, covariance=np.diag(std**2))
+    by_poses = calibrate_reconstruction(
+        capture, reconstruction_of(problem.recon_from_camera, evidence=stated)
+    )
+    for found, least, most in ((by_images, 0.01, 0.03), (by_poses, 0.03, 0.1)):
+        assert found.joint_offsets is not None
+        off = problem.bent.errors[1:5] - found.joint_offsets.offset[1:5]
+        assert (np.abs(off) < 3 * found.joint_offsets.std[1:5]).all()
+        assert least < np.degrees(found.joint_offsets.std[1:5]).max() < most
 
 
 def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large():
