@@ -18,13 +18,13 @@ from numpy import ndarray
 
 from jcr.estimation.elimination import cholesky, inverse_of, log_root_determinant, lower, over, upper
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian, error_std
-from jcr.geometry import Poses, rotation_angle
+from jcr.geometry import Poses
 from jcr.records import RobotNoise
 
 REACH = 0.45
 """Typical lever (m) between an arm's joint and its gripper, which turns an angle error into a position error."""
 ALIKE = 1.0
-"""Distance of gripper poses (rad; lengths divided by REACH) whose errors have the correlation e^(−1/2)."""
+"""Distance of gripper poses (chord 2 sin(θ/2) of the angle θ; lengths over REACH) with the correlation e^(−1/2)."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 """Assumed ratio (m/rad) of link errors to joint offsets: 0.3 mm with 0.1°, 1 mm with 0.3°."""
 
@@ -40,7 +40,10 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
     between = rotation[:, None] @ np.swapaxes(rotation, 1, 2)[None]
     apart = np.linalg.norm(position[:, None] - position, axis=-1) / REACH
-    share = np.exp(-(rotation_angle(between) ** 2 + apart**2) / (2 * ALIKE**2))[..., None, None]
+    # The chord 2 sin(θ/2) of an angle θ: with θ itself the matrix has negative eigenvalues (a Gaussian of the geodesic
+    # distance on SO(3) is not positive definite).
+    squared_chord = 3 - np.trace(between, axis1=-2, axis2=-1)
+    share = np.exp(-(squared_chord + apart**2) / (2 * ALIKE**2))[..., None, None]
     alike = share * (np.eye(3) + between) / 2
     out = np.zeros((n, n, 6, 6))
     out[..., :3, :3], out[..., 3:, 3:] = REACH**2 * alike, alike
