@@ -1,6 +1,7 @@
 """What looks like nothing and moves the answer is named with its size, and counts as uncertainty."""
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,13 @@ import pytest
 
 from benchmarks.faults import calibrated, outcome
 from jcr.calibration.adjust import with_adjusted_images
-from jcr.calibration.checks.effects import as_remark, check_effects
+from jcr.calibration.checks.effects import as_remark, check_effects, of_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fit_poses
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import arm_named
+from jcr.estimation.hypotheses import camera_rows
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
@@ -185,6 +187,20 @@ def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_a
     case = with_adjusted_images(replace(case, hand_eye=case.pose_fit, fit=None))
     kinds = {one.kind for one in check_effects(case).hand_eye.findings}
     assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
+
+
+def test_points_behind_a_camera_give_no_numpy_warning():
+    capture, reconstruction = reconstructed(faulty_capture(np.random.default_rng(3), 6, Faults()), False)
+    options, robot = CalibrateOptions(), errors_of(capture.base_from_gripper)
+    model = of_case(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)))
+    images, observations = model.solution.images, model.solution.problem.observations
+    assert observations is not None
+    x_in_camera = images.view.x_in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
+    behind = replace(images, view=replace(images.view, x_in_camera=x_in_camera))
+    model = replace(model, solution=replace(model.solution, evidence=behind))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all(np.isfinite(row.columns).all() for row in camera_rows(model, 6))
 
 
 def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covariance_of_given_cameras():

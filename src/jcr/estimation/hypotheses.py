@@ -480,10 +480,11 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
         return
     common = every[:, :2].sum(1, keepdims=True)
     of_centre = np.concatenate([common, every[:, 2:4]], axis=1)
-    # An image without points gets the median distance.
+    # An image without points, or with points behind its camera, gets the median distance.
     distance = np.array([np.median(view.depth[observations.image == k]) if (observations.image == k).any() else np.nan
                          for k in mine])  # fmt: skip
-    far = np.log(np.where(np.isfinite(distance), distance, np.nanmedian(distance)))
+    ahead = distance > 0  # neither NaN nor behind the camera
+    far = np.log(np.where(ahead, distance, np.median(distance[ahead]) if ahead.any() else 1.0))
     by_distance, unit = focal @ (far - far.mean())[:, None], float(np.ptp(far))
     # An orthonormal basis of the vectors whose sum is 0.
     each = focal @ np.linalg.svd(np.eye(m) - 1 / m)[0][:, : m - 1]
