@@ -195,8 +195,8 @@ def test_points_behind_a_camera_give_no_numpy_warning():
     model = of_case(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)))
     images, observations = model.solution.images, model.solution.problem.observations
     assert observations is not None
-    x_in_camera = images.view.x_in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
-    behind = replace(images, view=replace(images.view, x_in_camera=x_in_camera))
+    x_in_camera = images.view.in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
+    behind = replace(images, view=replace(images.view, in_camera=x_in_camera))
     model = replace(model, solution=replace(model.solution, evidence=behind))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
