@@ -553,5 +553,9 @@ def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[
     The first seven unknowns are in COVARIANCE_ORDER. `columns` (s,b) are the b confirmed error patterns of the poses,
     one standard deviation each; s = 6 per pose (m, rad; base axes).
     """
-    straight = replace(solution.equations, confirmed=columns @ columns.T)
+    # Confirmed effects of other arms stay as they are.
+    own, before = columns.reshape(-1, 6, columns.shape[1]).any((1, 2)), solution.equations.confirmed
+    other = ~np.repeat(own, 6)
+    confirmed = columns @ columns.T + (0.0 if before is None else np.outer(other, other) * before)
+    straight = replace(solution.equations, confirmed=confirmed)
     return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step
