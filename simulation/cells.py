@@ -17,7 +17,15 @@ from jcr.estimation.problem import Observations, ReportedPoses
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import Similarity, inverse, rotation_exp, scale_translation, transform
 from jcr.records import Intrinsics
-from simulation.arms import EFFECTIVE_POSES, PRESETS, PresetName, about_posture, bend, effective_fit
+from simulation.arms import (
+    EFFECTIVE_POSES,
+    PRESETS,
+    ArmErrors,
+    PresetName,
+    about_posture,
+    bend,
+    effective_fit,
+)
 from simulation.motion import fixed_camera, motion_over_table
 from simulation.poses import looking_at, random_hand_eye
 from simulation.problems import INTRINSICS, disturbed, shown_points
@@ -69,13 +77,22 @@ class CellProblem:
 
 
 def cell_problem(
-    kind: Kind, preset: PresetName, count: int, seed: int, noise_px: float = 0.5, points: int = 400
+    kind: Kind,
+    preset: PresetName | ArmErrors,
+    count: int,
+    seed: int,
+    noise_px: float = 0.5,
+    points: int = 400,
+    second: ArmErrors | None = None,
 ) -> CellProblem:
-    """Draw a cell of that kind, of UR5e arms with errors of `preset`, and `count` poses of each."""
+    """Draw a cell of that kind, of UR5e arms with the errors `preset`, and `count` poses of each.
+
+    `second` are the errors of the second arm; None: those of the first, too.
+    """
     rng = np.random.default_rng([seed, 13])
     cell = _Cell(kind=kind)
-    bent = bend(arm_named("ur5e"), PRESETS[preset], rng)
-    white = PRESETS[preset].white
+    first = PRESETS[preset] if isinstance(preset, str) else preset
+    bent, white = bend(arm_named("ur5e"), first, rng), first.white
     if kind == "carried":
         gripper_from_object = random_hand_eye(rng)
         gripper_from_object[:3, 3] = BOX_AHEAD * bent.arm.forward
@@ -112,14 +129,14 @@ def cell_problem(
         cell.add_camera(place[None], FIXED_CAMERA)
         cell.truth["base_from_camera"] = own.base_from_true_base @ place
     else:
-        second = bend(arm_named("ur5e"), PRESETS[preset], rng)
-        other = motion_over_table(second, count, np.zeros(3), (rng, rng))
+        errors = second or first
+        other = motion_over_table(bend(arm_named("ur5e"), errors, rng), count, np.zeros(3), (rng, rng))
         # The second arm is across the table.
         rotation = rotation_exp(np.array([0.0, 0.0, np.pi + rng.uniform(-0.4, 0.4)]))
         base_from_other = transform(rotation, target - rotation @ other.target_in_base)
         cell.add_arm(
             base_from_other @ other.base_from_gripper @ other.physical,
-            disturbed(other.reported, white, rng),
+            disturbed(other.reported, errors.white, rng),
             (other.physical, inverse(base_from_other)),
             FIXED_CAMERA,
         )

@@ -23,6 +23,7 @@ from jcr.records import (
     Tracks,
     Uncertainty,
 )
+from simulation.cells import CellProblem
 from simulation.problems import INTRINSICS
 
 Change = Callable[[ndarray], ndarray]
@@ -55,6 +56,18 @@ def reconstruction_of(recon_from_camera: Float[ndarray, "n 4 4"], **facts: Any) 
     """Return a reconstruction with these cameras and no tracks, of every image of a capture."""
     usual = {"image_index": np.arange(len(recon_from_camera)), "intrinsics": INTRINSICS, "tracks": NO_TRACKS}
     return Reconstruction(recon_from_camera=recon_from_camera, **(usual | {"backend": "colmap"} | facts))
+
+
+def carried_capture(problem: CellProblem, given: Intrinsics | None = None) -> tuple[Capture, Reconstruction]:
+    """Return capture and reconstruction of a cell of kind carried; `given` None: intrinsics are given exactly."""
+    camera = given or problem.cameras[0]
+    size = camera.width, camera.height
+    capture = capture_of(problem.reported[0], intrinsics=camera, image_size=size, mount="base")
+    seen = problem.observations
+    tracks = Tracks(
+        image=seen.image, x_px=seen.x_px, point=seen.point, points_in_recon=problem.points_in_world
+    )
+    return capture, reconstruction_of(problem.world_from_rig, intrinsics=camera, tracks=tracks)
 
 
 def maps_of(points_in_recon: Float[ndarray, "m h w 3"], intrinsics: Intrinsics, **facts: Any) -> Pointmaps:

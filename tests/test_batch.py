@@ -14,6 +14,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
+from jcr.errors import InputError
 from jcr.pipeline import batch as module
 from jcr.pipeline.batch import BatchRow, batch, run_one
 from jcr.pipeline.options import BatchOptions
@@ -125,3 +126,9 @@ def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Pa
     options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)), map=None)
     row = run_one(captures[1], tmp_path / "b", options, ReadOptions())
     assert row.status == "rejected" and row.reason, row
+
+
+def test_a_batch_of_no_captures_is_an_input_error(tmp_path: Path):
+    with pytest.raises(InputError, match="no captures"):
+        batch([], tmp_path / "out", RunOptions(), BatchOptions())
+    assert not (tmp_path / "out").exists()

@@ -16,8 +16,10 @@ from conftest import shrunk_capture
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.pipeline import selection
+from jcr.pipeline.stages import begun
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Reconstruction
+from jcr.result import RunOptions
 from scenes import reconstruction_of
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import write_bag
@@ -116,3 +118,10 @@ def test_edited_input_is_read_and_run_again(
     assert made == ["colmap", "colmap"]
     found = jcr.read_capture(out / "capture").base_from_gripper
     assert found[:, 0, 3].mean() == pytest.approx(moved[:, 0, 3].mean(), abs=0.02)
+
+
+def test_a_corrected_mount_is_reconstructed_anew(capture: Capture, tmp_path: Path):
+    """The images of a fixed camera are reconstructed without their background: the old reconstruction was kept."""
+    mounts = (replace(capture, mount=mount) for mount in ("gripper", "base"))
+    made = {begun(tmp_path, one, RunOptions()).state.made["reconstruct"] for one in mounts}
+    assert len(made) == 2

@@ -22,14 +22,16 @@ from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.estimation.solve import solve
 from jcr.files import write_bytes
-from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.geometry import apply, inverse, retract, rotation_exp, scale_translation, transform
 from jcr.pipeline.stages import begun, keep_reconstruction
-from jcr.pipeline.touch import touch
+from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
 from jcr.pipeline.verify import TOLERANCE, _judged, _of_two
-from jcr.records import Capture
+from jcr.records import Capture, RobotNoise, Uncertainty
 from jcr.result import RunOptions, RunResult
-from scenes import reconstruction_of, reference_of
+from scenes import hand_eye_of, reconstruction_of, reference_of
 from simulation.capture import with_robot_noise
+from simulation.poses import gripper_poses
+from simulation.problems import INTRINSICS
 
 pytestmark = pytest.mark.slow
 
@@ -246,7 +248,7 @@ def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         while found < 2:
             x_px = rng.uniform((80, 60), (560, 420)).round()
             try:
-                seen = surface_at(capture, reconstruction, name, x_px, "test")
+                seen, _ = surface_at(capture, reconstruction, name, x_px, "test")
             except InputError:
                 continue
             # By the true transform and this image's own gripper pose, at the depth that was found.
@@ -291,3 +293,29 @@ def test_what_is_no_list_of_touched_points_is_refused(done: Path, tmp_path: Path
     (tmp_path / "points.csv").write_text(FAULTS[words])
     with pytest.raises(InputError, match=words):
         touch(done, tmp_path / "points.csv")
+
+
+def test_the_expected_errors_of_a_touch_are_those_of_its_click_depth_and_pose():
+    """The p-value is uniform: errors drawn from the truth are as large as expected."""
+    rng, count, draws = np.random.default_rng(0), 6, 400
+    x = transform(rotation_exp(np.array([0.1, -0.2, 0.3])), np.array([0.03, -0.02, 0.06]))
+    gripper = gripper_poses("varied", 3, np.array([0.5, 0.0, 0.0]), x, rng)[np.arange(count) // 2]
+    in_camera = rng.uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.6], (count, 3))
+    noise = RobotNoise(translation=1e-3, rotation=np.radians(0.2), estimated=True)
+    exact = Uncertainty(covariance=1e-14 * np.eye(7))
+    calibration = hand_eye_of(x, uncertainty=exact, robot_noise=noise, intrinsics=INTRINSICS.with_std(None))
+    std = np.full(count, 2e-3)
+    covariance = error_covariance(calibration, gripper, np.arange(count) // 2, in_camera, std)
+    squared = np.empty(draws)
+    for k in range(draws):
+        step = rng.normal(size=(3, 6)) * np.repeat([noise.translation, noise.rotation], 3)
+        true = retract(gripper[::2], step)[np.arange(count) // 2]
+        seen = in_camera.copy()
+        seen *= 1 + std[:, None] * rng.normal(size=(count, 1)) / seen[:, 2:]
+        seen[:, :2] += CLICK_PX * rng.normal(size=(count, 2)) * seen[:, 2:] / [INTRINSICS.fx, INTRINSICS.fy]
+        tip = np.stack([apply(one @ x, p) for one, p in zip(true, in_camera, strict=True)])
+        tip += noise.translation * rng.normal(size=(count, 3))
+        surface = np.stack([apply(one @ x, p) for one, p in zip(gripper, seen, strict=True)])
+        error = (tip - surface).ravel()
+        squared[k] = error @ np.linalg.solve(covariance, error)
+    assert squared.mean() == pytest.approx(3 * count, rel=0.1)

@@ -1,21 +1,25 @@
 """What looks like nothing and moves the answer is named with its size, and counts as uncertainty."""
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.checks.effects import as_remark
+from jcr.calibration.adjust import with_adjusted_images
+from jcr.calibration.checks.effects import as_remark, check_effects, of_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fit_poses
 from jcr.cell.carried import eye_to_hand, refined
 from jcr.estimation.arms import arm_named
+from jcr.estimation.hypotheses import camera_rows
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
+from jcr.records import CameraEvidence
 from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
@@ -165,6 +169,58 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.uncertainty.budget.faults) == 0
     error = step_between(hand_eye.base_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
+
+
+def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_adjustment_settled(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    capture, reconstruction = reconstructed(
+        faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0]), estimated=False
+    )
+    robot, options = errors_of(capture.base_from_gripper), CalibrateOptions()
+    case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
+    case = case.after((Finding.of(FindingKind.FEW_USED, "warns", "reconstruction", value=12.0, of=20.0),))
+    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    assert kinds >= {FindingKind.FEW_USED, FindingKind.ZOOM} and FindingKind.NOT_SETTLED not in kinds
+    monkeypatch.setattr("jcr.estimation.solve.ROUNDS", 1)
+    case = replace(case, adjusted=None)
+    case = with_adjusted_images(replace(case, hand_eye=case.pose_fit, fit=None))
+    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
+
+
+def test_points_behind_a_camera_give_no_numpy_warning():
+    capture, reconstruction = reconstructed(faulty_capture(np.random.default_rng(3), 6, Faults()), False)
+    options, robot = CalibrateOptions(), errors_of(capture.base_from_gripper)
+    model = of_case(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)))
+    images, observations = model.solution.images, model.solution.problem.observations
+    assert observations is not None
+    x_in_camera = images.view.in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
+    behind = replace(images, view=replace(images.view, in_camera=x_in_camera))
+    model = replace(model, solution=replace(model.solution, evidence=behind))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all(np.isfinite(row.columns).all() for row in camera_rows(model, 6))
+
+
+def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covariance_of_given_cameras():
+    """Camera poses counted as exact: those that images correct doubled the ±, stated errors were left out."""
+    problem = bent_problem(arm_named("ur5e"), "factory-calibrated", 10, 2, (1e-3, np.radians(0.2)))
+    capture = capture_of(
+        problem.base_from_gripper, intrinsics=OBSERVED_BY, robot="ur5e", joints=problem.joints
+    )
+    seen = observed(problem, np.random.default_rng(2), 150, 0.5)
+    by_images = calibrate_reconstruction(capture, reconstruction_of(problem.recon_from_camera, tracks=seen))
+    std = np.tile(np.repeat([1e-3 / problem.scale, np.radians(0.2)], 3), 10)
+    stated = CameraEvidence(recon_from_camera=problem.recon_from_camera, covariance=np.diag(std**2))
+    by_poses = calibrate_reconstruction(
+        capture, reconstruction_of(problem.recon_from_camera, evidence=stated)
+    )
+    for found, least, most in ((by_images, 0.01, 0.03), (by_poses, 0.03, 0.1)):
+        assert found.joint_offsets is not None
+        off = problem.bent.errors[1:5] - found.joint_offsets.offset[1:5]
+        assert (np.abs(off) < 3 * found.joint_offsets.std[1:5]).all()
+        assert least < np.degrees(found.joint_offsets.std[1:5]).max() < most
 
 
 def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large():

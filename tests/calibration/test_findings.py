@@ -159,3 +159,10 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     file.write_text(json.dumps(written | {"converged": False}))
     with pytest.raises(InputError, match="contradict one another"):
         read_calibration(file)
+
+
+def test_a_misspelt_field_of_a_finding_fails():
+    """The message printed an empty number."""
+    sizes = {"value": 0.01, "rotatoin": 0.02, "longer": "before", "count": 6.0}
+    with pytest.raises(TypeError, match="rotation_deg"):
+        Finding.of(FindingKind.SLIP, "warns", "mount", "3.png", "4.png", **sizes)

@@ -253,6 +253,15 @@ def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
     assert "the robot cannot tell" in notes[0]
 
 
+def test_depth_images_of_two_units_are_no_measure_of_the_scale(measured: tuple, tmp_path: Path):
+    """Half of the images in twice the unit: no depth agreed with the median of all, which ended with a ValueError."""
+    capture, reconstruction, hand_eye, true = measured
+    for k, name in enumerate(capture.depths):
+        depth = np.rint(1e3 * (1 + k % 2) * true[k]).clip(0, 65535).astype(np.uint16)
+        write_bytes(tmp_path / name, encode_png(depth))
+    assert depth_check(replace(capture, folder=tmp_path), reconstruction, hand_eye) is None
+
+
 def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
     folder = tmp_path / "capture"
     frames = []

@@ -10,11 +10,12 @@ from jcr.distributions import chi2
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import TYPICAL_RAD, camera_error_part
 from jcr.estimation.hypotheses import joint_offsets
-from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.pose_equations import pose_equations, reported_poses
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
-from jcr.geometry import rotation_exp, transform
+from jcr.estimation.solve import solve
+from jcr.geometry import rotation_exp, step_between, transform
 from simulation.arms import PresetName
 from simulation.problems import bent_problem, error, hand_eye_problem
 
@@ -143,3 +144,21 @@ def test_offsets_are_right_within_their_sigma():
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
     # The first and the last joint rotate base and gripper, which nothing shows.
     assert (np.median(printed, axis=0)[[0, 5]] > 0.95).all() and (np.median(printed, axis=0)[1:5] < 0.7).all()
+
+
+@pytest.mark.parametrize("camera_std", [0.0, 1e-3])
+def test_problem_and_state_of_a_robust_fit_are_in_the_given_frame(camera_std: float):
+    """Residuals of the returned state in the returned problem were metres; the covariance was another frame's."""
+    problem = hand_eye_problem(np.random.default_rng(1), 10, robot_noise=(3e-4, 1e-3))
+    away = transform(np.eye(3), np.array([5.0, -3.0, 2.0]))
+    given = away @ problem.recon_from_camera
+    covariance = camera_std**2 * np.eye(60) if camera_std else None
+    fit = robust_fit(problem.base_from_gripper, given, camera_covariance=covariance)
+    assert np.linalg.norm(reported_poses(fit.problem, fit.state)[0], axis=1).max() < 5e-3
+    assert np.abs(fit.equations.residual).max() < 5e-3
+    again = solve(fit.problem, fit.state)
+    assert np.allclose(step_between(again.state.z[0], fit.state.z[0]), 0, atol=1e-6)
+    std = np.sqrt(np.diag(again.covariance))
+    assert np.allclose(fit.covariance / np.outer(std, std), again.covariance / np.outer(std, std), atol=1e-3)
+    errors, own = again.leave_one_out[0], fit.leave_one_out[0]
+    assert np.allclose(errors, own, atol=1e-6)

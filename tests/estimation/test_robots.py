@@ -10,6 +10,7 @@ from jcr.errors import InputError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm
 from jcr.estimation.kinematics import error_jacobian, error_std, forward_kinematics, with_tool
+from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import inverse, rotation_exp, step_between, transform
 from simulation.arms import BentArm
 
@@ -214,3 +215,15 @@ def test_joint_angles_contradict_positions_that_are_all_too_long(name):
             poses[:, :3, 3] *= factor
             with pytest.raises(LengthError, match=f"{words}for a {name}"):
                 mounted_arm(arm, joints, poses)
+
+
+@pytest.mark.parametrize("about_one_axis", [True, False])
+def test_smooth_errors_have_a_covariance_at_all_rotations(about_one_axis: bool):
+    """With the angle of the rotation in place of its chord, eigenvalues were down to -0.010."""
+    turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)[:, None] * np.array([0.0, 0.6, 0.8])
+    rotations = rotation_exp(turns)
+    if not about_one_axis:
+        rotations = Rotation.random(60, rng=0).as_matrix()
+    covariance = smooth_errors(transform(rotations, np.zeros((60, 3))))
+    assert np.linalg.eigvalsh(covariance).min() > -1e-12
+    assert np.diag(covariance).reshape(60, 2, 3) == pytest.approx(np.tile([[0.45**2], [1.0]], (60, 1, 3)))

@@ -3,6 +3,7 @@
 A case without adjusted images keeps the fit to camera poses; errors of the intrinsics are added to its covariance.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import image_verdicts, judged, leave_one_out
+from jcr.calibration.hand_eye import JUDGED, image_verdicts, judged, leave_one_out
 from jcr.calibration.record import Calibration
 from jcr.camera import by_parameters, by_point, parameter_names
 from jcr.estimation.image_equations import median_reprojection_px
@@ -26,6 +27,7 @@ from jcr.estimation.projection import view_of
 from jcr.estimation.solve import START_NOISE, Solution, recon_frame, solve, uncertainty_of
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import (
+    Poses,
     apply,
     inverse,
     retract,
@@ -82,17 +84,30 @@ def with_adjusted_images(case: Case) -> Case:
     case = replace(case, adjusted=found)
     if not case.hand_eye.observability.observable:
         return case
-    refined = judged(refined_by(case, found))
-    if not found.settled:
-        # The iterations ended before the steps and the estimated sizes of the errors converged.
-        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
-        size = {"value": found.last_step, "rounds": float(found.iterations)}
-        unsettled = Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size)
-        refined = refined.with_findings(unsettled)
+    refined = readjusted(case, found)
     nearer, than = refined.held_out, case.hand_eye.held_out
     if case.tracks.from_pointmaps and (nearer is None or than is None or nearer.length_m >= than.length_m):
         return case
     return replace(case, hand_eye=refined, fit=case.pose_fit)
+
+
+def readjusted(case: Case, found: Solution) -> Calibration:
+    """Return the calibration that the adjustment `found` of a case gives, with the findings of earlier checks.
+
+    Kinds JUDGED are derived again, and a finding states whether this adjustment settled.
+    """
+    derived = JUDGED | {FindingKind.NOT_SETTLED}
+    kept = tuple(one for one in case.hand_eye.findings if one.kind not in derived)
+    refined = replace(refined_by(case, found), findings=kept)
+    for one in kept:
+        refined = refined.with_finding(one)
+    refined = judged(refined)
+    if found.settled:
+        return refined
+    # The iterations ended before the steps and the estimated sizes of the errors converged.
+    severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+    size = {"value": found.last_step, "rounds": float(found.iterations)}
+    return refined.with_findings(Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size))
 
 
 def adjust_case(
@@ -170,7 +185,8 @@ def with_intrinsics_considered(case: Case) -> Calibration:
 def refined_by(case: Case, found: Solution) -> Calibration:
     """Return the calibration that the adjustment `found` of a case gives, with the findings of the fit to camera poses.
 
-    The findings of the kinds JUDGED still describe the fit; `judged` derives them again.
+    `readjusted` replaces these findings. For an arm that carries the
+    scene, gripper_from_camera stands for base_from_camera, and base_from_recon for gripper_from_object.
     """
     fit, used, x = case.pose_fit, case.used, found.state.x[0]
     scale, base_from_recon = recon_frame(found, case.tracks)
@@ -181,10 +197,12 @@ def refined_by(case: Case, found: Solution) -> Calibration:
         steps = decentring(intrinsics, x)
         uncertainty = uncertainty.with_error(steps @ steps.T, "intrinsics")
     gripper, camera = case.base_from_gripper, case.recon_from_camera
+    # For an arm that carries the scene, X, Z and the rigs predict gripper_from_base.
+    of_arm: Callable[[Poses], Poses] = inverse if case.carries == "scene" else np.asarray
     # The residuals of rejected gripper poses refer to the poses that their camera poses predict.
-    predicted = base_from_recon @ scale_translation(camera, scale) @ inverse(x)
+    predicted = of_arm(base_from_recon @ scale_translation(camera, scale) @ inverse(x))
     state, rigs = found.state, found.problem.arms[0].rigs
-    predicted[used] = predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig[rigs])
+    predicted[used] = of_arm(predicted_gripper_poses(x, state.scale, state.z[0], state.world_from_rig[rigs]))
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
@@ -193,8 +211,8 @@ def refined_by(case: Case, found: Solution) -> Calibration:
     # by the leave-one-out residuals of their gripper poses.
     left_out, likely = found.leave_one_out[0], found.most_likely
     x_likely, z, displaced = likely.x[0], likely.z[0], likely.world_from_rig.copy()
-    gripper_likely = predicted_gripper_poses(x_likely, likely.scale, z, displaced[rigs])
-    in_metres = inverse(z) @ retract(gripper_likely, -left_out) @ x_likely
+    gripper_likely = of_arm(predicted_gripper_poses(x_likely, likely.scale, z, displaced[rigs]))
+    in_metres = inverse(z) @ of_arm(retract(gripper_likely, -left_out)) @ x_likely
     displaced[rigs] = scale_translation(in_metres, 1 / likely.scale)
     moved = view_of(found.problem, replace(found.images.state, world_from_rig=displaced))
     reprojection_px = float(np.median(median_reprojection_px(found.problem, moved)))
@@ -208,7 +226,7 @@ def refined_by(case: Case, found: Solution) -> Calibration:
         uncertainty=uncertainty,
         intrinsics=intrinsics.with_std(uncertainty.intrinsics_std),
         images=image_verdicts(case.names, fit.inliers, reasons, metres, radians, reprojection),
-        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, fit.inliers)),
+        residuals=PaperResiduals(*paper_residuals(of_arm(gripper), camera, x, scale, fit.inliers)),
         robot_noise=found.noise,
         held_out=leave_one_out(left_out, how, reprojection_px),
     )

@@ -1,5 +1,6 @@
 """Stage calibrate, for a reconstructed capture or given camera poses: fit, bundle adjustment, checks, requirement."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -23,6 +24,7 @@ from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
+from jcr.estimation.closed_form import ONE_AXIS
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
 from jcr.estimation.pose_misfit import pose_misfit
 from jcr.estimation.problem import offset_prior, scale_prior
@@ -49,10 +51,17 @@ CHECKS = (
 The pose convention of a rejected calibration is tested early, because poses of another convention make all later checks
 meaningless. Rejected calibrations are also tested for effects on camera and robot, which may explain the rejection.
 """
+OF_ADJUSTMENT = (
+    check_board_shapes,
+    check_effects,
+    check_predicted_focal,
+    check_boards,
+    check_lengths,
+    check_robot,
+)
+"""Checks of CHECKS that test the adjustment; the others test the images, and poses that are not adjusted."""
 HEIGHT_STD = 1e-3
 """Standard deviation (m) of a height measured with a ruler."""
-ONE_AXIS = np.radians(6)
-"""Largest rms deviation of the rotation axis (rad) for which a motion is planar, and smallest rotation it needs."""
 CONTRADICTED = (4.0, 0.02)
 """Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
 fraction of the scale; both limits are exceeded."""
@@ -88,11 +97,15 @@ def calibrate_case(
 
     `robot` is the error prior of the registered images' gripper poses.
     """
-    case = checked_case(capture, reconstruction, options, robot)
+    return with_requirement(checked_case(capture, reconstruction, options, robot))
+
+
+def with_requirement(case: Case) -> Case:
+    """Return the case with the uncertainty of points at the working distance and of the scene, and its requirement."""
     gripper, distance_m, scene = case.base_from_gripper, case.scene_distance_m, None
     if distance_m is not None and case.adjusted is not None:
         scene = scene_uncertainty(scene_points(case.adjusted))
-    found = advised(case.hand_eye, gripper, options, distance_m, scene)
+    found = advised(case.hand_eye, gripper, case.options, distance_m, scene)
     return replace(case, hand_eye=found)
 
 
@@ -105,8 +118,12 @@ def checked_case(
     A rejected calibration is returned with its findings, not raised; a check that its geometry makes impossible is
     skipped. `robot` is the error prior of the registered images' gripper poses.
     """
-    case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
-    for check in CHECKS:
+    return with_checks(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)), CHECKS)
+
+
+def with_checks(case: Case, checks: Sequence[Callable[[Case], Case]]) -> Case:
+    """Return the case after the checks in their order; with a rejected calibration, impossible checks are skipped."""
+    for check in checks:
         try:
             case = check(case)
         except np.linalg.LinAlgError:
@@ -144,8 +161,8 @@ def fit_poses(
         camera_errors="none",
         names=[capture.images[row] for row in rows],
     )
-    if offset is None and metric_std is not None:
-        free, scale = solve(), (1.0, metric_std)
+    if metric_std is not None:
+        free, scale = solve(offset=offset), (1.0, metric_std)
         off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
         sigmas, share = CONTRADICTED
         if free.converged and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):

@@ -18,20 +18,23 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjust_case
-from jcr.calibration.case import MIN_OBSERVATIONS, Case, with_findings
-from jcr.calibration.checks.effects import POLICIES, effects, of_case, with_effects
-from jcr.calibration.hand_eye import judged, solve_hand_eye
+from jcr.calibration.adjust import with_adjusted_images
+from jcr.calibration.case import MIN_OBSERVATIONS, Case
+from jcr.calibration.hand_eye import JUDGED, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.stage import OF_ADJUSTMENT, with_checks, with_requirement
 from jcr.capture.images import encode_png, read_image
-from jcr.estimation.solve import recon_frame, uncertainty_of
 from jcr.files import write_bytes
-from jcr.findings import Finding, FindingKind
+from jcr.findings import Finding, FindingKind, kinds_of
 from jcr.geometry import inverse
 from jcr.records import Capture, Reconstruction
 
+AGAIN = kinds_of("camera", "order", "strain", "lengths").union(
+    JUDGED, {FindingKind.NOT_SETTLED, FindingKind.JOINT_OFFSETS}
+)
+"""Kinds of findings of an adjustment, which are derived again for the gripper poses as reported."""
 LEVELS = 14.0
 """Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
 REDUCED = 320
@@ -84,35 +87,25 @@ def refined(
         )
         why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
         return (found.with_findings(why) if on_gripper.converged else found).on_fixed_camera()
+    # Findings on images and motions stay. Those of the adjustment are derived again with the poses as reported.
+    kept = tuple(one for one in found.findings if one.kind not in AGAIN)
+    registered = tuple(found.images[row] for row in rows)
     case = Case(
         capture=capture,
         reconstruction=reconstruction,
         options=options,
         robot=robot_errors(capture, options).of(rows),
-        hand_eye=found,
+        hand_eye=replace(
+            found, images=registered, source="poses", findings=kept, lengths=(), depth_check=None
+        ),
         carries="scene",
     )
     if found.source == "poses" or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found.on_fixed_camera()
-    case = replace(case, adjusted=adjust_case(case))
-    state, effects_found = effects(of_case(case))
-    adjusted, effects_found = with_effects(case, state, effects_found)
-    answer = adjusted or case.adjusted
-    assert answer is not None
-    scale, gripper_from_object = recon_frame(answer, case.tracks)
-    uncertainty = uncertainty_of(answer)
-    intrinsics = answer.problem.intrinsics(answer.state)[0].with_std(uncertainty.intrinsics_std)
-    again = replace(
-        found,
-        on_gripper=answer.state.x[0],
-        resting=gripper_from_object,
-        scale=scale,
-        uncertainty=replace(uncertainty, seen=found.uncertainty.seen, scene=found.uncertainty.scene),
-        intrinsics=intrinsics,
-        robot_noise=answer.noise,
-        findings=tuple(one for one in found.findings if one.kind not in POLICIES),
-    )
-    return judged(with_findings(judged(again), effects_found)).on_fixed_camera()
+    case = with_requirement(with_checks(with_adjusted_images(case), OF_ADJUSTMENT))
+    images = dict(zip(rows.tolist(), case.hand_eye.images, strict=True))
+    every = tuple(images.get(row, one) for row, one in enumerate(found.images))
+    return replace(case.hand_eye, images=every).on_fixed_camera()
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:

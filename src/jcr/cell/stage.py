@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.calibration.case import Case
-from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects
+from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects, straight_shift
 from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
@@ -27,7 +27,7 @@ from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
 from jcr.estimation.hypotheses import Adjustment
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.problem import Problem, State, freed, with_observations
+from jcr.estimation.problem import Problem, State, columns_of_arm, freed, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, apply, inverse, step_between
@@ -164,12 +164,39 @@ def _examined(
                 place=one.parent_from_camera,
             )
         )
-        if (free := state.combinations) is not None:
-            problem = freed(problem, free, one.number)
-            solution = _adjusted(problem, start, one)
-            faults = tuple(as_adopted(one) if one.kind.row.group == "camera" else one for one in faults)
+        problem, solution, faults = _adopted(problem, start, one, state, faults)
         found.append(faults)
     return solution, found
+
+
+def _adopted(
+    problem: Problem, start: State, views: CameraViews, model: Adjustment, faults: tuple[Finding, ...]
+) -> tuple[Problem, Solution, tuple[Finding, ...]]:
+    """Return problem and solution with the effects of `model` on a camera and its arm, and the findings on them.
+
+    Findings on the camera lose their shifts. The first finding on the arm's lengths or angles (a strain) gets the shift
+    of the camera's pose from reported to true gripper poses.
+    """
+    free = model.combinations
+    strains = [row for row in model.rows if row.kind.row.group == "strain"]
+    if free is None and not strains:
+        return problem, model.solution, faults
+    if free is not None:
+        problem = freed(problem, free, views.number)
+    bent = np.concatenate([row.unit * row.columns for row in strains], axis=1) if strains else None
+    if bent is not None and views.arm is not None:
+        own, arms = model.poses[1], list(problem.arms)
+        arms[views.arm] = replace(arms[views.arm], confirmed_errors=bent[own])
+        problem = replace(problem, arms=tuple(arms))
+    solution, adopted = solve(*with_observations(problem, start)), list[Finding]()
+    for one in faults:
+        if one.kind.row.group == "camera":
+            one = as_adopted(one)
+        elif bent is not None and views.arm is not None and one.kind is strains[0].kind:
+            shift = straight_shift(solution, bent)[columns_of_arm(views.arm)[:6]]
+            one = replace(one, shift=(*shift.tolist(), 0.0))
+        adopted.append(one)
+    return problem, solution, tuple(adopted)
 
 
 def _adjusted(

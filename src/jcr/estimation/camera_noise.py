@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from jcr.estimation.pose_equations import pose_by_pose, pose_equations, reported_poses
 from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, LinearPrior, Start, pose_problem
 from jcr.estimation.robot_noise import (
+    OF_ARM,
     Equations,
     LogSizes,
     log_evidence,
@@ -115,7 +116,7 @@ def camera_error_covariance(
         adopted += parts
         del components[parts]
     every, out = np.arange(len(recon_from_camera)), None
-    for part, variance in zip(adopted, equations.variances(sizes)[3:], strict=True):
+    for part, variance in zip(adopted, equations.variances(sizes)[OF_ARM:], strict=True):
         covariance = variance * camera_error_part(part, recon_from_camera, fit[1], every)
         out = covariance if out is None else out + covariance
     return out

@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, lower, upper
 from jcr.estimation.pose_equations import Region
-from jcr.estimation.problem import UNKNOWNS
+from jcr.estimation.problem import SCALE, columns_of_arm
 from jcr.estimation.robot_noise import (
     Each,
     Equations,
@@ -50,7 +50,8 @@ def posterior(
     """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
     The averages are over the posterior of the robot's error sizes σ. `mode` are their most likely logarithms,
-    `information` is their information matrix. The covariance includes `region.spread`, the effect of systematic errors
+    `information` is their information matrix. The sizes of one arm vary while those of the others stay at the mode, and
+    the changes by all arms add up. The covariance includes `region.spread`, the effect of systematic errors
     at other poses. `expected`: for predictions, the residuals are 0 and their squares are replaced by expectations
     under the noise at the mode.
     """
@@ -65,7 +66,7 @@ def posterior(
 
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
         """Return the covariance of the unknowns by systematic robot errors, which differ at other poses."""
-        part = equations.variances(sizes)[..., 2, None, None] * equations.systematic
+        part = equations.systematic_part(sizes)
         # The diagonal block (6,6) of each pose.
         poses, each = part.shape[-1] // 6, np.arange(part.shape[-1] // 6)
         blocks = part.reshape(*part.shape[:-2], poses, 6, poses, 6)[..., each, :, each, :]
@@ -80,15 +81,23 @@ def posterior(
             learned = learned + sign * np.swapaxes(columns, -1, -2) @ columns
         return region.spread(second_moment + poses / (poses + PRIOR_POSES) * learned)
 
-    found = over_sizes(equations, mode, information, density)
-    groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
-    weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
-    step = weight @ steps
-    off = steps - step
-    covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
-    n = UNKNOWNS
-    covariance *= _widening(weight, off[:, :n], each[:, :n, :n], covariance[:n, :n])
-    at_mode = elsewhere(solve_equations(equations, mode), mode)
+    mode_solution = solve_equations(equations, mode)
+    at_mode = elsewhere(mode_solution, mode)
+    step, covariance = mode_solution.step, mode_solution.covariance + at_mode
+    factor, steps_beyond, beyond = np.ones(len(step)), np.zeros_like(step), np.zeros_like(covariance)
+    for arm in range(equations.arms):
+        found = over_sizes(equations, mode, information, density, arm)
+        groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
+        weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
+        mean = weight @ steps
+        off = steps - mean
+        averaged = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
+        own = np.sort(np.r_[SCALE.start, columns_of_arm(arm)])
+        widened = _widening(weight, off[:, own], each[:, own[:, None], own], averaged[np.ix_(own, own)])
+        # All unknowns but those of further arms are enlarged as the first arm's.
+        factor[slice(None) if arm == 0 else columns_of_arm(arm)] = np.sqrt(widened)
+        steps_beyond, beyond = steps_beyond + (mean - step), beyond + (averaged - covariance)
+    step, covariance = step + steps_beyond, factor[:, None] * (covariance + beyond) * factor
     return step, covariance, _budget(equations, mode, at_mode, covariance)
 
 
@@ -142,24 +151,25 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     exact intrinsics would remove. The parts are scaled so that they add up to `covariance`. The part of the images
     includes unobservable directions and rounding.
     """
+    arms = 12 * equations.arms + 1
     exact = replace(
         equations,
-        jacobian=equations.jacobian[:, :UNKNOWNS],
-        prior_information=equations.prior_information[:UNKNOWNS, :UNKNOWNS],
-        prior_gradient=equations.prior_gradient[:UNKNOWNS],
+        jacobian=equations.jacobian[:, :arms],
+        prior_information=equations.prior_information[:arms, :arms],
+        prior_gradient=equations.prior_gradient[:arms],
     )
     solution = solve_equations(exact, log_sizes)
     gain = solution.gain
     random = (gain * exact.random(log_sizes)) @ gain.T
-    systematic = elsewhere[:UNKNOWNS, :UNKNOWNS]
-    systematic = systematic + exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
+    systematic = elsewhere[:arms, :arms]
+    systematic = systematic + gain @ exact.systematic_part(log_sizes) @ gain.T
     if exact.confirmed is not None:
         systematic = systematic + gain @ exact.confirmed @ gain.T
     # Covariance from the priors and from errors of the camera poses.
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
-    intrinsics = solve_equations(equations, log_sizes).covariance[:UNKNOWNS, :UNKNOWNS] - solution.covariance
+    intrinsics = solve_equations(equations, log_sizes).covariance[:arms, :arms] - solution.covariance
     whole, parts = covariance[:7, :7], [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     # A linear map takes errors with the covariance of all parts to errors with the whole covariance.
     known = sum(parts[1:], parts[0])

@@ -262,7 +262,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
     `model`, which raises LinAlgError if it is singular.
     """
     if not row.of_camera:
-        test = confirm_in_equations(model.solution.equations, row)
+        test = confirm_in_equations(model.solution.equations, row, arm=model.arm or 0)
         own = test.shift[columns_of_arm(model.arm or 0)[:6]]
         return replace(test, shift=np.r_[own, 0.0])
     after = model.with_rows((*model.rows, row))
@@ -286,7 +286,7 @@ def confirm(model: Adjustment, row: Row) -> Test:
         covariance=_dispersion(solution.images) * covariance,
         log_p=float(f_distribution.logsf(ratio, d, scores.freedom) + np.log(row.places)),
         shift=np.r_[step, growth],
-        noise=solution.noise,
+        noise=solution.equations.noise(solution.log_sizes, model.arm or 0),
         after=after,
     )
 
@@ -300,12 +300,13 @@ def squared_length(vector: Float[ndarray, " d"], covariance: Float[ndarray, "d d
     return float(whitened @ whitened), int(kept.sum())
 
 
-def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None) -> Test:
+def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None, arm: int = 0) -> Test:
     """Return Wald's test of an effect on the poses: an F test of its parameters, averaged over the error sizes.
 
     The rows of `row.columns` are those of `equations.residual`. The average weighs each choice of the sizes by its
     posterior (`over_sizes`). `Test.shift` is the change of all p unknowns, in the order of `equations`. `freedom` is
-    the denominator's degrees of freedom of each F test; None: those of all residuals, which is conservative.
+    the denominator's degrees of freedom of each F test; None: those of all residuals, which is conservative. `arm` is
+    the arm whose noise the result has.
     """
     count, d = equations.jacobian.shape[1], row.columns.shape[1]
     free = replace(
@@ -320,7 +321,7 @@ def confirm_in_equations(equations: Equations, row: Row, freedom: float | None =
     under = float(max(len(equations.residual) - UNKNOWNS - d, 1)) if freedom is None else freedom
     log_shares = []
     # Few poses determine the sizes badly, and with larger sizes the same estimate is less significant.
-    for weight, _, each in over_sizes(free, likeliest, information):
+    for weight, _, each in over_sizes(free, likeliest, information, arm=arm):
         size, covariance = each.step[:, count:], each.covariance[:, count:, count:]
         ratio = (size * np.linalg.solve(covariance, size[..., None])[..., 0]).sum(1) / d
         log_tail = np.array([f_distribution.logsf(float(one), d, under) for one in ratio])
@@ -331,7 +332,7 @@ def confirm_in_equations(equations: Equations, row: Row, freedom: float | None =
         covariance=found.covariance[count:, count:],
         log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(row.places)),
         shift=found.step[:count] - without.step,
-        noise=free.noise(likeliest),
+        noise=free.noise(likeliest, arm),
     )
 
 
@@ -479,10 +480,11 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
         return
     common = every[:, :2].sum(1, keepdims=True)
     of_centre = np.concatenate([common, every[:, 2:4]], axis=1)
-    # An image without points gets the median distance.
+    # An image without points, or with points behind its camera, gets the median distance.
     distance = np.array([np.median(view.depth[observations.image == k]) if (observations.image == k).any() else np.nan
                          for k in mine])  # fmt: skip
-    far = np.log(np.where(np.isfinite(distance), distance, np.nanmedian(distance)))
+    ahead = distance > 0  # neither NaN nor behind the camera
+    far = np.log(np.where(ahead, distance, np.median(distance[ahead]) if ahead.any() else 1.0))
     by_distance, unit = focal @ (far - far.mean())[:, None], float(np.ptp(far))
     # An orthonormal basis of the vectors whose sum is 0.
     each = focal @ np.linalg.svd(np.eye(m) - 1 / m)[0][:, : m - 1]

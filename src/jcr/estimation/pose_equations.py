@@ -300,7 +300,10 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         shared = (shared + shared.T) / 2
     by_unknown = np.delete(by_arms.reshape(6 * n, arms), SCALE, axis=1)
     root, fit = np.tile(EFFECTIVE_WEIGHT, len(rows) // 6), np.zeros((by_unknown.shape[1], 6 * n))
-    fit[:, rows] = np.linalg.pinv(root[:, None] * by_unknown[rows], rcond=1e-9) * root
+    # A known coordinate of the camera determines the effective transform along a direction that the motions do not.
+    known = [np.delete(one.row[:arms], SCALE) / one.std for one in problem.priors]
+    weighted = np.concatenate([root[:, None] * by_unknown[rows], np.reshape(known, (-1, fit.shape[0]))])
+    fit[:, rows] = np.linalg.pinv(weighted, rcond=1e-9)[:, : len(rows)] * root
     everywhere = Region(by_unknown, fit, problem.unknowns)
     region = replace(everywhere, by_unknown=by_unknown[rows], fit=fit[:, rows])
     systematic = np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms)))
@@ -318,6 +321,9 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         systematic=everywhere.left(systematic),
         given=problem.robot_noise_floor,
         confirmed=everywhere.left(columns @ columns.T) if columns.size else None,
+        arm=np.repeat(np.arange(len(problem.arms)), [len(one.rigs) for one in problem.arms])
+        if len(problem.arms) > 1
+        else None,
     )
     return PoseEquations(every, region, used, by_rig, (follow, to_mean, covariance))
 

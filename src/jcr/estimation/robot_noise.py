@@ -18,13 +18,13 @@ from numpy import ndarray
 
 from jcr.estimation.elimination import cholesky, inverse_of, log_root_determinant, lower, over, upper
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian, error_std
-from jcr.geometry import Poses, rotation_angle
+from jcr.geometry import Poses
 from jcr.records import RobotNoise
 
 REACH = 0.45
 """Typical lever (m) between an arm's joint and its gripper, which turns an angle error into a position error."""
 ALIKE = 1.0
-"""Distance of gripper poses (rad; lengths divided by REACH) whose errors have the correlation e^(−1/2)."""
+"""Distance of gripper poses (chord 2 sin(θ/2) of the angle θ; lengths over REACH) with the correlation e^(−1/2)."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 """Assumed ratio (m/rad) of link errors to joint offsets: 0.3 mm with 0.1°, 1 mm with 0.3°."""
 
@@ -40,7 +40,10 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
     between = rotation[:, None] @ np.swapaxes(rotation, 1, 2)[None]
     apart = np.linalg.norm(position[:, None] - position, axis=-1) / REACH
-    share = np.exp(-(rotation_angle(between) ** 2 + apart**2) / (2 * ALIKE**2))[..., None, None]
+    # The chord 2 sin(θ/2) of an angle θ: with θ itself the matrix has negative eigenvalues (a Gaussian of the geodesic
+    # distance on SO(3) is not positive definite).
+    squared_chord = 3 - np.trace(between, axis1=-2, axis2=-1)
+    share = np.exp(-(squared_chord + apart**2) / (2 * ALIKE**2))[..., None, None]
     alike = share * (np.eye(3) + between) / 2
     out = np.zeros((n, n, 6, 6))
     out[..., :3, :3], out[..., 3:, 3:] = REACH**2 * alike, alike
@@ -94,7 +97,10 @@ AT_ONCE = 4e6
 SETTLED = 1e-4
 """Largest step of the log sizes at which the search of their mode ends."""
 LogSizes = Float[ndarray, "*k c"]
-"""c logarithms: random errors σ_t (m) and σ_r (rad), systematic error σ_s (rad), sizes of camera pose errors."""
+"""c logarithms: for each arm random errors σ_t (m) and σ_r (rad) and systematic error σ_s (rad); then the sizes of
+camera pose errors."""
+OF_ARM = 3
+"""Number of error sizes of one arm: σ_t, σ_r, σ_s."""
 Each = Float[ndarray, "*k"] | np.floating
 Covariance = Float[ndarray, "s s"]
 Information = Float[ndarray, "c c"]
@@ -123,6 +129,9 @@ class Equations:
     """Covariances of the residuals from components of the camera pose errors, each for a typical size."""
     confirmed: Covariance | None = None
     """Covariance of errors by confirmed effects (a strain of the arm, ...); it does not depend on the sizes."""
+    arm: Int[ndarray, " n"] | None = None
+    """Arm of each of n poses; each arm has error sizes of its own, and no systematic error is shared by two arms. None:
+    one arm."""
 
     @property
     def least(self) -> Float[ndarray, "2"]:
@@ -136,16 +145,29 @@ class Equations:
     def prior(self) -> tuple[Float[ndarray, "r c"], Float[ndarray, " r"], Float[ndarray, " c"]]:
         """Weak prior on the c log sizes x, as whitened residuals A x − b: A, b, and the standard deviation of each x.
 
-        The last residual is that of log(σ_t / (REACH · σ_r)).
+        The last residuals are those of log(σ_t / (REACH · σ_r)) of each arm.
         """
-        added = np.ones(len(self.camera_errors))
-        typical, count = np.r_[TYPICAL, added], 3 + len(added)
+        added, arms = np.ones(len(self.camera_errors)), self.arms
+        of_arm, first = TYPICAL.copy(), OF_ARM * np.arange(arms)
         if self.given is not None:
-            typical[:2] = GIVEN_SHARE * self.least
-        std = np.r_[FACTOR_STD, CAMERA_FACTOR_STD * added]
-        rows = np.concatenate([np.diag(1 / std), np.eye(1, count) - np.eye(1, count, 1)])
-        rows[-1] /= RATIO_STD
-        return rows, np.r_[np.log(typical) / std, np.log(REACH) / RATIO_STD], std
+            of_arm[:2] = GIVEN_SHARE * self.least
+        typical = np.r_[np.tile(of_arm, arms), added]
+        std = np.r_[np.tile(FACTOR_STD, arms), CAMERA_FACTOR_STD * added]
+        every = np.eye(len(std))
+        rows = np.concatenate([np.diag(1 / std), (every[first] - every[first + 1]) / RATIO_STD])
+        return rows, np.r_[np.log(typical) / std, np.full(arms, np.log(REACH) / RATIO_STD)], std
+
+    @property
+    def arms(self) -> int:
+        """Number of arms."""
+        return 1 if self.arm is None else int(self.arm.max()) + 1
+
+    @cached_property
+    def size_of(self) -> tuple[Int[ndarray, " s"], Int[ndarray, " s"]]:
+        """Index of the size of the random part, and of the systematic part, of each of s residuals in `LogSizes`."""
+        arm = np.zeros(len(self.residual) // 6, int) if self.arm is None else self.arm
+        first = OF_ARM * np.repeat(arm, 6)
+        return first + (self.of_position == 0), first + 2
 
     @cached_property
     def of_position(self) -> Float[ndarray, " s"]:
@@ -163,19 +185,21 @@ class Equations:
             known=None if self.known is None else of_poses(self.known, poses),
             camera_errors=tuple(of_poses(one, poses) for one in self.camera_errors),
             confirmed=None if self.confirmed is None else of_poses(self.confirmed, poses),
+            arm=None if self.arm is None else self.arm[poses],
         )
 
     def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
-        """Return c variances: random position (m²) and rotation (rad²), systematic (rad²), squared camera error sizes.
+        """Return c variances, in the order of `LogSizes`: squares of the sizes.
 
         The random variances are σ_t² and σ_r² plus the squares of `least`.
         """
         variances = np.exp(2 * log_sizes)
-        variances[..., :2] += self.least**2
+        for first in range(0, OF_ARM * self.arms, OF_ARM):
+            variances[..., first : first + 2] += self.least**2
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
-        """Return log σ_t, log σ_r and log σ_s of a noise record: the inverse of the method `noise`.
+        """Return log σ_t, log σ_r and log σ_s of a noise record, for one arm: the inverse of the method `noise`.
 
         The squared bounds `least` are subtracted. Each σ is at least LEAST_BESIDE times its bound.
         """
@@ -185,13 +209,21 @@ class Equations:
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
         """Return the variance of the random part of each of s residuals: m² for position, rad² for rotation."""
-        variances = self.variances(log_sizes)
-        return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
+        return self.variances(log_sizes)[..., self.size_of[0]]
 
-    def noise(self, log_sizes: LogSizes) -> RobotNoise:
-        """Return the record of robot errors (random and systematic; m, rad) for one vector of c log sizes."""
-        metres, radians, systematic = np.sqrt(self.variances(log_sizes)[:3]).tolist()
-        left = systematic * np.sqrt(np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2)))
+    def systematic_part(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
+        """Return the covariance (s,s) of the systematic part: G times the size σ_s² of each arm (m, rad)."""
+        if self.arms == 1:
+            return self.variances(log_sizes)[..., 2, None, None] * self.systematic
+        size = np.exp(log_sizes[..., self.size_of[1]])
+        return size[..., :, None] * self.systematic * size[..., None, :]
+
+    def noise(self, log_sizes: LogSizes, arm: int = 0) -> RobotNoise:
+        """Return the record of an arm's errors (random and systematic; m, rad) for one vector of c log sizes."""
+        first = OF_ARM * arm
+        metres, radians, systematic = np.sqrt(self.variances(log_sizes)[first : first + OF_ARM]).tolist()
+        own = self.size_of[1] == first + 2
+        left = systematic * np.sqrt(np.diag(self.systematic)[own].reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
         return RobotNoise(
             translation=metres,
@@ -208,8 +240,9 @@ class Equations:
         V is the sum of the random part, the systematic part, camera pose errors and confirmed effects.
         """
         covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
-        variances = self.variances(log_sizes)[..., 2:]
-        for k, part in enumerate((self.systematic, *self.camera_errors)):
+        covariance += self.systematic_part(log_sizes)
+        variances = self.variances(log_sizes)[..., OF_ARM * self.arms :]
+        for k, part in enumerate(self.camera_errors):
             covariance += variances[..., k, None, None] * part
         for part in (self.known, self.confirmed):
             if part is not None:
@@ -264,8 +297,7 @@ class LinearSolution:
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
     """Return the generalised least-squares solution for log sizes of the errors: (c,), or (k,c) for k solutions.
 
-    The c logarithms are those of σ_t, σ_r (random, m and rad), σ_s (systematic, rad) and one size for each of
-    `equations.camera_errors`.
+    The c logarithms are in the order of `LogSizes`.
     """
     root = cholesky(equations.covariance(log_sizes))
     whitened = lower(root, np.column_stack([equations.jacobian, equations.residual]))
@@ -289,19 +321,20 @@ def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution
 
 
 def left_out(
-    solution: LinearSolution, noise: tuple[float, float]
+    solution: LinearSolution, random: Float[ndarray, " s"]
 ) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
     """Return the residual of each of m poses from a fit without that pose, and its covariance.
 
     The six components are position (m), then rotation (rad), in base axes. The results are P_ii⁻¹ (P r)_i and P_ii⁻¹
-    for the block i of a pose, with P = `solution.projection` and the residuals r. `noise` (m, rad) scales the matrices
-    before they are inverted, for numerical accuracy.
+    for the block i of a pose, with P = `solution.projection` and the residuals r. The square root of `random` (m², rad²;
+    `Equations.random`) scales the matrices before they are inverted, for numerical accuracy.
     """
-    sigma, m = np.repeat(noise, 3), len(solution.root) // 6
+    m = len(solution.root) // 6
+    sigma = np.sqrt(random).reshape(m, 6)
     own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
-    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
+    without = np.linalg.inv(sigma[:, :, None] * own * sigma[:, None] + 1e-9 * np.eye(6))
     found = sigma * np.einsum("mij,mj->mi", without, sigma * solution.weighed_left.reshape(m, 6))
-    return found, sigma[:, None] * without * sigma
+    return found, sigma[:, :, None] * without * sigma[:, None]
 
 
 def most_likely(
@@ -320,7 +353,8 @@ def most_likely(
         some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
         at, information = most_likely(some, start, settled)
         return at, poses / TOO_MANY * information
-    at = equations.prior[1][:-1] * equations.prior[2] if start is None else start
+    middle, std = equations.prior[1:]
+    at = middle[: len(std)] * std if start is None else start
     value, gradient, information = score(equations, at)
     curvature = information
     for _ in range(40):
@@ -360,24 +394,27 @@ def over_sizes(
     mode: LogSizes,
     information: Information,
     density: Callable[[LinearSolution], Each] = lambda solution: solution.log_posterior,
+    arm: int = 0,
 ) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], LinearSolution]]:
     """Return a grid of log sizes about their mode: groups of posterior weights, log sizes and solutions.
 
     All weights together sum to 1. `density` returns the log posterior of the sizes of a solution, up to a constant;
     `information` is that of `most_likely`. Grid axes are eigenvectors of the information. Each side of an axis has its
     own step length, because the posterior is skewed: sizes have longer tails on one side. With more than TOO_MANY poses
-    the mode is the only grid point.
+    the mode is the only grid point. The sizes of arms other than `arm` stay at the mode.
     """
     poses = len(equations.residual) // 6
     sizes, log_volumes = mode[None], np.zeros(1)
     if poses <= TOO_MANY:
-        values, vectors = np.linalg.eigh(information)
-        axes, probe = vectors / np.sqrt(values), 1.5
+        sizes_of_arm = np.arange(OF_ARM * arm, OF_ARM * (arm + 1))
+        own = np.r_[sizes_of_arm, np.arange(OF_ARM * equations.arms, len(mode))] if arm == 0 else sizes_of_arm
+        values, vectors = np.linalg.eigh(information[np.ix_(own, own)])
+        axes, probe = np.eye(len(mode))[:, own] @ (vectors / np.sqrt(values)), 1.5
         beside = mode + probe * np.concatenate([-axes.T, axes.T])
         top, *others = (density(solve_equations(equations, at)) for at in (mode, *beside))
         drop = np.maximum(2 * (top - np.array(others)), 1e-3)
         shorter, longer = np.clip(probe / np.sqrt(drop), 0.3, 3.0).reshape(2, -1)
-        z = np.array(list(product(LEVELS, repeat=len(mode))))
+        z = np.array(list(product(LEVELS, repeat=len(own))))
         z = z[(z**2).sum(1) < (FARTHEST if poses < MANY else LESS_FAR)]
         lengths = np.where(z < 0, shorter, longer)
         sizes, log_volumes = mode + (lengths * z) @ axes.T, np.log(lengths).sum(1)
@@ -397,14 +434,26 @@ def score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, I
     """
     solution = solve_equations(equations, log_sizes)
     projection, left = solution.projection, solution.weighed_left
-    masks = np.stack([equations.of_position, 1 - equations.of_position])
-    parts = (equations.systematic, *equations.camera_errors)
+    arms, (of_random, of_systematic) = equations.arms, equations.size_of
+    sizes = OF_ARM * np.arange(arms)
+    masks = (of_random == np.stack([sizes, sizes + 1], 1).reshape(-1, 1)).astype(float)
+    each = [equations.systematic]
+    if arms > 1:
+        each = [np.outer(own, own) * equations.systematic for own in of_systematic == (sizes + 2)[:, None]]
+    parts = (*each, *equations.camera_errors)
     by = [projection @ part for part in parts]
     beside = np.stack([masks @ (one * projection).sum(1) for one in by], axis=1)
     own = np.array([[(one * other.T).sum() for other in by] for one in by])
     pairs = np.block([[masks @ projection**2 @ masks.T, beside], [beside.T, own]])
     squares = np.r_[masks @ left**2, [left @ part @ left for part in parts]]
     traces = np.r_[masks @ np.diagonal(projection), [np.trace(one) for one in by]]
+    # The masks come first, then the parts; the log sizes of each arm are together.
+    count = len(pairs)
+    order = np.r_[
+        np.column_stack([np.arange(2 * arms).reshape(-1, 2), 2 * arms + np.arange(arms)]).ravel(),
+        np.arange(OF_ARM * arms, count),
+    ]
+    pairs, squares, traces = pairs[np.ix_(order, order)], squares[order], traces[order]
     growth = np.exp(2 * log_sizes)
     of_prior, middle, _ = equations.prior
     return (

@@ -15,10 +15,18 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.pose_equations import predicted_gripper_poses
-from jcr.estimation.problem import SCALE, LinearPrior, pose_problem
+from jcr.estimation.pose_equations import pose_equations, predicted_gripper_poses
+from jcr.estimation.problem import (
+    BASE_ROTATION,
+    BASE_TRANSLATION,
+    SCALE,
+    LinearPrior,
+    State,
+    pose_problem,
+)
+from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
-from jcr.geometry import ARM, Poses, rotation_angle, transform
+from jcr.geometry import ARM, Poses, rotation_angle, skew, transform
 
 Images = Bool[ndarray, " n"]
 """Mask of the used images."""
@@ -60,6 +68,7 @@ def robust_fit(
     middle = centers.mean(0)
     unit = float(np.sqrt(((centers - middle) ** 2).sum(1).mean()))
     unit = unit if unit > 1e-12 * np.abs(centers).max() else 1.0
+    given_cameras = recon_from_camera, camera_covariance, priors
     recon_from_camera = transform(recon_from_camera[:, :3, :3], (centers - middle) / unit)
     priors = tuple(
         one._replace(value=one.value + np.log(unit) * float(one.row[SCALE].item())) for one in priors
@@ -95,9 +104,47 @@ def robust_fit(
             fewer, other = _improved(fitted, np.ones(n, dtype=bool), adding=False)
             used = fewer if other >= evidence else used
     fit = solve(replace(every, used=used), fitted(used).most_likely)
-    scale, z = fit.state.scale / unit, fit.state.z[0]
-    z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
-    return replace(fit, state=replace(fit.state, scale=scale, z=z[None]))
+    return _in_frame(fit, given_cameras, middle, unit)
+
+
+def _in_frame(
+    fit: Solution,
+    given: tuple[Poses, Float[ndarray, "r r"] | None, tuple[LinearPrior, ...]],
+    middle: Float[ndarray, "3"],
+    unit: float,
+) -> Solution:
+    """Return a solution for cameras (c - `middle`) / `unit` as that for the cameras c.
+
+    `given` holds the camera poses c, their covariance, and the priors. X, Z and scale step as before; only the position
+    of Z depends on the frame.
+    """
+    recon_from_camera, covariance, priors = given
+
+    def moved(state: State) -> State:
+        """Return the state with base_from_recon, scale and camera poses in the given frame and unit."""
+        z, rigs, scale = state.z[0], state.world_from_rig, state.scale / unit
+        z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
+        rigs = transform(rigs[:, :3, :3], unit * rigs[:, :3, 3] + middle)
+        return replace(state, scale=scale, z=z[None], world_from_rig=rigs)
+
+    problem = replace(fit.problem, known_rigs=(recon_from_camera, covariance), priors=priors)
+    state, likely = moved(fit.state), moved(fit.most_likely)
+    poses = pose_equations(problem, likely, None)
+    away = state.scale * state.z[0][:3, :3] @ middle
+    by_step = np.eye(len(fit.covariance))
+    by_step[BASE_TRANSLATION, SCALE], by_step[BASE_TRANSLATION, BASE_ROTATION] = -away[:, None], skew(away)
+    found = replace(
+        fit,
+        problem=problem,
+        state=state,
+        covariance=by_step @ fit.covariance @ by_step.T,
+        most_likely=likely,
+        poses=poses,
+        at_mode=solve_equations(poses.equations, fit.log_sizes),
+    )
+    # Leave-one-out errors are the same in all frames; a frame far from the cameras would cost digits.
+    found.__dict__["leave_one_out"] = fit.leave_one_out
+    return found
 
 
 def _improved(fitted: Callable[[Images], Solution], used: Images, adding: bool) -> tuple[Images, float]:

@@ -129,13 +129,13 @@ class Solution:
 
     @property
     def log_sizes(self) -> LogSizes:
-        """Most likely logarithms of the robot's error sizes σ_t (m), σ_r, σ_s (rad)."""
+        """Most likely logarithms of the error sizes σ_t (m), σ_r, σ_s (rad) of each arm."""
         assert self.most_likely.robot_log_sizes is not None
         return self.most_likely.robot_log_sizes
 
     @property
     def noise(self) -> RobotNoise:
-        """Estimated sizes of the errors of the reported poses, common to all arms."""
+        """Estimated sizes of the errors of the first arm's reported poses."""
         return self.equations.noise(self.log_sizes)
 
     @property
@@ -158,21 +158,21 @@ class Solution:
 
         A residual is the step from the reported to the predicted pose: position (m), then rotation (rad); base axes.
         """
-        used, every, noise, solution = self.poses.used, self.poses.every, self.noise, self.at_mode
-        random, n = (noise.translation, noise.rotation), len(used)
+        used, every, solution, n = self.poses.used, self.poses.every, self.at_mode, len(self.poses.used)
+        random = every.random(self.log_sizes)
         found, covariance = every.residual.reshape(n, 6).copy(), np.empty((n, 6, 6))
-        found[used], covariance[used] = left_out(solution, random)
+        found[used], covariance[used] = left_out(solution, random[np.repeat(used, 6)])
         if used.all():
             return found, covariance
         # The used poses predict the systematic error of an unused one (best linear unbiased prediction).
-        alike = noise.systematic**2 * every.systematic + (0.0 if every.known is None else every.known)
+        alike = every.systematic_part(self.log_sizes) + (0.0 if every.known is None else every.known)
         rows = np.repeat(used, 6)
         for i in np.flatnonzero(~used):
             mine = slice(6 * i, 6 * i + 6)
             gain = alike[mine, rows] @ solution.weight
             by = every.jacobian[mine] - gain @ self.equations.jacobian
             found[i] -= gain @ self.equations.residual
-            own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(np.repeat(np.square(random), 3))
+            own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(random[mine])
             covariance[i] = own + by @ solution.covariance @ by.T
         return found, covariance
 

@@ -3,6 +3,8 @@
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from string import Formatter
 from typing import Any, Literal
 
 import numpy as np
@@ -54,9 +56,15 @@ class Finding:
     def of(
         cls, kind: FindingKind, severity: Severity, concerns: Concerns = "none", *images: str, **known: Any
     ) -> "Finding":
-        """Return a finding about `images`; `known` sets other fields by name and, under all other names, its details."""
+        """Return a finding about `images`; `known` sets other fields by name and, under all other names, its details.
+
+        Raises TypeError if a name that the message or the remedy of the kind always prints has no value.
+        """
         sizes = {name: known.pop(name) for name in cls.__dataclass_fields__ if name in known}
-        return cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
+        made = cls(kind=kind, severity=severity, concerns=concerns, images=images, details=known, **sizes)
+        if missing := printed_names(kind) - quantities(made).keys():
+            raise TypeError(f"finding {kind.value!r} without {', '.join(sorted(missing))}")
+        return made
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
@@ -135,6 +143,14 @@ def quantities(finding: Finding) -> defaultdict[str, Any]:
         direction, move = MOTIONS[named["motion"]]
         named |= {"direction": direction.format_map(named), "move": move.format_map(named)}
     return named
+
+
+@cache
+def printed_names(kind: FindingKind) -> frozenset[str]:
+    """Return the names that message and remedy of a kind always print; formats with |, = or $ allow a missing name."""
+    parts = (part for template in (kind.row.message, kind.row.remedy) for part in Formatter().parse(template))
+    names = {name for _, name, spec, _ in parts if name and not set("|=$") & set(spec or "")}
+    return frozenset(name.partition("[")[0] for name in names)
 
 
 def joined(words: Iterable[str]) -> str:

@@ -257,7 +257,7 @@ class FindingKind(StrEnum):
     BOARD_IN_VIEW = "board in view", KindRow("reconstruction", "a calibration board is in view",
         "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
         "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")
-    RECONSTRUCTION = "reconstruction", KindRow("reconstruction", "{text}", "{remedy}",
+    RECONSTRUCTION = "reconstruction", KindRow("reconstruction", "{text}", "{remedy:$}",
         means="what a back end says to act on, in words", help="in its words")
     NO_RECONSTRUCTION = "no reconstruction", KindRow("reconstruction", "{text}", "{remedy}",
         means="no back end found camera poses", help="in its words")

@@ -93,6 +93,8 @@ def batch(
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")
+    if not captures:
+        raise InputError("batch: no captures; name one or more")
     report, read = progress or silent, read or ReadOptions()
     run_options = replace(run_options, map=None) if options.calibrate_only else run_options
     tasks, names = list[Task](), set[str]()

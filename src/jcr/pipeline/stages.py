@@ -73,7 +73,9 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     own = replace(own, **paths)
     weights = Path(own.weights) if own.weights and Path(own.weights).exists() else None
     images = [(name, capture.folder / name) for name in capture.images]
-    facts = images, capture.base_from_gripper, capture.intrinsics, candidates(own), weights, FORMAT
+    # The mount decides which pixels are reconstructed, and which poses guide it.
+    of_capture = images, capture.mount, capture.base_from_gripper, capture.intrinsics
+    facts = *of_capture, candidates(own), weights, FORMAT
     made = {"reconstruct": fingerprint(facts, own, __version__)}
     state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
     return RunResult(out, capture=capture, state=state)

@@ -4,19 +4,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
+from scipy.linalg import block_diag
 
+from jcr.calibration.record import Calibration
 from jcr.camera import project, unproject
 from jcr.capture.documents import read_tables
 from jcr.distributions import chi2
 from jcr.errors import InputError
-from jcr.geometry import apply, by_similarity, inverse
+from jcr.geometry import Poses, apply, by_similarity, inverse, scale_translation
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunResult
 
 COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 """Columns of the CSV: image and pixel of a point, and position of the tip that touched the point (base frame)."""
+CLICK_PX = 1.0
+"""Standard deviation of a selected pixel, and of the nearest pixel of a pointmap, along each axis (px of the image). At
+0.5 m and 600 px focal length it moves a point by 0.8 mm; half or twice of it matters only beside robots below 1 mm."""
 LEAST = 3
 """Smallest number of points with which a wrong calibration can be distinguished from one bad touch."""
 
@@ -58,35 +63,79 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
     `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
     run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The surface point is that
-    of the nearest pixel of the image's pointmap. The expected errors include the covariance of the calibration, common
-    to all points, and the robot's errors at each touch. Raises InputError for fewer than three points, an image that is
+    of the nearest pixel of the image's pointmap. The expected errors are those of
+    `error_covariance`. Raises InputError for fewer than three points, an image that is
     not in the run, or a pixel without a surface.
     """
     points = Path(points)
     calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
     images, numbers = _read(points)
-    x, base_from_recon = calibration.gripper_from_camera, calibration.base_from_recon
+    base_from_recon, count = calibration.base_from_recon, len(images)
     row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}
-    error, jacobian = np.empty((len(images), 3)), np.empty((len(images), 3, 7))
+    rows = np.array([row_of.get(image, -1) for image in images])
+    error, in_camera, depth_std_m = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     for k, (image, own) in enumerate(zip(images, numbers, strict=True)):
-        found = surface_at(capture, reconstruction, image, own[:2], points.name)
-        error[k], row = own[2:] - base_from_recon(found), row_of[image]
-        in_camera = apply(inverse(reconstruction.recon_from_camera[row]), found)
-        arm = x[:3, :3] @ (base_from_recon.scale * in_camera)
-        rotation = capture.base_from_gripper[reconstruction.image_index[row], :3, :3]
-        jacobian[k] = rotation @ by_similarity(arm)
-    touch_variance = calibration.robot_noise.together[0] ** 2
-    stacked = jacobian.reshape(-1, 7)
-    covariance = stacked @ calibration.covariance @ stacked.T + touch_variance * np.eye(len(stacked))
+        found, std = surface_at(capture, reconstruction, image, own[:2], points.name)
+        error[k], depth_std_m[k] = own[2:] - base_from_recon(found), base_from_recon.scale * std
+        camera = scale_translation(reconstruction.recon_from_camera[rows[k]], base_from_recon.scale)
+        in_camera[k] = apply(inverse(camera), base_from_recon.scale * found)
+    covariance = error_covariance(
+        calibration, capture.base_from_gripper[reconstruction.image_index[rows]], rows, in_camera, depth_std_m
+    )
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
     std = np.sqrt(np.diag(covariance)).reshape(-1, 3)
     return TouchTest(tuple(images), error, std, float(chi2.sf(squared, error.size)))
 
 
+def error_covariance(
+    calibration: Calibration,
+    base_from_gripper: Poses,
+    image: Int[ndarray, " k"],
+    in_camera: Float[ndarray, "k 3"],
+    depth_std_m: Float[ndarray, " k"],
+) -> Float[ndarray, "r r"]:
+    """Return the covariance (m², base axes, r = 3k) of tip minus surface point, point by point.
+
+    `base_from_gripper` is the reported pose of each point's image, `image` the number of the image. `in_camera` are the
+    surface points (m, camera frame), `depth_std_m` the standard deviations of their depths. Errors of the scene are
+    common to all points (`Uncertainty.scene`). Without adjusted images these are the errors of the calibration, and
+    those of a gripper pose for the points of its image. Each point has errors of its own: of the click (CLICK_PX), of
+    the depth, and of the robot at the touch.
+    """
+    x, noise, count = calibration.gripper_from_camera, calibration.robot_noise, len(image)
+    arm, rotation = in_camera @ x[:3, :3].T, base_from_gripper[:, :3, :3]
+    lever, scene = (rotation @ (arm + x[:3, 3])[..., None])[..., 0], calibration.uncertainty.scene
+    by_calibration, of_points = (rotation @ by_similarity(arm)).reshape(3 * count, 7), noise.together[0] ** 2
+    if scene is None:
+        covariance = by_calibration @ calibration.covariance @ by_calibration.T
+        by_pose = by_similarity(lever)[:, :, :6].reshape(3 * count, 6)
+        random = np.square([noise.translation, noise.rotation])
+        variance = np.repeat(random + np.square(noise.systematic_left), 3)
+        same = np.repeat(np.repeat(image[:, None] == image, 3, axis=0), 3, axis=1)
+        covariance = covariance + same * ((by_pose * variance) @ by_pose.T)
+    else:
+        by_scene = by_similarity(base_from_gripper[:, :3, 3] + lever - scene.middle_in_base)
+        by_scene, budget = by_scene.reshape(3 * count, 7), calibration.uncertainty.budget
+        covariance = by_scene @ scene.covariance @ by_scene.T
+        if budget is not None:
+            covariance = covariance + by_calibration @ budget.faults @ by_calibration.T
+        of_points += scene.shape_m**2
+    # A click moves the point across the ray; an error of the depth moves it along the ray.
+    focal = 1.0 if calibration.intrinsics is None else calibration.intrinsics.fx
+    own = np.zeros((count, 3, 3))
+    own[:, 0, 0] = own[:, 1, 1] = CLICK_PX / focal * in_camera[:, 2]
+    own[:, :, 2] = depth_std_m[:, None] * in_camera / in_camera[:, 2:]
+    own = rotation @ x[:3, :3] @ own
+    each = own @ np.swapaxes(own, 1, 2) + of_points * np.eye(3)
+    return covariance + np.asarray(block_diag(*each))
+
+
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
-) -> Float[ndarray, "3"]:
-    """Return the surface point (recon frame and unit) at the pixel `x_px` of an image, from the pointmaps.
+) -> tuple[Float[ndarray, "3"], float]:
+    """Return the surface point at the pixel `x_px` of an image, and the standard deviation of its depth (recon units).
+
+    Both come from the pointmaps; the standard deviation is 0 where they do not state it.
 
     `image` is a name of the capture, `x_px` a pixel (x, y) of its distorted image; the nearest pixel of the pointmap is
     read. Raises InputError if the image is not registered or the pixel has no depth. The message begins with
@@ -105,7 +154,8 @@ def surface_at(
     inside = 0 <= column < width and 0 <= row < height
     if not inside or not dense.confidence[rows[0], row, column] > 0:
         raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
-    return dense.points_in_recon[rows[0], row, column].astype(np.float64)
+    std = 0.0 if dense.depth_std is None else float(dense.depth_std[rows[0], row, column])
+    return dense.points_in_recon[rows[0], row, column].astype(np.float64), std
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:

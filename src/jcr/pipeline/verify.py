@@ -199,9 +199,11 @@ def _fixed_cameras(
         for one in ([] if run.cameras is None else run.cameras.cameras)
         if one.converged and one.mount == "base" and one.intrinsics is not None and one.name in others
     }
-    for camera in new.others:
-        if camera.name not in placed:
-            continue
+    known_cameras = [camera for camera in new.others if camera.name in placed]
+    if not known_cameras:
+        return
+    hand_eye = calibrate_reconstruction(capture, reconstruction, calibrate_options)
+    for camera in known_cameras:
         own = others[camera.name]
         _new_images(own, capture, camera, new)
         # Both poses are of the same camera, so that an error of its intrinsics cancels in their difference.
@@ -209,7 +211,6 @@ def _fixed_cameras(
         known = {"intrinsics": intrinsics, "intrinsics_std": np.zeros(4 + len(intrinsics.distortion))}
         now = replace(camera, name=f"{camera.name[:60]}_now", folder=camera.folder or new.folder, **known)
         both = replace(own, **known), now
-        hand_eye = calibrate_reconstruction(capture, reconstruction, calibrate_options)
         parts = capture, both, reconstruction, hand_eye, calibrate_options, progress
         cell, solution, poses = place_cameras(*parts)
         for one in cell.cameras:

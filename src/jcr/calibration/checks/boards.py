@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.calibration.adjust import with_adjusted_images
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import JUDGED
+from jcr.calibration.hand_eye import judged
 from jcr.distributions import f as f_distribution
 from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD, STRETCHED_STD
 from jcr.estimation.projection import by_points
@@ -102,12 +102,10 @@ def _adjusted_again(case: Case, tracks: Tracks) -> Case:
     checks are kept.
     """
     made = replace(case.reconstruction, tracks=tracks)
-    changed = replace(
-        case, reconstruction=made, hand_eye=case.pose_fit, fit=None, chosen_tracks=None, adjusted=None
-    )
-    changed = with_adjusted_images(changed)
-    kinds = JUDGED | {one.kind for one in changed.hand_eye.findings} | {FindingKind.NOT_SETTLED}
-    return changed.after(tuple(one for one in case.hand_eye.findings if one.kind not in kinds))
+    kept = tuple(one for one in case.hand_eye.findings if one.kind is not FindingKind.NOT_SETTLED)
+    fit = judged(replace(case.pose_fit, findings=kept))
+    changed = replace(case, reconstruction=made, hand_eye=fit, fit=None, chosen_tracks=None, adjusted=None)
+    return with_adjusted_images(changed)
 
 
 def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjust_case, refined_by
+from jcr.calibration.adjust import adjust_case, readjusted
 from jcr.calibration.case import Case, some_points
-from jcr.calibration.hand_eye import judged, poses_agree
+from jcr.calibration.hand_eye import poses_agree
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
 from jcr.camera import parameter_names, parameters, with_thin_prism
@@ -473,7 +473,7 @@ def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Ca
     adjusted, adopted = with_effects(fewer, model, findings)
     if adjusted is None:
         return case.after(findings)
-    before, refined = case.hand_eye, judged(refined_by(fewer, adjusted))
+    before, refined = case.hand_eye, readjusted(fewer, adjusted)
     if not refined.converged:
         return case.after(findings)
     of_camera = {one.kind for one in findings if one.kind.row.group == "camera"} - {FindingKind.INTRINSICS}
@@ -553,5 +553,9 @@ def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[
     The first seven unknowns are in COVARIANCE_ORDER. `columns` (s,b) are the b confirmed error patterns of the poses,
     one standard deviation each; s = 6 per pose (m, rad; base axes).
     """
-    straight = replace(solution.equations, confirmed=columns @ columns.T)
+    # Confirmed effects of other arms stay as they are.
+    own, before = columns.reshape(-1, 6, columns.shape[1]).any((1, 2)), solution.equations.confirmed
+    other = ~np.repeat(own, 6)
+    confirmed = columns @ columns.T + (0.0 if before is None else np.outer(other, other) * before)
+    straight = replace(solution.equations, confirmed=confirmed)
     return solve_equations(straight, solution.log_sizes).step - solution.at_mode.step

@@ -220,7 +220,8 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
     """Return scale error and noise of the depth images, measured by the robot; None if too few features have a depth.
 
     Measured depths are compared with the depths of reconstructed features, which `hand_eye.scale` converts to metres.
-    None is also returned without depth images. Raises InputError if a depth image cannot be read.
+    None is also returned without depth images, or
+    if too few depths agree with the median. Raises InputError if a depth image cannot be read.
     """
     if capture.depths is None:
         return None
@@ -238,6 +239,9 @@ def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Cali
     spread = NORMAL * float(np.median(np.abs(medians - common)))
     std = np.hypot(1.2533 * spread / np.sqrt(len(rows)), hand_eye.uncertainty.std[6])
     same = np.abs(off - common) < OUTSIDE
+    if same.sum() < MIN_FEATURES:
+        # Two groups of depths, of different units or surfaces, have their median between them.
+        return None
     depth = predicted[same]
     # The variance of the residuals at depth z is a² + (b z²)², with a and b fitted in bins of z. The rows are divided by
     # the variance, because the error of an estimated variance is proportional to it.

@@ -7,14 +7,32 @@ import numpy as np
 
 from jcr.calibration.case import Case
 from jcr.estimation.hypotheses import joint_offsets
-from jcr.estimation.pose_equations import pose_equations
+from jcr.estimation.pose_equations import PoseEquations, pose_equations
 from jcr.estimation.problem import pose_problem
+from jcr.estimation.robot_noise import of_poses
 from jcr.findings import Finding, FindingKind, joined
 
 MIN_EXAMINED = 4
 """Fewest used images with which joint offsets are estimated."""
 SURE = 2.5
 """Size of a joint offset, in standard deviations, above which it is reported."""
+
+
+def _equations(case: Case) -> PoseEquations:
+    """Return the equations of the used gripper poses, with the errors of the camera poses: of images, or as stated."""
+    if case.adjusted is not None and case.hand_eye.source == "images":
+        return case.adjusted.poses
+    fit, used, evidence = case.pose_fit, case.used, case.reconstruction.evidence
+    problem, state = pose_problem(
+        case.base_from_gripper[used],
+        case.recon_from_camera[used],
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
+        camera_covariance=None if evidence is None else of_poses(evidence.covariance, used),
+        error_covariance=case.systematic,
+        noise_floor=fit.robot_noise.given,
+        priors=case.priors,
+    )
+    return pose_equations(problem, state, None)
 
 
 def check_robot(case: Case) -> Case:
@@ -27,15 +45,7 @@ def check_robot(case: Case) -> Case:
     used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
     if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
         return case
-    fit = case.pose_fit
-    problem, state = pose_problem(
-        case.base_from_gripper[used],
-        case.recon_from_camera[used],
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
-        error_covariance=case.systematic,
-        noise_floor=fit.robot_noise.given,
-    )
-    found = joint_offsets(pose_equations(problem, state, None), arm, joints[used])
+    found = joint_offsets(_equations(case), arm, joints[used])
     hand_eye = replace(hand_eye, joint_offsets=found)
     off = np.flatnonzero(np.abs(found.offset) > SURE * found.std).tolist()
     if not off or any(one.kind.row.group == "camera" for one in hand_eye.findings):
