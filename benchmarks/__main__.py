@@ -45,7 +45,7 @@ BENCHES = {
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SHARE = 4
 """`all` takes one case in SHARE of the benches with many."""
-COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
+COMMANDS = {"align": "benchmarks.align", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of commands that are no bench and take arguments of their own, by name."""
 CLAIM = "> "
 """Prefix of the lines of a page that state its result in a sentence."""

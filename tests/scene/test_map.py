@@ -125,8 +125,7 @@ def test_colours_and_labels_are_learnt(scene: "SceneMap", cloud: PointCloud):
 def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud: PointCloud):
     import torch
 
-    from jcr.scene.build import build_scene
-    from jcr.scene.paper import PaperField, train_paper
+    from jcr.paper.fields import PaperField, published_scene, train_fields
 
     box = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
     field, x = PaperField(box, "color", 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
@@ -138,7 +137,7 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     )
     assert field.hidden.weight.shape == (256, 60)
 
-    fields = train_paper(cloud, steps=250)
+    fields, _ = train_fields(cloud, MapOptions(steps=250))
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
     points = uniform(100_000)
     free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
@@ -148,7 +147,7 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     assert np.abs(fields["color"](surface)["color"].numpy() - color).mean() < 0.12
     assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
     untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
-    assert [type(one) for one in build_scene(cloud, untrained).fields.of] == 3 * [PaperField]
+    assert [type(one) for one in published_scene(cloud, untrained).fields.of] == 3 * [PaperField]
 
 
 def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.camera import project, rays
 from jcr.errors import InputError
 from jcr.progress import Progress
@@ -72,7 +72,7 @@ def _read_names(path: Path) -> dict[int, str]:
 def image_labels(
     capture: Capture,
     reconstruction: Reconstruction,
-    hand_eye: Calibration,
+    hand_eye: Calibration | PublishedCalibration,
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:
