@@ -14,18 +14,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from jcr.geometry import inverse, transform
-from jcr.pointmaps.global_alignment.align import Alignment
+from jcr.pointmaps.global_alignment.align import PIXELS, Alignment
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import AlignmentState, initial_depth
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.progress import Progress, silent
 
+Depths = Float[ndarray, "n p"]
 STEPS, LEARNING_RATE = 300, 0.01
 """Number of Adam steps, and learning rate of the first; it falls to 0 along a cosine (DUSt3R's defaults). The authors
 of the paper took 5000 steps."""
-START_PIXELS = 2048
-"""Number of pixels per image from which the initial estimate is computed."""
 FOCAL_SLOWNESS = 20.0
 """Factor of log f in the parameter of the focal length, so that one step changes f by little (as DUSt3R)."""
 PAIRS_AT_ONCE = 16
@@ -40,8 +39,8 @@ def align(
     The initial estimate chains the pairs along a spanning tree. `device` is the torch device of the descent.
     """
     problem, report = AlignmentProblem.of(predictions), progress or silent
-    count, height, width = predictions.image_count, *predictions.conf.shape[1:]
-    start = initial_state(problem.observe_all(START_PIXELS), predictions.edges)
+    count = predictions.image_count
+    start = initial_state(problem.observe_all(PIXELS), predictions.edges)
     everything = (observe(problem, k, slice(None)) for k in range(count))
     model = PointmapModel(start, np.stack([initial_depth(o, start) for o in everything]), problem).to(device)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
@@ -61,22 +60,19 @@ def align(
 
 
 class PointmapModel(torch.nn.Module):
-    """Unknowns of eq. 1: X̂_i by camera pose, focal length and depths of each image; P_e and σ_e of each pair."""
+    """Unknowns of eq. 1: X̂_i by camera pose, focal length and depths of each image; P_e and σ_e of each pair.
+
+    They begin at the estimate `start`, and at `depth` (recon units) of the p pixels of n images.
+    """
 
     offset: Tensor
 
-    def __init__(self, start: AlignmentState, depth: Float[ndarray, "n p"], problem: AlignmentProblem):
-        """Set the unknowns to the estimate `start`, and to `depth` (recon units) at the p pixels of n images."""
+    def __init__(self, start: AlignmentState, depth: Depths, problem: AlignmentProblem) -> None:
         super().__init__()
         predictions = problem.predictions
         self.problem, self.images = problem, torch.from_numpy(predictions.edges)
-        self.shown = (
-            (predictions.pts3d, predictions.conf),
-            (
-                predictions.pts3d_in_other_view,
-                predictions.conf2,
-            ),
-        )
+        self.shown = predictions.pts3d, predictions.pts3d_in_other_view
+        self.confidence = predictions.conf, predictions.conf2
         height, width = predictions.conf.shape[1:]
         x, y = np.meshgrid(np.arange(width), np.arange(height))
         cx, cy = problem.principal_point_px
@@ -92,41 +88,30 @@ class PointmapModel(torch.nn.Module):
         # The scale multiplies the whole of P_e, including its translation.
         self.pair_center = _parameter(observer[:, :3, 3] / np.exp(start.log_pair_scale)[:, None])
 
-    def focal(self) -> Tensor:
-        """Return fx (px), common to all images."""
-        return torch.exp(self.slow_focal / FOCAL_SLOWNESS)
-
     def scale(self) -> Tensor:
         """Return σ_e (e,), whose product is 1; without this constraint all points would shrink to one."""
         return torch.exp(self.log_scale - self.log_scale.mean())
 
     def points(self) -> Tensor:
         """Return X̂ (n, pixels, 3) in the recon frame."""
-        ray = (self.offset / self.focal())[None]
+        ray = (self.offset / torch.exp(self.slow_focal / FOCAL_SLOWNESS))[None]
         ray = torch.cat([ray, torch.ones_like(ray[..., :1])], dim=2)
         in_camera = torch.exp(self.log_depth)[..., None] * ray
         return in_camera @ rotations(self.camera_quat_xyzw).mT + self.camera_center[:, None]
 
     def distance(self, points: Tensor, pairs: slice, view: int) -> Tensor:
         """Return ‖X̂_i − σ_e P_e X_e,i‖ (pairs, pixels) for the first (0) or second (1) view of some pairs."""
-        shown = torch.from_numpy(self.shown[view][0][pairs]).to(points.device).flatten(1, 2)
+        shown = torch.from_numpy(self.shown[view][pairs]).to(points.device).flatten(1, 2)
         aligned = shown @ rotations(self.pair_quat_xyzw[pairs]).mT + self.pair_center[pairs, None]
         aligned = self.scale()[pairs, None, None] * aligned
         return torch.linalg.vector_norm(points[self.images[pairs, view]] - aligned, dim=2)
 
     def loss(self, points: Tensor, pairs: slice, view: int) -> Tensor:
         """Return the sum over some pairs of the mean weighted distance of one view: terms of eq. 1 per pixel."""
-        weight = torch.from_numpy(self.problem.weigh(self.shown[view][1][pairs])).to(points.device).flatten(1)
+        weight = (
+            torch.from_numpy(self.problem.weigh(self.confidence[view][pairs])).to(points.device).flatten(1)
+        )
         return (weight * self.distance(points, pairs, view)).mean(dim=1).sum()
-
-    def residual(self, points: Tensor, pairs: slice) -> Tensor:
-        """Return the median distance of some pairs' points relative to their range, of the worse view, (pairs,)."""
-        of_views = []
-        for view in (0, 1):
-            shown = torch.from_numpy(self.shown[view][0][pairs]).to(points.device).flatten(1, 2)
-            reach = self.scale()[pairs] * torch.linalg.vector_norm(shown, dim=2).median(dim=1).values
-            of_views.append(self.distance(points, pairs, view).median(dim=1).values / reach)
-        return torch.maximum(*of_views)
 
 
 @torch.no_grad()
@@ -140,8 +125,9 @@ def _alignment(model: PointmapModel, problem: AlignmentProblem, groups: list[sli
             total[image] += problem.weigh(confidence)
     shown = np.bincount(predictions.edges.ravel(), minlength=count)
     mean = total / shown[:, None, None].astype(np.float32)
-    points, focal = model.points(), float(model.focal())
-    residual = torch.cat([model.residual(points, group) for group in groups])
+    points, focal = model.points(), float(torch.exp(model.slow_focal / FOCAL_SLOWNESS))
+    distance = torch.cat([model.distance(points, group, 1).median(dim=1).values for group in groups])
+    reach = torch.linalg.vector_norm(points - model.camera_center[:, None], dim=2).median(dim=1).values
     center = model.camera_center.double().cpu().numpy()
     recon_from_camera = transform(rotations(model.camera_quat_xyzw).double().cpu().numpy(), center)
     return Alignment(
@@ -151,20 +137,17 @@ def _alignment(model: PointmapModel, problem: AlignmentProblem, groups: list[sli
         depth=model.log_depth.exp().reshape(count, height, width).cpu().numpy(),
         confidence=np.exp(mean) if problem.log_weight else mean,
         pair_scale=model.scale().double().cpu().numpy(),
-        pair_residual=residual.double().cpu().numpy(),
+        pair_residual=(distance / reach[model.images[:, 0]]).double().cpu().numpy(),
         covariance=np.full((6 * count, 6 * count), np.nan),
     )
 
 
 def rotations(quat_xyzw: Tensor) -> Tensor:
     """Return rotation matrices (k,3,3) of quaternions (k,4) of any length."""
-    x, y, z, w = torch.nn.functional.normalize(quat_xyzw, dim=1).unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    unit, identity = torch.nn.functional.normalize(quat_xyzw, dim=1), torch.eye(3, device=quat_xyzw.device)
+    axis = unit[:, None, :3].expand(-1, 3, 3)
+    cross = torch.linalg.cross(axis, identity.expand_as(axis)).mT  # cross @ v is axis × v
+    return identity + 2 * unit[:, 3, None, None] * cross + 2 * cross @ cross
 
 
 def _parameter(values: ndarray) -> torch.nn.Parameter:

@@ -23,13 +23,12 @@ BATCH, RATE = 6144, 5e-3
 
 
 class PaperField(Field):
-    """Network f_θ for one property: sinusoids φ of the position, 256 hidden ReLU units, linear output."""
+    """Network f_θ of the property `name`: sinusoids φ of the position, 256 hidden ReLU units, linear outputs.
+
+    `box` (2,3) m is the workspace, whose longest side is scaled to [-1, 1]. The layers are drawn from `generator`.
+    """
 
     def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
-        """Initialise the layers of the property `name` from `generator`; the network has `outputs` outputs.
-
-        `box` (2,3) m is the workspace, whose longest side is scaled to [-1, 1].
-        """
         super().__init__({name: outputs}, HIDDEN, box, frequencies=FREQUENCIES, generator=generator)
 
 

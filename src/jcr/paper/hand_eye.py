@@ -15,8 +15,7 @@ from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, rotati
 Poses = Float[ndarray, "n 4 4"]
 SCALES = np.linspace(1.0, 4.0, 20_000)
 """Values of λ that the authors' code tries; a scale outside of them is not found."""
-LEAST_IMAGES = 3
-"""Least number of images: two motions about different axes determine the rotation."""
+LEAST_IMAGES = 3  # two motions about different axes determine the rotation
 
 
 def motions(a_from_b: Poses) -> Poses:

@@ -168,10 +168,18 @@ def select_reconstruction(
 
 def solved_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> PublishedCalibration:
     """Calibrate given camera poses by the published solver; raises as `select_published` does."""
-    extra("torch", "map", "--method paper")
+    require_published(options or CalibrateOptions())
     from jcr.paper.run import calibrate_published
 
-    return calibrate_published(pairs, pairs, options)
+    return calibrate_published(pairs, pairs)
+
+
+def require_published(options: CalibrateOptions) -> None:
+    """Raise InputError without torch, and for an option of the calibration, because the published method has none."""
+    extra("torch", "map", "--method paper")
+    for name, value in vars(CalibrateOptions()).items():
+        if getattr(options, name) != value:
+            raise InputError(f"--method paper: does not use --{name.replace('_', '-')}; leave it out")
 
 
 def select_published(
@@ -185,15 +193,17 @@ def select_published(
     If the reconstruction `before` is given, only it is calibrated. Raises InputError as the method does, and
     NothingFoundError if it gives no calibration.
     """
+    require_published(options.calibrate)
+    if capture.mount != "gripper":
+        raise InputError("--method paper: is for a camera on the gripper; leave it out")
     # Torch and pycolmap take seconds to import, and torch may be absent.
-    extra("torch", "map", "--method paper")
     from jcr.paper.run import calibrate_published, reconstruct_published
 
     start, made = time.perf_counter(), before
     try:
         made = reconstruct_published(capture, options.reconstruct, progress) if made is None else made
         reconstructed = time.perf_counter()
-        hand_eye = calibrate_published(capture, made, options.calibrate)
+        hand_eye = calibrate_published(capture, made)
     except RejectedError as error:
         account = Attempt(
             backend=options.reconstruct.backend if made is None else made.backend,

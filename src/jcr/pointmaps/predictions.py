@@ -34,7 +34,8 @@ def reconstruct_predictions(
 ) -> Reconstruction:
     """Return camera poses, pointmaps and tracks from the predictions in an npz file.
 
-    Matches of the images refine the poses, unless `refining` is False. The file has pairwise pointmaps (pairs.ARRAYS), or camera poses and pointmaps in one frame (POINTMAPS). Raises
+    Matches of the images refine the poses, unless `refining` is False. The file has pairwise pointmaps (pairs.ARRAYS),
+    or camera poses and pointmaps in one frame (POINTMAPS). Raises
     InputError for a file that is missing, damaged, or does not fit the capture.
     """
     arrays, source = read_arrays(path), str(path)
