@@ -35,11 +35,13 @@ BENCHES = {
     "coverage": (HONEST, "Is ± true?"),
     "faults": (HONEST, "Faults"),
     "live": (HONEST, "Live calibration"),
+    "spheres": (HONEST, "Spheres at a confidence"),
     "map": (MAPPED, "The map"),
     "speed": (TIME, "Speed"),
     "peers": (OTHERS, "Peers"),
     "kinhec": (OTHERS, "KinHEC"),
     "pointmaps": (OTHERS, "Pointmaps"),
+    "published": (OTHERS, "Tables of the paper"),
 }
 """Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
 RESULTS = Path(__file__).parents[1] / "docs" / "results"

@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed
-from jcr.calibration.record import AnyCalibration, FailedCalibration, write_calibration
+from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
@@ -325,6 +325,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     from jcr.paper.fields import published_scene
     from jcr.scene.build import build_scene
     from jcr.scene.cloud import point_cloud
+    from jcr.scene.uncertainty import map_uncertainty
     from jcr.segments.measure import measure_objects
     from jcr.segments.segments import image_labels, label_cloud
     from jcr.segments.tabletop import fit_support
@@ -355,6 +356,8 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
         is_published = "paper" in (options.method, options.map.preset)
         build = published_scene if is_published else build_scene
         scene = build(cloud, options.map, progress, device=device_of(options.reconstruct))
+        if isinstance(hand_eye, Calibration):
+            scene = scene.with_uncertainty(map_uncertainty(scene, cloud, hand_eye, made))
         measured = None if sizes is None else sizes.result()
     write_cloud(result.out / CLOUD, cloud)
     scene.save(result.out / MAP)

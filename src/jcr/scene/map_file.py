@@ -31,6 +31,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     from jcr.scene.fields import Field, Fields, Lattice
     from jcr.scene.scene_map import FORMAT, SceneMap, digest
     from jcr.scene.seen import SeenGrid
+    from jcr.scene.uncertainty import MapUncertainty
 
     try:
         with safe_open(path, "pt") as file:
@@ -46,9 +47,15 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
             Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
             for k, (cell, shape) in enumerate(about["lattices"])
         ]
+        uncertainty = None
+        if (stated := about["uncertainty"]) is not None:
+            own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("uncertainty.")}
+            arrays = {name.removeprefix("uncertainty."): value.numpy() for name, value in own.items()}
+            uncertainty = MapUncertainty(**(stated | {"order": tuple(stated["order"])} | arrays))
         fields = Fields([Field(**of, box=seen.box, lattices=lattices) for of in about["fields"]], lattices)
         fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
-        return SceneMap(fields, seen, tuple(about["label_names"]), about["history"]).to(device)
+        labels = tuple(about["label_names"])
+        return SceneMap(fields, seen, labels, about["history"], uncertainty).to(device)
     except InputError:
         raise
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
