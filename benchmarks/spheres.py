@@ -48,7 +48,7 @@ FEATURES, PIXEL_STD = 50, 0.3
 """Features drawn in each image, and errors of their observations (px)."""
 GRID = (128, 96)
 SPHERES, RADII, CLEARANCE = 4000, (0.01, 0.05), 0.01
-"""Spheres of a capture; their radii (m); largest distance (m) from their surface to the true one they are drawn about."""
+"""Spheres of a capture; their radii (m); largest distance (m) from their surface to the true surface."""
 CONFIDENCE, CELL_M, PATIENCE_S = 0.95, 0.01, 10.0
 
 
@@ -65,7 +65,9 @@ class Answers:
     """Distance in the map minus radius, m."""
     std: Float[ndarray, " n"]
     called_free: Bool[ndarray, " n"]
-    """Whether the map calls it free at CONFIDENCE."""
+    """Whether the map calls it free at CONFIDENCE, where seen surfaces alone count."""
+    called_seen_free: Bool[ndarray, " n"]
+    """Whether the map calls it free at CONFIDENCE, where unseen space counts as occupied."""
     surface_off: Float[ndarray, " n"]
     """True distance minus distance in the map (m) at the centre, over its stated standard deviation."""
 
@@ -95,16 +97,20 @@ def run(every: int = 1) -> str:
         for name, field, values in (("images", "images", map(str, COUNTS)), ("arm", "errors", ERRORS))
         for value in values
     ]
+    safe = np.concatenate([one.called_seen_free for one in found])
     lines = [
         f"> Of the spheres that truly collide, {100 * share:.1f} % are called free at {CONFIDENCE}, "
         f"{100 * worst:.1f} % in the worst of {len(by_cell)} cells; without a margin "
-        f"{100 * (gap[collides] > 0).mean():.1f} %. Of the free ones {100 * lost[0]:.1f} % are lost, {100 * lost[1]:.1f} % by the constant margin "
+        f"{100 * (gap[collides] > 0).mean():.1f} %. Of the free ones {100 * lost[0]:.1f} % are lost, "
+        f"{100 * lost[1]:.1f} % by the constant margin "
         f"({1e3 * same:.1f} mm) that calls as many free wrongly, {100 * lost[2]:.1f} % without a margin.",
+        f"> Where unseen space counts as occupied, {100 * safe[collides].mean():.1f} % are called free at {CONFIDENCE}, "
+        f"and {100 * (1 - safe[~collides].mean()):.1f} % of the free ones are lost.",
         "",
         f"{len(by_cell)} cells of arms with errors, {len(COUNTS)} captures each; {len(found)} of {tried} captures are "
         f"accepted. {SPHERES:,} spheres a capture of {100 * RADII[0]:.0f} to {100 * RADII[1]:.0f} cm radius, their "
-        f"surface within {1e3 * CLEARANCE:.0f} mm of a true surface that the images show; unseen space counts as occupied. "
-        f"Cameras and features are simulated and the calibration is that of `jcr calibrate`; depth has errors of "
+        f"surface within {1e3 * CLEARANCE:.0f} mm of a true surface that the images show; seen surfaces alone count. "
+        "Cameras and features are simulated, and the calibration is that of `jcr calibrate`; depth has errors of "
         f"{100 * DEPTH_STD:.1f} %, smooth and white. In {100 * within:.0f} % of the cells at most "
         f"{100 * (1 - CONFIDENCE):.0f} % are called free. {seconds:.1f} s of processor a capture.",
         "",
@@ -171,7 +177,7 @@ def answers(cell: int, number: int, count: int) -> Answers | None:
     low, high = np.percentile(surface, [2, 98], axis=0)
     box = (*(low - 0.06).tolist(), *(high + 0.06).tolist())
     scene = build_scene(cloud, MapOptions(workspace=box, cell=CELL_M, max_seconds=PATIENCE_S))
-    scene = scene.with_uncertainty(map_uncertainty(scene, cloud, found, made))
+    scene.set_uncertainty(map_uncertainty(scene, cloud, found))
     inside = ((surface > low) & (surface < high)).all(1)
     asked = _asked(scene, surface[inside], scene_from_base, size, rng)
     return Answers(cell=cell, images=count, errors=errors, **asked)
@@ -238,14 +244,17 @@ def _asked(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     radius = rng.uniform(*RADII, SPHERES)
     centers = at + (radius + rng.uniform(-CLEARANCE, CLEARANCE, SPHERES))[:, None] * normal
-    sample, true = scene.query(centers, unknown="occupied"), clearance(centers)
+    sample, true = scene.query(centers, unknown="free"), clearance(centers)
     inside = np.isfinite(sample.distance)
-    free = ~scene.check_spheres(centers, radius, confidence=CONFIDENCE)
-    seen = scene.query(centers, unknown="free")
+    free, safe = (
+        ~scene.check_spheres(centers, radius, unknown, confidence=CONFIDENCE)
+        for unknown in ("free", "occupied")
+    )
     return {
         "collides": (true < radius)[inside],
         "gap": (sample.distance - radius)[inside],
         "std": sample.std[inside],
         "called_free": free[inside],
-        "surface_off": ((true - seen.distance) / seen.std)[inside],
+        "called_seen_free": safe[inside],
+        "surface_off": ((true - sample.distance) / sample.std)[inside],
     }

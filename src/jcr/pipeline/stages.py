@@ -357,7 +357,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
         build = published_scene if is_published else build_scene
         scene = build(cloud, options.map, progress, device=device_of(options.reconstruct))
         if isinstance(hand_eye, Calibration):
-            scene = scene.with_uncertainty(map_uncertainty(scene, cloud, hand_eye, made))
+            scene.set_uncertainty(map_uncertainty(scene, cloud, hand_eye))
         measured = None if sizes is None else sizes.result()
     write_cloud(result.out / CLOUD, cloud)
     scene.save(result.out / MAP)

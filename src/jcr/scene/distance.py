@@ -55,13 +55,6 @@ class DistanceGrid:
         distance, std = interpolate_grid(self.spread, self.lower, self.cell, x_in_base)
         return distance, std
 
-    def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the signed distance (n,) m at points (n,3) m of the base frame, interpolated trilinearly.
-
-        A point outside of the grid has the value of the nearest point on its border.
-        """
-        return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
-
 
 def distance_grid(
     lower: Float[Tensor, "3"],

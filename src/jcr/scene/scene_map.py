@@ -21,7 +21,7 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Fields, in_chunks
+from jcr.scene.fields import Fields, in_chunks, interpolate_grid
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
 from jcr.scene.uncertainty import MapUncertainty
 
@@ -91,8 +91,9 @@ class Sample:
     def color(self) -> Any:
         """RGB (n,3) in [0, 1] of the colour field, valid at surfaces; NaN outside of the workspace."""
         fields = self._map.fields
-        ask = self._everywhere if self._map.is_published else self._inside
-        return ask(lambda x: fields(x, ("color",))["color"].clamp(0.0, 1.0))
+        return self._inside(
+            lambda x: fields(x, ("color",))["color"].clamp(0.0, 1.0), everywhere=self._map.is_published
+        )
 
     @cached_property
     def label(self) -> Any:
@@ -141,14 +142,12 @@ class Sample:
         )
         return answer[:, 0], answer[:, 1:]
 
-    def _inside(self, ask: Callable[[Tensor], Tensor]) -> Any:
-        """Return the result (n,d) of the function `ask` at the query's points, NaN outside of the workspace."""
+    def _inside(self, ask: Callable[[Tensor], Tensor], everywhere: bool = False) -> Any:
+        """Return the result (n,d) of `ask` at the query's points, NaN outside of the workspace unless `everywhere`."""
         inside = self._map.seen.index
+        if everywhere:
+            return self._answers(lambda x: (ask(x),))[0]
         return self._answers(lambda x: (torch.where(inside(x)[1][:, None], ask(x), torch.nan),))[0]
-
-    def _everywhere(self, ask: Callable[[Tensor], Tensor]) -> Any:
-        """Return the result (n,d) of the function `ask` at the query's points."""
-        return self._answers(lambda x: (ask(x),))[0]
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
         """Return the results of the function `ask` at the query's points, as tensors or arrays like the query.
@@ -227,9 +226,10 @@ class SceneMap:
         fields = copy.deepcopy(self.fields).to(device)
         return SceneMap(fields, seen, self.label_names, self.history, self.uncertainty)
 
-    def with_uncertainty(self, uncertainty: MapUncertainty) -> "SceneMap":
-        """Return the map with the uncertainty of its calibration and depth."""
-        return SceneMap(self.fields, self.seen, self.label_names, self.history, uncertainty)
+    def set_uncertainty(self, uncertainty: MapUncertainty) -> None:
+        """Set the uncertainty of calibration and depth, which is computed from queries of the map itself."""
+        self.uncertainty = uncertainty
+        self._distance.clear()
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
@@ -268,9 +268,7 @@ class SceneMap:
         if probability or confidence is not None:
             quantile = self._quantile(0.5 if confidence is None else confidence)
         if probability and unknown == "report":
-            raise InputError(
-                "probability: give unknown as occupied or free, which decide what a collision is"
-            )
+            raise InputError("probability: give unknown as occupied or free, which decide what collides")
         ask = partial(self._touches, x, radius, quantile=quantile, center_std=center_std)
         if unknown != "report":
             return ask(unknown, probability=probability).cpu().numpy().reshape(batch)
@@ -318,13 +316,17 @@ class SceneMap:
         are reduced by `quantile` standard deviations; None: the surface is taken as exact.
         """
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
+        nodes = grid.nodes
+        if quantile is not None and grid.spread is not None and center_std == 0 and not probability:
+            # One interpolation of the reduced distance takes half the time of two.
+            nodes, quantile = nodes - quantile * grid.spread[1], None
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
             """Return the mask (n,) of spheres that collide, or their probabilities."""
             nearest = torch.clamp(x, lower, upper)
             beyond, reach, std = (x - nearest).norm(dim=1), radius, None
             if quantile is None:
-                distance = grid.distance(nearest)
+                distance = interpolate_grid(nodes[None], grid.lower, grid.cell, nearest)[0]
             else:
                 distance, std = grid.distance_std(nearest)
                 std = (std.square() + center_std**2).sqrt()

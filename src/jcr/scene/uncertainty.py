@@ -9,9 +9,8 @@ from numpy import ndarray
 
 from jcr.calibration.record import Calibration
 from jcr.camera import NORMALIZED
-from jcr.estimation.point_uncertainty import point_covariance, scene_uncertainty
-from jcr.geometry import by_similarity
-from jcr.records import COVARIANCE_ORDER, PointCloud, Reconstruction, SceneUncertainty
+from jcr.estimation.point_uncertainty import point_covariance
+from jcr.records import COVARIANCE_ORDER, PointCloud
 
 if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
@@ -20,8 +19,6 @@ BLOCK = 4
 """Side (map cells) of the blocks in which the depth's standard deviation is constant."""
 LEAST_POINTS = 20
 """Least number of points of a block for a value of its own; others have that of all points."""
-MOST_POINTS = 100_000
-"""Largest number of random points from which the depth's standard deviation is computed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,16 +32,15 @@ class MapUncertainty:
     middle: Float[ndarray, "3"]
     """Centre of the scene (m, base frame)."""
     similarity: Float[ndarray, "7 7"]
-    """Covariance of the scene's similarity about `middle` (SceneUncertainty): the part common to all points."""
+    """Covariance of the scene's similarity about `middle` (SceneUncertainty), the part common to all points."""
     shape_m: float
     """Standard deviation per axis of a point's remaining error by the calibration (m)."""
     look_std_m: float
     """Standard deviation per axis (m) of a point that the robot locates by an image from another pose: by transform,
     intrinsics and the error of that gripper pose. It changes with the pose, and is no part of the map's errors."""
     lower: Float[ndarray, "3"]
-    """Lower corner (m) of the first block."""
+    """Lower corner (m) of the first block; the sides of a block are `block_m`."""
     block_m: float
-    """Side (m) of the blocks."""
     depth_std: Float[ndarray, "z y x"]
     """Standard deviation (m) of the surface's position along its normal by depth and map, per block."""
 
@@ -55,50 +51,36 @@ class MapUncertainty:
         p = x_in_base - self.middle
         along = np.concatenate([normal, np.cross(p, normal), (p * normal).sum(1, keepdims=True)], axis=1)
         variance = ((along @ self.similarity) * along).sum(1) + self.shape_m**2
-        shape = np.array(self.depth_std.shape)
-        index = np.clip(((x_in_base - self.lower) / self.block_m).astype(int)[:, ::-1], 0, shape - 1)
+        index = ((x_in_base - self.lower) / self.block_m).astype(int)[:, ::-1]
+        index = np.clip(index, 0, np.array(self.depth_std.shape) - 1)
         return np.sqrt(variance + self.depth_std[tuple(index.T)] ** 2)
 
 
-def map_uncertainty(
-    scene: "SceneMap", cloud: PointCloud, hand_eye: Calibration, made: Reconstruction
-) -> MapUncertainty:
-    """Return the uncertainty of a map that was built from `cloud`, a calibration and its reconstruction `made`."""
-    uncertainty, whole = hand_eye.uncertainty, hand_eye.uncertainty.whole
-    placed = uncertainty.scene or _scene_of(hand_eye, made)
+def map_uncertainty(scene: "SceneMap", cloud: PointCloud, hand_eye: Calibration) -> MapUncertainty:
+    """Return the uncertainty of a map that was built from `cloud` and a calibration.
+
+    Without adjusted images, the points' standard deviations in their worst directions are used in all directions.
+    """
+    uncertainty, noise = hand_eye.uncertainty, hand_eye.robot_noise.together
     reach = np.linalg.norm(cloud.points_in_base - cloud.camera_centers_in_base[cloud.image], axis=1)
     camera, distance = hand_eye.intrinsics or NORMALIZED, float(np.median(reach))
     middle_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
     seen = point_covariance(hand_eye.gripper_from_camera, uncertainty, camera, middle_px, distance)
-    metres, radians = hand_eye.robot_noise.together
-    # Rotations move a point across the lever alone, that is along two of three axes.
-    look = np.trace(seen) / 3 + metres**2 + 2 / 3 * (radians * distance) ** 2
-    names = COVARIANCE_ORDER if uncertainty.joint is None else uncertainty.joint.order
+    # A rotation moves a point across the lever alone, that is along two of three axes.
+    look = np.trace(seen) / 3 + noise[0] ** 2 + 2 / 3 * (noise[1] * distance) ** 2
+    margin = 0.0 if cloud.margin is None else float(np.sqrt((cloud.margin**2).mean()))
+    placed = uncertainty.scene
     return MapUncertainty(
-        order=names,
-        joint=whole,
-        middle=np.asarray(placed.middle_in_base, float),
-        similarity=placed.covariance,
-        shape_m=placed.shape_m,
+        order=COVARIANCE_ORDER if uncertainty.joint is None else uncertainty.joint.order,
+        joint=uncertainty.whole,
+        middle=np.zeros(3) if placed is None else np.asarray(placed.middle_in_base, float),
+        similarity=np.zeros((7, 7)) if placed is None else placed.covariance,
+        shape_m=margin if placed is None else placed.shape_m,
         look_std_m=float(np.sqrt(look)),
         lower=scene.box[0],
         block_m=BLOCK * scene.cell,
         depth_std=_depth_std(scene, cloud),
     )
-
-
-def _scene_of(hand_eye: Calibration, made: Reconstruction, points: int = 300) -> SceneUncertainty:
-    """Return the scene's uncertainty from that of transform and scale, for a calibration without adjusted images."""
-    confident = np.argwhere(made.dense.confidence > 0)
-    image, row, column = np.random.default_rng(0).permutation(confident)[:points].T
-    x = hand_eye.base_from_recon(made.dense.points_in_recon[image, row, column].astype(np.float64))
-    base_from_camera = hand_eye.base_from_recon.rigid[:3, :3] @ made.recon_from_camera[:, :3, :3]
-    center = hand_eye.base_from_recon(made.recon_from_camera[:, :3, 3])
-    base_from_gripper = (base_from_camera @ hand_eye.gripper_from_camera[:3, :3].T)[image]
-    from_camera = ((x - center[image])[:, None] @ base_from_gripper)[:, 0]
-    by = (base_from_gripper @ by_similarity(from_camera)).reshape(-1, 7)
-    together = (by @ hand_eye.covariance @ by.T).reshape(len(x), 3, len(x), 3)
-    return scene_uncertainty((x, together, np.zeros((len(x), 3, 3))))
 
 
 def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
@@ -108,26 +90,23 @@ def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
     of the depth, if known, are a lower bound of it.
     """
     (low, high), side = scene.box, BLOCK * scene.cell
-    x = cloud.points_in_base
-    inside = np.random.default_rng(0).permutation(len(x))[:MOST_POINTS]
-    inside = inside[((x > low) & (x < high)).all(1)[inside]]
-    x, sample = x[inside], scene.query(x[inside], unknown="free")
+    inside = np.flatnonzero(((cloud.points_in_base > low) & (cloud.points_in_base < high)).all(1))
+    x = cloud.points_in_base[inside]
+    sample, stated = scene.query(x, unknown="free"), np.zeros(len(x))
     off = np.minimum(np.abs(sample.distance), 2 * scene.cell)
-    stated = np.zeros(len(x))
     if cloud.depth_std is not None:
         ray = x - cloud.camera_centers_in_base[cloud.image[inside]]
         cosine = (ray * sample.gradient).sum(1) / np.linalg.norm(ray, axis=1)
         stated = cloud.depth_std[inside] * np.minimum(np.abs(cosine), 1.0)
-    shape = np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1)[::-1]
-    index = np.minimum(((x - low) / side).astype(int)[:, ::-1], shape - 1)
-    block = np.ravel_multi_index(tuple(index.T), tuple(shape))
-    order: ndarray = np.lexsort((off, block))
-    first = np.flatnonzero(np.diff(block[order], prepend=-1))
-    count = np.diff(np.r_[first, len(order)])
-    spread = off[order][first + (0.95 * (count - 1)).astype(int)] / 1.96
-    noise = np.sqrt(np.add.reduceat(stated[order] ** 2, first) / count)
-    own, enough = np.maximum(spread, noise), count >= LEAST_POINTS
+    shape = tuple(np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1)[::-1])
+    block = np.ravel_multi_index(tuple(((x - low) / side).astype(int)[:, ::-1].T), shape, mode="clip")
+    order: ndarray = np.lexsort((off, block))  # pyright: ignore[reportAssignmentType]
+    block, off, stated = block[order], off[order], stated[order]
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    count = np.diff(np.r_[first, len(block)])
+    spread = off[first + (0.95 * (count - 1)).astype(int)] / 1.96
+    own = np.maximum(spread, np.sqrt(np.add.reduceat(stated**2, first) / count))
     anywhere = max(float(np.quantile(off, 0.95)) / 1.96, float(np.sqrt((stated**2).mean())))
-    found = np.full(int(np.prod(shape)), anywhere, np.float32)
-    found[block[order][first[enough]]] = own[enough]
-    return found.reshape(tuple(shape))
+    found = np.full(int(np.prod(shape)), anywhere)
+    found[block[first]] = np.where(count >= LEAST_POINTS, own, anywhere)
+    return found.reshape(shape)
