@@ -1,4 +1,4 @@
-"""Tables I and II of the paper on simulated captures: this package's method and the published one, from the same input."""
+"""Tables I and II of the paper on simulated captures, by this package and as published, from the same input."""
 
 import tempfile
 from collections.abc import Iterator

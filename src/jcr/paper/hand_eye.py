@@ -18,7 +18,7 @@ SCALES = np.linspace(1.0, 4.0, 20_000)
 LEAST_IMAGES = 3  # two motions about different axes determine the rotation
 
 
-def motions(a_from_b: Poses) -> Poses:
+def motions(a_from_b: Poses) -> Float[ndarray, "n-1 4 4"]:
     """Return the n − 1 motions between consecutive poses, a_from_b[i]⁻¹ · a_from_b[i+1] (eq. 2)."""
     return inverse(a_from_b[:-1]) @ a_from_b[1:]
 
