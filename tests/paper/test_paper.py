@@ -145,6 +145,8 @@ def test_one_switch_runs_the_published_method_from_images_to_the_map(
     assert jcr.run(made, tmp_path / "out", options).is_unchanged
 
 
+@pytest.mark.slow
+@pytest.mark.gl
 def test_options_and_back_ends_that_the_method_lacks_are_refused(
     predicted: tuple[Path, Path], tmp_path: Path
 ):

@@ -25,10 +25,8 @@ Depths = Float[ndarray, "n p"]
 STEPS, LEARNING_RATE = 300, 0.01
 """Number of Adam steps, and learning rate of the first; it falls to 0 along a cosine (DUSt3R's defaults). The authors
 of the paper took 5000 steps."""
-FOCAL_SLOWNESS = 20.0
-"""Factor of log f in the parameter of the focal length, so that one step changes f by little (as DUSt3R)."""
-PAIRS_AT_ONCE = 16
-"""Number of pairs in one forward and backward pass, which bounds the memory."""
+FOCAL_SLOWNESS = 20.0  # factor of log f in its parameter, so that one step changes f by little (as DUSt3R)
+PAIRS_AT_ONCE = 16  # in one forward and backward pass, which bounds the memory
 
 
 def align(

@@ -87,9 +87,8 @@ def reconstruct_baseline(capture: Capture, seed: int = 0) -> Reconstruction:
             words = f"COLMAP by its defaults registered {most} of {len(capture)} images"
             raise RejectedError(words, "overlap the views more, or use --backend dust3r")
         next(model for model in models if model.num_reg_images() == most).write(folder)
-        return replace(
-            reconstruct_given(replace(capture, intrinsics=None), Path(folder), seed), backend=BASELINE
-        )
+        made = reconstruct_given(replace(capture, intrinsics=None), Path(folder), seed)
+        return replace(made, backend=BASELINE)
 
 
 def calibrate_published(
@@ -102,8 +101,7 @@ def calibrate_published(
     rows = made.image_index
     gripper, camera = capture.base_from_gripper[rows], made.recon_from_camera
     x, scale = solve(gripper, camera)
-    used = set(rows.tolist())
-    why = f"not registered by {made.backend}"
+    used, why = set(rows.tolist()), f"not registered by {made.backend}"
     return PublishedCalibration(
         method="paper",
         on_gripper=x,
