@@ -34,8 +34,8 @@ class DistanceGrid:
     """Signed distance (m) at the nodes."""
     gradients: Float[Tensor, "4 nz ny nx"]
     """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
-    spread: Float[Tensor, "2 nz ny nx"] | None = None
-    """Signed distance (m), then the standard deviation (m) of the nearest surface along the gradient; None: unknown."""
+    std: Float[Tensor, "nz ny nx"] | None = None
+    """Standard deviation (m) of the nearest surface along the gradient; None: unknown."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
         """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
@@ -43,17 +43,6 @@ class DistanceGrid:
         The points are in the base frame; a point outside of the grid has the values of the nearest point on its border.
         """
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
-
-    def distance_std(
-        self, x_in_base: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Return signed distance and its standard deviation (m), each (n,), interpolated trilinearly at n points (m).
-
-        The grid must have `spread`; points outside have the values of the nearest point on its border.
-        """
-        assert self.spread is not None
-        distance, std = interpolate_grid(self.spread, self.lower, self.cell, x_in_base)
-        return distance, std
 
 
 def distance_grid(
@@ -93,19 +82,19 @@ def distance_grid(
             wall = cell * np.minimum(np.arange(n), np.arange(n)[::-1]).astype(np.float32)
             distance = np.minimum(distance, wall.reshape([-1 if a == axis else 1 for a in range(3)]))
     dz, dy, dx = np.gradient(distance, cell)
-    spread = None
+    std = None
     if surface_std is not None:
-        std = np.zeros(shape, np.float32)
+        spread = np.zeros(shape, np.float32)
         if row is not None:
             at, normal = np.argwhere(beside), np.stack([one[beside] for one in (dx, dy, dz)], 1)
             x = lower.cpu().numpy() + cell * (at + offset[:, beside].T)[:, ::-1]
-            std[beside] = surface_std(x, normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-6)[:, None])
-            std = std.take(row)
-        # The two values of a node are adjacent in memory.
-        spread = torch.as_tensor(np.stack([distance, std], -1), device=lower.device).permute(3, 0, 1, 2)
+            spread[beside] = surface_std(
+                x, normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-6)[:, None]
+            )
+        std = torch.as_tensor(spread if row is None else spread.take(row), device=lower.device)
     nodes = torch.as_tensor(distance, device=lower.device)
     gradients = torch.as_tensor(np.stack([distance, dx, dy, dz], -1), device=lower.device)
-    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2), spread)
+    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2), std)
 
 
 def _boundary(

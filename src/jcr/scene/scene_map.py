@@ -83,9 +83,8 @@ class Sample:
         NaN outside of the workspace, and for a map whose calibration states no uncertainty.
         """
         grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
-        if grid.spread is None:
-            return self._answers(lambda x: (torch.full_like(x[:, 0], torch.nan),))[0]
-        return self._inside(lambda x: grid.distance_std(x)[1][:, None])[:, 0]
+        std = torch.full_like(grid.nodes, torch.nan) if grid.std is None else grid.std
+        return self._inside(lambda x: interpolate_grid(std[None], grid.lower, grid.cell, x).T)[:, 0]
 
     @cached_property
     def color(self) -> Any:
@@ -201,10 +200,10 @@ class SceneMap:
 
         It is 1.645 times the 95 % quantile of the standard deviation over the nodes within a cell of seen surfaces.
         """
-        spread = self.distance_grid("free").spread
-        if spread is None:
+        grid = self.distance_grid("free")
+        if grid.std is None:
             return float("nan")
-        std = spread[1][spread[0].abs() < self.cell]
+        std = grid.std[grid.nodes.abs() < self.cell]
         return float(ndtri(0.95) * np.quantile(std.cpu().numpy(), 0.95)) if len(std) else 0.0
 
     @property
@@ -316,20 +315,20 @@ class SceneMap:
         are reduced by `quantile` standard deviations; None: the surface is taken as exact.
         """
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
-        nodes = grid.nodes
-        if quantile is not None and grid.spread is not None and center_std == 0 and not probability:
-            # One interpolation of the reduced distance takes half the time of two.
-            nodes, quantile = nodes - quantile * grid.spread[1], None
+        nodes = grid.nodes[None]
+        if quantile is not None and grid.std is not None:
+            nodes = torch.stack([grid.nodes, grid.std])
+            if center_std == 0 and not probability:
+                # One interpolation of the reduced distance takes half the time of two.
+                nodes, quantile = nodes[:1] - quantile * nodes[1:], None
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
             """Return the mask (n,) of spheres that collide, or their probabilities."""
             nearest = torch.clamp(x, lower, upper)
             beyond, reach, std = (x - nearest).norm(dim=1), radius, None
-            if quantile is None:
-                distance = interpolate_grid(nodes[None], grid.lower, grid.cell, nearest)[0]
-            else:
-                distance, std = grid.distance_std(nearest)
-                std = (std.square() + center_std**2).sqrt()
+            distance, *more = interpolate_grid(nodes, grid.lower, grid.cell, nearest)
+            if quantile is not None:
+                std = (more[0].square() + center_std**2).sqrt()
                 reach = radius + quantile * std
             if unknown != "occupied":
                 # A lower bound of the distance from outside to surfaces in the box, which is convex.

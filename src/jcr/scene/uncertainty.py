@@ -99,8 +99,9 @@ def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
         cosine = (ray * sample.gradient).sum(1) / np.linalg.norm(ray, axis=1)
         stated = cloud.depth_std[inside] * np.minimum(np.abs(cosine), 1.0)
     shape = tuple(np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1)[::-1])
-    block = np.ravel_multi_index(tuple(((x - low) / side).astype(int)[:, ::-1].T), shape, mode="clip")
-    order: ndarray = np.lexsort((off, block))  # pyright: ignore[reportAssignmentType]
+    index = tuple(((x - low) / side).astype(int)[:, ::-1].T)
+    block = np.asarray(np.ravel_multi_index(index, shape, mode="clip"))
+    order = np.lexsort((off, block))
     block, off, stated = block[order], off[order], stated[order]
     first = np.flatnonzero(np.diff(block, prepend=-1))
     count = np.diff(np.r_[first, len(block)])
