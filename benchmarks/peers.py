@@ -255,7 +255,8 @@ def alignment_page() -> Iterator[str]:
     ours_s, published_s = spent.values()
     yield (
         f"> Global alignment of {IMAGES * (IMAGES - 1)} pairs at 512x384 takes {ours_s:.1f} s of processor; "
-        f"{STEPS} steps of Adam, the published method, would take {published_s / ours_s:.0f} times as long."
+        f"{STEPS} steps of Adam, a reimplementation of the published method, would take {published_s / ours_s:.0f} "
+        "times as long on this processor."
     )
     yield from ("", *table("pairs of | method | processor, s | cameras off: mm | °", rows))
 
