@@ -36,17 +36,19 @@ BENCHES = {
     "coverage": (HONEST, "Is ± true?"),
     "faults": (HONEST, "Faults"),
     "live": (HONEST, "Live calibration"),
+    "spheres": (HONEST, "Spheres at a confidence"),
     "map": (MAPPED, "The map"),
     "speed": (TIME, "Speed"),
     "peers": (OTHERS, "Peers"),
     "kinhec": (OTHERS, "KinHEC"),
     "pointmaps": (OTHERS, "Pointmaps"),
+    "published": (OTHERS, "Tables of the paper"),
 }
 """Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SHARE = 4
 """`all` takes one case in SHARE of the benches with many."""
-COMMANDS = {"align": "benchmarks.adam", "fetch-captures": "benchmarks.real_captures.fetch"}
+COMMANDS = {"align": "benchmarks.align", "fetch-captures": "benchmarks.real_captures.fetch"}
 """Modules of commands that are no bench and take arguments of their own, by name."""
 CLAIM = "> "
 """Prefix of the lines of a page that state its result in a sentence."""

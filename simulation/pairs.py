@@ -82,7 +82,7 @@ def synthetic_pairs(
     k = intrinsics or Intrinsics(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
     images = int(edges.max()) + 1
     base_from_camera = _cameras(images, rng)
-    depth = np.stack([_depth(pose, rays(k)) for pose in base_from_camera])
+    depth = np.stack([scene_depth(pose, rays(k)) for pose in base_from_camera])
     return predicted_pairs(
         edges, base_from_camera, depth, k, errors, rng, carries_intrinsics=intrinsics is not None
     )
@@ -150,8 +150,8 @@ def _with_errors(
     """Add smooth errors along and across the sight, and white ones in all directions, to points."""
     height, width = depth.shape
     white = errors.pixel * growth * np.where(outlier, 20, 1) * depth
-    stretched = exact * (1 + errors.warp * growth * _smooth(rng, height, width))[..., None]
-    bend = errors.bend * growth * np.stack([_smooth(rng, height, width) for _ in range(3)], axis=-1)
+    stretched = exact * (1 + errors.warp * growth * smooth_noise(rng, height, width))[..., None]
+    bend = errors.bend * growth * np.stack([smooth_noise(rng, height, width) for _ in range(3)], axis=-1)
     return stretched + np.cross(bend, exact) + white[..., None] * rng.normal(size=exact.shape)
 
 
@@ -196,7 +196,9 @@ def _cameras(count: int, rng: np.random.Generator) -> Float[ndarray, "n 4 4"]:
     return transform(level @ roll, eye.T)
 
 
-def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
+def scene_depth(
+    base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]
+) -> Float[ndarray, "h w"]:
     """Return the depth of the nearest surface along rays of unit depth."""
     origin, direction = base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T
     nearest = np.maximum(*((ROWS_ABOVE[:, None, None] - origin) / direction)).min(axis=-1)
@@ -213,7 +215,18 @@ def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]
     return nearest
 
 
-def _smooth(rng: np.random.Generator, height: int, width: int) -> Float[ndarray, "h w"]:
+def scene_distance(x: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
+    """Return the distance (m) of points in the scene's frame to table, spheres and boxes, negative inside."""
+    distances = [x[:, 2]]
+    for *center, radius in SPHERES:
+        distances.append(np.linalg.norm(x - center, axis=1) - radius)
+    for low, high in BOXES:
+        q = np.abs(x - (low + high) / 2) - (high - low) / 2
+        distances.append(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0))
+    return np.min(distances, axis=0)
+
+
+def smooth_noise(rng: np.random.Generator, height: int, width: int) -> Float[ndarray, "h w"]:
     """Draw unit normals on a 4x5 grid and interpolate them."""
     return cv2.resize(rng.normal(size=(4, 5)), (width, height), interpolation=cv2.INTER_LINEAR)
 

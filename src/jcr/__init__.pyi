@@ -5,6 +5,7 @@ from .calibration.difference import compare as compare
 from .calibration.hand_eye import solve_hand_eye as solve_hand_eye
 from .calibration.options import CalibrateOptions as CalibrateOptions
 from .calibration.record import Calibration as Calibration
+from .calibration.record import PublishedCalibration as PublishedCalibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
 from .capture.ros import read_ros_camera_info as read_ros_camera_info
@@ -70,6 +71,7 @@ from .scene.options import CloudOptions as CloudOptions
 from .scene.options import MapOptions as MapOptions
 from .scene.scene_map import Sample as Sample
 from .scene.scene_map import SceneMap as SceneMap
+from .scene.uncertainty import MapUncertainty as MapUncertainty
 from .segments.measure import Measurement as Measurement
 from .segments.options import SegmentOptions as SegmentOptions
 from .segments.options import TabletopOptions as TabletopOptions

@@ -268,14 +268,7 @@ def reconstruct(
     InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
     """
     options = options or ReconstructOptions()
-    row = BACKENDS[candidates(options)[0]]
-    if not row.is_installed():
-        more = ", or choose another" if row.has_weights() else f"; then {weights_command(row)}"
-        raise InputError(
-            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}{more}"
-        )
-    if row.needs and getattr(options, row.needs) is None:
-        raise InputError(f"--backend {row.name}: name {NEEDED[row.needs]}")
+    row = ready_backend(options, candidates(options)[0])
     # Matching, RANSAC and the initial pair depend on the order of the images: with other names, calibrations differed by
     # up to 1.7 standard deviations. Images are therefore sorted by their poses: position, x first, then rotation. Adding
     # zero turns -0 into 0; equal poses keep their order.
@@ -307,6 +300,17 @@ def reconstruct(
         tracks=replace(made.tracks, image=row_of[made.tracks.image], boards=boards),
         evidence=evidence,
     )
+
+
+def ready_backend(options: ReconstructOptions, name: str) -> Backend:
+    """Return the back end `name`; raise InputError if its package or an option that it requires is missing."""
+    row = BACKENDS[name]
+    if not row.is_installed():
+        more = ", or choose another" if row.has_weights() else f"; then {weights_command(row)}"
+        raise InputError(f"--backend {name} needs {row.package}, which is not installed: {row.install}{more}")
+    if row.needs and getattr(options, row.needs) is None:
+        raise InputError(f"--backend {name}: name {NEEDED[row.needs]}")
+    return row
 
 
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:

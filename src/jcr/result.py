@@ -6,14 +6,20 @@ A file of the run folder may be invalid, because the user has edited it; reading
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxtyping import Int
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, read_calibration
+from jcr.calibration.record import (
+    AnyCalibration,
+    Calibration,
+    FailedCalibration,
+    PublishedCalibration,
+    read_calibration,
+)
 from jcr.capture.added import read_added
 from jcr.capture.read import read_capture
 from jcr.cell.added import read_added_cameras
@@ -48,6 +54,8 @@ CAPTURE = "capture"
 class RunOptions:
     """Options of all stages of a run."""
 
+    method: Literal["default", "paper"] = "default"
+    """Method of reconstruction, calibration and map: that of this package, or the published one (jcr.paper)."""
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
@@ -106,7 +114,16 @@ class RunResult:
 
     @property
     def found(self) -> Calibration:
-        """Calibration of a successful run; raises RejectedError for a failed calibration."""
+        """Calibration of a successful run; raises RejectedError for a failed one, InputError for a published one."""
+        if isinstance(found := self.solved, PublishedCalibration):
+            raise InputError(
+                f"{self.out}: is by --method paper, which has no uncertainty; run the default method for this"
+            )
+        return found
+
+    @property
+    def solved(self) -> Calibration | PublishedCalibration:
+        """Calibration of a successful run by either method; raises RejectedError for a failed calibration."""
         if isinstance(self.calibration, FailedCalibration):
             raise RejectedError(f"no calibration was found: {self.calibration.doubt}")
         return self.calibration
@@ -190,11 +207,11 @@ class RunResult:
 
     @property
     def scale_std(self) -> float:
-        """Standard deviation of the scale (metres per recon unit) divided by the scale; 0 for a failed calibration."""
+        """Standard deviation of the scale (metres per recon unit) divided by the scale; 0 if it is unknown."""
         uncertainty = self.calibration.uncertainty
         return 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100
 
-    def of_wrist_camera(self) -> tuple[Calibration, Capture, Reconstruction]:
+    def of_wrist_camera(self) -> tuple[Calibration | PublishedCalibration, Capture, Reconstruction]:
         """Return calibration, capture and reconstruction of a run with a camera on the gripper.
 
         Raises InputError if one is missing or damaged, if the calibration failed or is of a fixed camera, or if the

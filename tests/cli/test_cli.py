@@ -214,6 +214,9 @@ def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     distance = np.array(answers["distance"][2:], float)
     assert np.isfinite(distance).mean() > 0.98  # the map's box holds all but a hundredth of the points
     assert np.nanmedian(np.abs(distance)) < 0.01
+    # The surface is known to millimetres, as the run's calibration and depth say.
+    assert 1e-5 < np.nanmedian(np.array(answers["std"][2:], float)) < 0.01
+    assert 1e-4 < answers["margin_95_m"] < 0.05 and answers["look_std_m"] > 0
 
 
 def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):

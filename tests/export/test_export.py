@@ -353,6 +353,7 @@ def test_esdf_voxels_hold_distances_at_centres(done: Path, scene: "SceneMap", un
         grid = {name: file[name] for name in file.files}
     assert (str(grid["frame"]), str(grid["unit"]), str(grid["unknown"])) == ("base_link", "m", unknown)
     assert "positive outside" in str(grid["sign"]) and grid["voxel_size"] == 0.015
+    assert float(str(grid["margin_95_m"])) == pytest.approx(scene.margin_95, abs=1e-5)
     shape = np.array(grid["values"].shape)
     np.testing.assert_allclose(grid["dims"], 0.015 * shape)
     np.testing.assert_allclose(grid["pose"][:3] - grid["dims"] / 2 + 0.0075, grid["origin"], atol=1e-12)

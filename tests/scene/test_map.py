@@ -125,8 +125,7 @@ def test_colours_and_labels_are_learnt(scene: "SceneMap", cloud: PointCloud):
 def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud: PointCloud):
     import torch
 
-    from jcr.scene.build import build_scene
-    from jcr.scene.paper import PaperField, train_paper
+    from jcr.paper.fields import PaperField, published_scene, train_fields
 
     box = torch.tensor([[0.0, -1.0, 0.0], [2.0, 1.0, 1.0]])
     field, x = PaperField(box, "color", 3, torch.Generator().manual_seed(1)), torch.rand(50, 3)
@@ -138,7 +137,7 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     )
     assert field.hidden.weight.shape == (256, 60)
 
-    fields = train_paper(cloud, steps=250)
+    fields, _ = train_fields(cloud, MapOptions(steps=250))
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
     points = uniform(100_000)
     free = torch.tensor(points[signed_distance(points) > 0.03], dtype=torch.float32)
@@ -148,7 +147,104 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     assert np.abs(fields["color"](surface)["color"].numpy() - color).mean() < 0.12
     assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
     untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
-    assert [type(one) for one in build_scene(cloud, untrained).fields.of] == 3 * [PaperField]
+    assert [type(one) for one in published_scene(cloud, untrained).fields.of] == 3 * [PaperField]
+
+
+def test_published_networks_answer_everywhere_and_unknown_stands_beside(cloud: PointCloud):
+    import torch
+
+    from jcr.paper.fields import published_scene
+
+    scene = published_scene(cloud, replace(OPTIONS, steps=100))
+    x = np.concatenate([uniform(5000), OUTSIDE[None], UNDER_TABLE[None]])
+    raw = scene.fields(torch.tensor(x).float(), scene.properties)
+    for unknown in ("occupied", "free", "report"):
+        sample = scene.query(x, unknown)  # pyright: ignore[reportArgumentType]
+        np.testing.assert_allclose(sample.occupancy, expit(raw["occupancy"][:, 0].numpy()), atol=1e-6)
+        np.testing.assert_allclose(sample.color, raw["color"].clamp(0, 1).numpy(), atol=1e-6)
+        assert np.array_equal(sample.label, raw["label"].argmax(1).numpy())
+        assert sample.unknown[-2] and np.isnan(sample.std).all()
+    assert 0.2 < sample.unknown.mean() < 0.8
+    z = torch.tensor(x[:10], dtype=torch.float32, requires_grad=True)
+    (gradient,) = torch.autograd.grad(scene.query(z).occupancy.sum(), z)
+    assert (gradient.norm(dim=1) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def uncertain(cloud: PointCloud) -> "SceneMap":
+    """A map whose calibration has errors of 2 mm, 0.2° and 0.3 % per axis."""
+    from jcr.scene.build import build_scene
+    from jcr.scene.uncertainty import MapUncertainty, _depth_std
+
+    made = build_scene(cloud, OPTIONS)
+    spread = np.diag(np.r_[[2e-3] * 3, [np.radians(0.2)] * 3, 0.003] ** 2)
+    made.set_uncertainty(
+        MapUncertainty(
+            order=("a", "b"),
+            joint=np.array([[2.0, 0.5], [0.5, 1.0]]),
+            middle=np.zeros(3),
+            similarity=spread,
+            shape_m=3e-4,
+            look_std_m=2e-3,
+            lower=made.box[0],
+            block_m=4 * made.cell,
+            depth_std=_depth_std(made, cloud),
+        )
+    )
+    return made
+
+
+def test_std_covers_the_errors_of_drawn_calibrations(uncertain: "SceneMap"):
+    """Draw the true surface about the map's, as often as the covariance says; spheres at 0.95 and their probability."""
+    from jcr.geometry import rotation_exp
+
+    assert uncertain.uncertainty is not None
+    draw, x = np.random.default_rng(0), near_surface(8000)
+    seen = uncertain.query(x, unknown="free")
+    x = x[(seen.distance > 0.01) & (seen.distance < 0.05) & ~uncertain.query(x).unknown]
+    sample = uncertain.query(x, unknown="free")
+    radius = sample.distance + draw.uniform(-0.008, 0.004, len(x))
+    free = ~uncertain.check_spheres(x, radius, "free", confidence=0.95)
+    probability = uncertain.check_spheres(x, radius, "free", probability=True)
+    assert np.array_equal(free, probability < 0.05) or (free != (probability < 0.05)).mean() < 0.001
+    off, wrong, collided = [], 0, 0
+    for step in draw.multivariate_normal(np.zeros(7), uncertain.uncertainty.similarity, 60):
+        in_map = (x - step[:3]) @ rotation_exp(step[3:6]) / np.exp(step[6])
+        true = signed_distance(in_map)
+        off.append((true - sample.distance) / sample.std)
+        wrong += int((free & (true < radius)).sum())
+        collided += int((true < radius).sum())
+    assert 0.6 < np.std(off) < 1.2
+    assert wrong < 0.05 * collided
+    assert free.mean() > 0.05
+    # Spheres that another image located are less certain.
+    elsewhere = uncertain.check_spheres(
+        x, radius, "free", confidence=0.95, center_std=uncertain.uncertainty.look_std_m
+    )
+    assert elsewhere[~free].all() and elsewhere.sum() > (~free).sum()
+
+
+def test_the_file_keeps_the_joint_covariance_and_the_answers(uncertain: "SceneMap", tmp_path: Path):
+    uncertain.save(tmp_path / "map.safetensors")
+    fresh, x = load_map(tmp_path), uniform(2000)
+    assert fresh.uncertainty is not None and uncertain.uncertainty is not None
+    assert fresh.uncertainty.order == ("a", "b")
+    for name, value in vars(uncertain.uncertainty).items():
+        assert np.array_equal(getattr(fresh.uncertainty, name), value), name
+    assert np.array_equal(fresh.query(x).std, uncertain.query(x).std, equal_nan=True)
+    assert np.array_equal(
+        fresh.check_spheres(x, 0.02, confidence=0.95), uncertain.check_spheres(x, 0.02, confidence=0.95)
+    )
+    assert 0.003 < fresh.margin_95 < 0.02
+    for wrong in (0.0, 1.0, -0.5):
+        with pytest.raises(InputError, match="between 0 and 1"):
+            fresh.check_spheres(x, 0.02, confidence=wrong)
+
+
+def test_a_map_without_uncertainty_refuses_a_confidence(scene: "SceneMap"):
+    with pytest.raises(InputError, match="no uncertainty"):
+        scene.check_spheres(FREE_SPOT[None], 0.02, confidence=0.95)
+    assert np.isnan(scene.query(FREE_SPOT[None]).std).all()
 
 
 def test_the_same_seed_gives_the_same_map_and_torchs_own_state_stays():

@@ -11,7 +11,14 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, read_content, validated
+from jcr.calibration.record import (
+    AnyCalibration,
+    Calibration,
+    FailedCalibration,
+    PublishedCalibration,
+    read_content,
+    validated,
+)
 from jcr.capture.transform_file import read_transform
 from jcr.distributions import chi2
 from jcr.errors import InputError, first_fault
@@ -123,6 +130,8 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
     record = getattr(one, "calibration", one)
     if isinstance(record, FailedCalibration):
         raise InputError(f"{name}: has no {record.mount}_from_camera; that calibration failed")
+    if isinstance(record, PublishedCalibration):
+        return StatedTransform(record.gripper_from_camera, doubt=record.doubt)
     if isinstance(record, Calibration):
         budget = record.uncertainty.budget
         causes = {} if budget is None else vars(budget)

@@ -116,6 +116,8 @@ class Outcome:
     """Rigid transform of recon coordinates times `scale` (m) to the base frame; None for a fixed camera."""
     carried: Annotated[Matrix | None, Field(alias="gripper_from_object")] = None
     """Rigid transform of the carried object's scaled recon coordinates (m) to the gripper; None for a camera on it."""
+    method: Literal["default", "paper"] = "default"
+    """Method of the calibration: that of this package, or the published one, which checks nothing."""
     backend: str = ""
     """Name of the back end that reconstructed the images."""
     images: tuple[ImageVerdict, ...]
@@ -376,8 +378,33 @@ class Calibration(Outcome):
         return point_in_base(x, self.uncertainty, self.intrinsics, self.robot_noise, pixel, depth_m, pose)
 
 
+class _WithoutUncertainty(Outcome):
+    """Base class of the records that lack fields of a Calibration: these fields are None, and null in the file."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
+
+        Raises AttributeError for a name that a Calibration does not have.
+        """
+        if name in Calibration.__dataclass_fields__ or name == "robot_errors":
+            return () if name == "lengths" else None
+        if name.startswith("_") or not hasattr(Calibration, name):
+            raise AttributeError(name)
+        raise RejectedError(self._lacking())
+
+    def _lacking(self) -> str:
+        """Return the reason why the record lacks fields of a Calibration."""
+        return f"no calibration was found: {self.doubt}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of calibration.json: the keys of a Calibration, null or empty where this has no value."""
+        fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
+        empty = {name: [] if name == "lengths" else None for name in sorted(fields)}
+        return super().as_json() | empty
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FailedCalibration(Outcome):
+class FailedCalibration(_WithoutUncertainty):
     """Result for a capture that could not be reconstructed; its findings are the reasons.
 
     Fields of a Calibration, such as `scale`, are None here and null in the file. Properties and methods of a
@@ -392,25 +419,34 @@ class FailedCalibration(Outcome):
         kind, motion = FindingKind.UNOBSERVABLE, "no camera poses"
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 
-    def __getattr__(self, name: str) -> Any:
-        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
 
-        Raises AttributeError for a name that a Calibration does not have.
-        """
-        if name in Calibration.__dataclass_fields__ or name == "robot_errors":
-            return () if name == "lengths" else None
-        if name.startswith("_") or not hasattr(Calibration, name):
-            raise AttributeError(name)
-        raise RejectedError(f"no calibration was found: {self.doubt}")
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PublishedCalibration(_WithoutUncertainty):
+    """Result of the published method: transform, scale and residuals, without covariance and without checks.
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the content of calibration.json: the keys of a Calibration, null or empty where this has no value."""
-        fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
-        empty = {name: [] if name == "lengths" else None for name in sorted(fields)}
-        return super().as_json() | empty
+    Other fields of a Calibration, such as `uncertainty`, are None here and null in the file.
+    """
+
+    scale: Positive
+    """Metres per unit of the reconstruction."""
+    residuals: PaperResiduals
+    """Residuals δ_t and δ_R of the paper (eq. 16); small ones do not prove accuracy."""
+
+    @property
+    def parent_from_camera(self) -> Float[ndarray, "4 4"]:
+        """gripper_from_camera; the published method calibrates a camera on the gripper."""
+        return self.gripper_from_camera
+
+    @property
+    def base_from_recon(self) -> Similarity:
+        """Similarity from recon coordinates (any unit) to the base frame (m)."""
+        return Similarity(self._require(self.resting, "gripper"), self.scale)
+
+    def _lacking(self) -> str:
+        return "the published method states no uncertainty; run the default method for this"
 
 
-AnyCalibration = Calibration | FailedCalibration
+AnyCalibration = Calibration | FailedCalibration | PublishedCalibration
 
 
 @cache
@@ -455,7 +491,8 @@ def validated(content: dict[str, object], file: Path) -> AnyCalibration:
             f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; run the calibration again"
         )
     is_empty = content.get("scale") is None and content.get("uncertainty") is None
-    record = FailedCalibration if is_empty else Calibration
+    of_method = PublishedCalibration if content.get("method") == "paper" else Calibration
+    record = FailedCalibration if is_empty else of_method
     try:
         # Strict validation accepts lists for tuples and arrays only in JSON text, not in Python values.
         found = adapter(record).validate_json(json.dumps(content), strict=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.record import AnyCalibration, Calibration
+from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.findings import (
     LENGTHS,
     Finding,
@@ -66,6 +66,8 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
+    if isinstance(content, PublishedCalibration):
+        lines += _published(content)
     return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines))]) + "\n"
 
 
@@ -74,9 +76,7 @@ def _result(content: Calibration) -> list[str]:
 
     The accuracy is the bound on 95 % of the errors of a point that the camera sees.
     """
-    uncertainty, matrix = content.uncertainty, content.parent_from_camera
-    quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
-    x, q = (" ".join(f"{number:8.5f}" for number in part) for part in (matrix[:3, 3], quat_xyzw))
+    uncertainty = content.uncertainty
     offset = " ".join(significant(size) for size in uncertainty.translation_std_mm)
     rotation = " ".join(significant(size) for size in uncertainty.rotation_std_deg)
     accuracy, required = "unknown", content.requirement
@@ -90,8 +90,7 @@ def _result(content: Calibration) -> list[str]:
     sources = joined(["the robot", *used]) if used else "the robot alone"
     tested.append(f"scale ±{uncertainty.scale_std_percent:.2g} %, from {sources}")
     lines = [
-        f"{content.mount}_from_camera (optical frame; m, quaternion xyzw)",
-        f"  {x}   {q}",
+        *_transform(content),
         f"  1σ: {offset} mm, {rotation}°",
         *labelled("Accuracy", accuracy, "; ".join(tested)),
     ]
@@ -101,6 +100,26 @@ def _result(content: Calibration) -> list[str]:
     how = "used" if camera.std is None else "given, refined" if given else "estimated"
     numbers = " ".join(f"{name} {getattr(camera, name):.1f}" for name in ("fx", "fy", "cx", "cy"))
     return [*lines, *labelled("Intrinsics", f"{how}: {numbers}; use them together with the transform")]
+
+
+def _transform(content: Calibration | PublishedCalibration) -> list[str]:
+    """Return two lines: the name of the transform, and its translation (m) and quaternion."""
+    matrix = content.parent_from_camera
+    quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
+    x, q = (" ".join(f"{number:8.5f}" for number in part) for part in (matrix[:3, 3], quat_xyzw))
+    return [f"{content.mount}_from_camera (optical frame; m, quaternion xyzw)", f"  {x}   {q}"]
+
+
+def _published(content: PublishedCalibration) -> list[str]:
+    """Return the lines of a calibration by the published method: transform, scale and residuals of the paper."""
+    found = content.residuals
+    sizes = f"δt {significant(1e3 * found.translation)} mm, δR {significant(found.rotation)} (paper, eq. 16)"
+    scale = f"{content.scale:.6g} m per unit of the reconstruction"
+    return [
+        *_transform(content),
+        *labelled("Residuals", sizes, "small ones do not prove accuracy"),
+        *labelled("Scale", scale),
+    ]
 
 
 def actions(findings: Sequence[Finding], most: int) -> list[str]:
@@ -141,6 +160,8 @@ def details(content: AnyCalibration) -> list[str]:
         lines.append(f"scale {content.scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %")
         if held_out is not None:
             lines.append(f"leave-one-out error: {leave_one_out_text(held_out)} ({held_out.how})")
+    if isinstance(content, PublishedCalibration):
+        lines += ["method of the paper", *_published(content)]
     for title, block in facts(content).items():
         lines += [f"{title}: {name}: {value}" for name, value in block.items()]
     lines += [f"{image.image}: {image.reason or 'used'}" for image in content.images]

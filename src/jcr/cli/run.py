@@ -6,7 +6,7 @@ import sys
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -44,6 +44,9 @@ class CalibrateCommand:
     """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
+    method: Literal["default", "paper"] = "default"
+    """default; paper: the method as published, without uncertainty and checks: back end dust3r, mast3r, predictions, or
+    colmap as its baseline without the gripper poses; published alignment, solver and networks."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
@@ -62,9 +65,9 @@ class CalibrateCommand:
                 capture = read_source(self.capture, self.read, into=self.out / CAPTURE, progress=progress)
             if not isinstance(capture, PosePairs):
                 return show(_run(self, capture, run_options(self, map=None), progress), self.output)
-            result = calibrate_poses(capture, self.out, self.calibrate)
+            result = calibrate_poses(capture, self.out, self.calibrate, self.method)
         show_calibration(result, capture, self.output)
-        is_marker = result.converged and is_one(result.found)
+        is_marker = self.method == "default" and result.converged and is_one(result.found)
         return show(result, self.output, *labelled("Scale", *["1, as the marker's size says"] * is_marker))
 
 
@@ -81,6 +84,7 @@ class RunCommand(CalibrateCommand):
       jcr run captures/table out/table --robot-noise 0.1 0.05 --json
       jcr run captures/ur5 out/ur5 --pose-convention ur
       jcr run captures/table out/table --no-map
+      jcr run captures/table out/paper --method paper --backend colmap
       jcr run scan.mcap out/scan --base-frame base_link --gripper-frame tool0 --frames 12
     """
 
@@ -124,6 +128,9 @@ class BatchCommand:
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]
     """Folders of the captures, then the folder for the results."""
+    method: Literal["default", "paper"] = "default"
+    """default; paper: the method as published, without uncertainty and checks: back end dust3r, mast3r, predictions, or
+    colmap as its baseline without the gripper poses; published alignment, solver and networks."""
     output: Output = field(default_factory=Output)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)

@@ -22,8 +22,8 @@ from jcr.rounding import decimals_of
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
-_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
-_FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
+_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
+_FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d,%.5f"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +113,10 @@ class ExportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class QueryCommand:
-    """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
+    """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour, label and std.
 
-    Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace.
+    Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace. std (m) is the
+    standard deviation of the nearest surface along the gradient, by calibration and depth.
 
     for example:
       jcr query out/table points.csv
@@ -144,7 +145,7 @@ class QueryCommand:
         # Eight-bit colours, as in the point cloud; 0 outside of the workspace.
         colors = np.nan_to_num(sample.color * 255).round().astype(np.uint8).T
         columns = [*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T]
-        columns += [*colors, sample.label]
+        columns += [*colors, sample.label, sample.std]
         count = np.bincount(sample.label, minlength=len(scene.label_names))
         labels = [f"{name} {n}" for name, n in zip(scene.label_names[1:], count[1:], strict=False) if n]
         unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(x_in_base) else "none"
@@ -152,6 +153,9 @@ class QueryCommand:
         if len(x_in_base) and np.isnan(sample.distance).all():
             summary += "; all are outside of the mapped workspace: give metres in the robot's base frame"
         answers: dict[str, object] = {"label_names": list(scene.label_names)}
+        if scene.uncertainty is not None:
+            answers |= {"margin_95_m": scene.margin_95, "look_std_m": scene.uncertainty.look_std_m}
+            summary += f"; surface within {1e3 * scene.margin_95:.1f} mm of the map on the free side (95 %)"
         if self.output.json:
             for name, column in zip(_COLUMNS.split(","), columns, strict=True):
                 rounded = column.astype(float).round(6) if column.dtype.kind == "f" else column

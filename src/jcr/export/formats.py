@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -52,14 +53,14 @@ urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
 easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
 camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
 ply | cloud.ply | points, colours, labels | views.write_cloud | cloud notes
-glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene notes
-octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene notes options
-esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene notes options
-spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene notes options
+glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene map_notes
+octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene map_notes options
+esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene map_notes options
+spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene map_notes options
 nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
     views cloud notes options
 colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views notes options
-rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene notes
+rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene map_notes
 """
 FORMATS = tuple(
     ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
@@ -153,6 +154,13 @@ class ExportedRun:
         return provenance(self.options.base_frame, self.doubt)
 
     @property
+    def map_notes(self) -> dict[str, str]:
+        """Notes for files made from the map: `notes`, and the margin (m) for 95 % of the surface's errors, if known."""
+        if self.scene.uncertainty is None:
+            return self.notes
+        return self.notes | {"margin_95_m": f"{self.scene.margin_95:.5f}"}
+
+    @property
     def mount(self) -> ros.CameraMount:
         """Transform of the exported camera (or its root link) to its parent frame, with frame names from the options.
 
@@ -204,7 +212,7 @@ class ExportedRun:
         """Point cloud of the run in the base frame (m), from cloud.ply."""
         return read_cloud(self.run.out / CLOUD)
 
-    @property
+    @cached_property
     def scene(self) -> "SceneMap":
         """Map of the run in the base frame (m), from map.safetensors."""
         return load_map(self.run.out)

@@ -156,6 +156,10 @@ class FindingKind(StrEnum):
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
         "too few images for this motion", "add some")
+    NOT_CHECKED = "nothing checked", KindRow("motion",
+        "the published method checks nothing: poses, intrinsics and motions may be wrong, and the result has no ±",
+        "run the default method on the same capture, and compare (jcr compare)",
+        means="the calibration is that of `--method paper`")
     NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"not as exact as needed: {REACHED}",
         f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of it comes from systematic robot "
         "errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; move "

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from jcr.extras import is_installed
 from jcr.files import locked, write_text
 from jcr.options import checked_options
 from jcr.pipeline.decision import decided_by_images
-from jcr.pipeline.selection import NEARLY_ALL, NothingFoundError
+from jcr.pipeline.selection import NEARLY_ALL, NothingFoundError, solved_pairs
 from jcr.pipeline.stages import (
     FIRST,
     REST,
@@ -119,14 +119,22 @@ def calibrate(
     return run(capture, out, options, backend=backend, progress=progress)
 
 
-def calibrate_poses(pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None) -> RunResult:
-    """Calibrate from given camera poses, without images; write calibration.json and report to the folder `out`."""
+def calibrate_poses(
+    pairs: PosePairs,
+    out: str | Path,
+    options: CalibrateOptions | None = None,
+    method: Literal["default", "paper"] = "default",
+) -> RunResult:
+    """Calibrate from given camera poses, without images; write calibration.json and report to the folder `out`.
+
+    `method` is that of RunOptions. Raises RejectedError if the published method gives no calibration.
+    """
     from jcr.report.html import report_html
 
     out = Path(out)
     with locked(out):
         start = time.perf_counter()
-        content = calibrate_pose_pairs(pairs, options)
+        content = solved_pairs(pairs, options) if method == "paper" else calibrate_pose_pairs(pairs, options)
         content = replace(content, timings_s={"calibrate": round(time.perf_counter() - start, 3)})
         forget_reconstruction(out)
         keep_calibration(out, content)

@@ -7,11 +7,13 @@ from functools import cache
 
 from jcr.allocator import give_back
 from jcr.calibration.checks.capture import as_causes, view_findings
-from jcr.calibration.record import Calibration
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.words import leave_one_out_text
 from jcr.errors import InputError, RejectedError
+from jcr.extras import extra
 from jcr.findings import (
     Concerns,
     Finding,
@@ -24,7 +26,7 @@ from jcr.findings import (
 )
 from jcr.progress import Progress, silent
 from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import Attempt, Capture, Reconstruction
+from jcr.records import Attempt, Capture, PosePairs, Reconstruction
 from jcr.result import RunOptions
 
 HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
@@ -164,6 +166,64 @@ def select_reconstruction(
                 raise trial.failure
             trials.append(trial)
     return _select(trials, notes, of_images() if any(one.is_doubtful for one in trials) else ())
+
+
+def solved_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> PublishedCalibration:
+    """Calibrate given camera poses by the published solver; raises as `select_published` does."""
+    require_published(options or CalibrateOptions())
+    from jcr.paper.run import calibrate_published
+
+    return calibrate_published(pairs, pairs)
+
+
+def require_published(options: CalibrateOptions) -> None:
+    """Raise InputError without torch, and for an option of the calibration, because the published method has none."""
+    extra("torch", "map", "--method paper")
+    for name, value in vars(CalibrateOptions()).items():
+        if getattr(options, name) != value:
+            raise InputError(f"--method paper: does not use --{name.replace('_', '-')}; leave it out")
+
+
+def select_published(
+    capture: Capture,
+    options: RunOptions,
+    progress: Progress | None = None,
+    before: Reconstruction | None = None,
+) -> tuple[Reconstruction, PublishedCalibration]:
+    """Reconstruct and calibrate a capture by the published method, with one back end and without checks.
+
+    If the reconstruction `before` is given, only it is calibrated. Raises InputError as the method does, and
+    NothingFoundError if it gives no calibration.
+    """
+    require_published(options.calibrate)
+    if capture.mount != "gripper":
+        raise InputError("--method paper: is for a camera on the gripper; leave it out")
+    # Torch and pycolmap take seconds to import, and torch may be absent.
+    from jcr.paper.run import calibrate_published, reconstruct_published
+
+    start, made = time.perf_counter(), before
+    try:
+        made = reconstruct_published(capture, options.reconstruct, progress) if made is None else made
+        reconstructed = time.perf_counter()
+        hand_eye = calibrate_published(capture, made)
+    except RejectedError as error:
+        account = Attempt(
+            backend=options.reconstruct.backend if made is None else made.backend,
+            images_registered=None if made is None else len(made.image_index),
+            reconstruct_s=round(time.perf_counter() - start, 3),
+            calibrate_s=0.0,
+            why_not=str(error),
+        )
+        raise NothingFoundError(error, (account,)) from None
+    give_back()
+    account = Attempt(
+        backend=made.backend,
+        images_registered=len(made.image_index),
+        reconstruct_s=round(reconstructed - start, 3),
+        calibrate_s=round(time.perf_counter() - reconstructed, 3),
+        why_not=None,
+    )
+    return made, replace(hand_eye, attempts=(account,), timings_s=timings_of((account,)))
 
 
 def _why_untried(

@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed
-from jcr.calibration.record import AnyCalibration, FailedCalibration, write_calibration
+from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, write_calibration
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
@@ -30,7 +30,7 @@ from jcr.depth.depth_npz import is_made_from, write_depth
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_text
 from jcr.findings import sentence
-from jcr.pipeline.selection import NothingFoundError, select_reconstruction, timings_of
+from jcr.pipeline.selection import NothingFoundError, select_published, select_reconstruction, timings_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct import candidates, device_of
 from jcr.records import Capture, ImageVerdict, Reconstruction
@@ -75,7 +75,7 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     images = [(name, capture.folder / name) for name in capture.images]
     # The mount decides which pixels are reconstructed, and which poses guide it.
     of_capture = images, capture.mount, capture.base_from_gripper, capture.intrinsics
-    facts = *of_capture, candidates(own), weights, FORMAT
+    facts = *of_capture, candidates(own), weights, FORMAT, options.method
     made = {"reconstruct": fingerprint(facts, own, __version__)}
     state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
     return RunResult(out, capture=capture, state=state)
@@ -86,7 +86,7 @@ def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunRes
 
     The times (s) of the stages after the calibration are added to `timings_s` of the calibration.
     """
-    unneeded = set() if result.others else {"cameras"}
+    unneeded = set() if has_cameras(result) else {"cameras"}
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):
         start = time.perf_counter()
@@ -100,12 +100,17 @@ def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunRes
 
 def finished(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
     """Run the named stages, which follow the calibration; mark the run as finished in run.json; return its result."""
-    if not result.others:
+    if not has_cameras(result):
         (result.out / CAMERAS).unlink(missing_ok=True)
         result = result.with_parts(cameras=None)
     result = make(result, stages, progress)
     keep_calibration(result.out, result.calibration)
     return complete(result)
+
+
+def has_cameras(result: RunResult) -> bool:
+    """Test whether the run locates other cameras of the cell; the published method has none."""
+    return bool(result.others) and result.state.options.method == "default"
 
 
 def complete(result: RunResult) -> RunResult:
@@ -195,13 +200,17 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     try:
         keep = partial(keep_reconstruction, result)
         read = None if before is None else before.reconstruction
-        is_attempted = before is None or bool(before.state.attempts)
-        made, found = select_reconstruction(seen, options, progress, keep, read, goes_on=not is_attempted)
+        if options.method == "paper":
+            made, found = select_published(seen, options, progress, read)
+        else:
+            is_attempted = before is None or bool(before.state.attempts)
+            made, found = select_reconstruction(seen, options, progress, keep, read, goes_on=not is_attempted)
     except NothingFoundError as error:
         if not is_same(out):
             forget_reconstruction(out)
         tried = error.attempts
         content = FailedCalibration(
+            method=options.method,
             mount=capture.mount,
             backend=tried[-1].backend,
             images=tuple(
@@ -246,9 +255,9 @@ def forget_reconstruction(out: Path) -> None:
 
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     """Add attempts, notes and a proposed board to the calibration; write calibration.json and log.txt."""
-    capture, reconstruction, content = result.capture, result.reconstruction, result.found
+    capture, reconstruction, content = result.capture, result.reconstruction, result.solved
     if capture.mount == "base":
-        content = refined(capture, reconstruction, content, result.state.options.calibrate)
+        content = refined(capture, reconstruction, result.found, result.state.options.calibrate)
     notes = (*capture.notes, *reconstruction.notes)
     content = replace(content, attempts=result.state.attempts, notes=notes)
     if content.verdict == "rejected" or content.short is not None:
@@ -315,13 +324,15 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added import extend
     from jcr.depth.measured import with_measured_depth
+    from jcr.paper.fields import published_scene
     from jcr.scene.build import build_scene
     from jcr.scene.cloud import point_cloud
+    from jcr.scene.uncertainty import map_uncertainty
     from jcr.segments.measure import measure_objects
     from jcr.segments.segments import image_labels, label_cloud
     from jcr.segments.tabletop import fit_support
 
-    options, capture, hand_eye, added = result.state.options, result.capture, result.found, result.added
+    options, capture, hand_eye, added = result.state.options, result.capture, result.solved, result.added
     assert options.map is not None  # `make` leaves this stage out otherwise
     made = result.reconstruction
     if len(added):
@@ -344,7 +355,11 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     give_back()
     with ThreadPoolExecutor(1) as beside:
         sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std, support)
-        scene = build_scene(cloud, options.map, progress, device=device_of(options.reconstruct))
+        is_published = "paper" in (options.method, options.map.preset)
+        build = published_scene if is_published else build_scene
+        scene = build(cloud, options.map, progress, device=device_of(options.reconstruct))
+        if isinstance(hand_eye, Calibration):
+            scene.set_uncertainty(map_uncertainty(scene, cloud, hand_eye))
         measured = None if sizes is None else sizes.result()
     write_cloud(result.out / CLOUD, cloud)
     scene.save(result.out / MAP)

@@ -68,7 +68,9 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     not in the run, or a pixel without a surface.
     """
     points = Path(points)
-    calibration, capture, reconstruction = RunResult(out).of_wrist_camera()
+    run = RunResult(out)
+    _, capture, reconstruction = run.of_wrist_camera()
+    calibration = run.found
     images, numbers = _read(points)
     base_from_recon, count = calibration.base_from_recon, len(images)
     row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}

@@ -93,7 +93,8 @@ def verify_run(
         new = read_capture(new, at_least=1)
     new = require_decided(new)
     run = RunResult(out)
-    calibration, capture, reconstruction = run.of_wrist_camera()
+    _, capture, reconstruction = run.of_wrist_camera()
+    calibration = run.found
     if not calibration.converged:
         raise InputError(
             f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
@@ -156,7 +157,8 @@ def _in_old_scene(
     `located` maps indices of images in `new` to these poses (recon frame); `notes` are warnings about new images without
     one. The poses of the calibration are fitted again for their joint covariance, which calibration.json lacks.
     """
-    calibration, capture, reconstruction = run.of_wrist_camera()
+    _, capture, reconstruction = run.of_wrist_camera()
+    calibration = run.found
     calibrate_options, rows = run.state.options.calibrate, list(located)
     is_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
     used = reconstruction.image_index[is_used]

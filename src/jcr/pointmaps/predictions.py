@@ -11,7 +11,13 @@ from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, require_rigid
 from jcr.pointmaps.grid import ImageGrid, PreparedImages, image_grid, read_colors
-from jcr.pointmaps.pairs import camera_of_arrays, check_arrays, pairs_from_arrays, read_arrays
+from jcr.pointmaps.pairs import (
+    PairPredictions,
+    camera_of_arrays,
+    check_arrays,
+    pairs_from_arrays,
+    read_arrays,
+)
 from jcr.pointmaps.posed import PosedPointmaps, fit_pinhole
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
@@ -23,21 +29,18 @@ LARGEST_MISFIT = 0.02
 """Largest median distance of projections from their pixels, as a share of the width; beyond it poses are wrong."""
 
 
-def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_predictions(
+    capture: Capture, path: Path, progress: Progress | None = None, refining: bool = True
+) -> Reconstruction:
     """Return camera poses, pointmaps and tracks from the predictions in an npz file.
 
-    The file has pairwise pointmaps (pairs.ARRAYS), or camera poses and pointmaps in one frame (POINTMAPS). Raises
+    Matches of the images refine the poses, unless `refining` is False. The file has pairwise pointmaps (pairs.ARRAYS),
+    or camera poses and pointmaps in one frame (POINTMAPS). Raises
     InputError for a file that is missing, damaged, or does not fit the capture.
     """
     arrays, source = read_arrays(path), str(path)
     if "edges" in arrays:
-        predictions = pairs_from_arrays(arrays, source)
-        rows = _rows(predictions.images, predictions.image_count, capture, source)
-        rank = np.argsort(np.argsort(rows))
-        # Rows of a reconstruction ascend; the file's images are renumbered to that order.
-        predictions = replace(predictions, edges=rank[predictions.edges], images=())
-        height, width = predictions.conf.shape[1:]
-        images = _images(capture, rows, arrays, (width, height), source)
+        predictions, images, rows = predicted_pairs(capture, arrays, source)
         maps = align_pairs(predictions, images, progress)
     elif "recon_from_camera" in arrays:
         check_arrays(arrays, POINTMAPS, source)
@@ -49,7 +52,23 @@ def reconstruct_predictions(capture: Capture, path: Path, progress: Progress | N
         raise InputError(
             f"{source}: holds neither 'edges' nor 'recon_from_camera' of pointmaps; see jcr docs predictions"
         )
-    return reconstruct_pointmaps(capture, images, maps, "predictions", progress, np.sort(rows))
+    return reconstruct_pointmaps(capture, images, maps, "predictions", progress, np.sort(rows), refining)
+
+
+def predicted_pairs(
+    capture: Capture, arrays: dict[str, ndarray], source: str
+) -> tuple[PairPredictions, PreparedImages, Int[ndarray, " m"]]:
+    """Return the pairs of a file with `arrays`, the images on their grid, and the row of each in the capture.
+
+    The images are renumbered in the order of the capture. `source` is the file named in messages.
+    """
+    predictions = pairs_from_arrays(arrays, source)
+    rows = _rows(predictions.images, predictions.image_count, capture, source)
+    rank = np.argsort(np.argsort(rows))
+    # Rows of a reconstruction ascend; the file's images are renumbered to that order.
+    predictions = replace(predictions, edges=rank[predictions.edges], images=())
+    height, width = predictions.conf.shape[1:]
+    return predictions, _images(capture, rows, arrays, (width, height), source), np.sort(rows)
 
 
 def _posed_pointmaps(

@@ -65,12 +65,13 @@ def reconstruct_pointmaps(
     backend: str,
     progress: Progress | None = None,
     image_index: Int[ndarray, " m"] | None = None,
+    refining: bool = True,
 ) -> Reconstruction:
     """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps and matches.
 
     `images` has colours on the grid of `maps`; `backend` is the name in the result. If the images have too few matches
-    (`refine`), the predicted cameras are kept, and their covariance is in `evidence`. Raises InputError where the
-    points fit no pinhole camera.
+    (`refine`), or without `refining`, the predicted cameras are kept, and their covariance is in `evidence`. Raises
+    InputError where the points fit no pinhole camera.
     """
     report = progress or silent
     rows = np.arange(len(capture)) if image_index is None else image_index
@@ -80,13 +81,13 @@ def reconstruct_pointmaps(
     if (pinhole := images.pinhole or predicted) is None:
         raise InputError(f"--backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
     maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
-    refined = refine(part, images, maps, pinhole, report)
+    refined = refine(part, images, maps, pinhole, report) if refining else None
     if refined is None:
         intrinsics = images.intrinsics_of_capture or pinhole
         covariance = published_covariance(maps) if maps.covariance is None else maps.covariance
         tracks, evidence = NO_TRACKS, CameraEvidence(maps.recon_from_camera, covariance)
-        note = "too few matches between the images: the cameras are as predicted"
-        if images.pinhole is None:
+        note = "too few matches between the images: the cameras are as predicted" if refining else ""
+        if images.pinhole is None and refining:
             maps = replace(maps, warnings=(*maps.warnings, UNCONFIRMED))
     else:
         (made, maps), evidence = refined, None
@@ -109,7 +110,7 @@ def reconstruct_pointmaps(
         tracks=tracks,
         backend=backend,
         is_metric=maps.is_metric,
-        notes=(*maps.notes, note),
+        notes=(*maps.notes, *filter(None, [note])),
         warnings=(*images.warnings, *maps.warnings),
         evidence=evidence,
         predicted_focal=None if refined or predicted is None else (predicted.fx, FOCAL_STD),

@@ -224,8 +224,8 @@ class PointCloud:
     points_in_base: Float[ndarray, "n 3"]
     color: UInt8[ndarray, "n 3"]
     confidence: Float[ndarray, " n"]
-    margin: Float[ndarray, " n"]
-    """Standard deviation of each point's position due to the calibration (m)."""
+    margin: Float[ndarray, " n"] | None
+    """Standard deviation of each point's position due to the calibration (m); None: the calibration states none."""
     label: Int[ndarray, " n"]
     """Index of each point's segment in `label_names`; 0: no segment."""
     image: Int[ndarray, " n"]

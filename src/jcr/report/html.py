@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 
-from jcr.calibration.record import FailedCalibration
+from jcr.calibration.record import FailedCalibration, PublishedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.errors import printable
 from jcr.records import Capture
@@ -51,7 +51,7 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
         given = "given" if capture.intrinsics is not None else "estimated"
         about = f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
-    has_images = isinstance(capture, Capture)
+    has_images, is_published = isinstance(capture, Capture), isinstance(calibration, PublishedCalibration)
     is_wrist, scene = has_images and capture.mount != "base", result.scene if has_images else None
     measured, sections = None if scene is None else result.measured, dict[str, Content | None]()
     if isinstance(calibration, FailedCalibration):
@@ -59,12 +59,14 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     else:
         sections |= head(calibration)
         sections |= {
-            "transform": transform_section(result.found),
+            "transform": transform_section(result.solved),
             "view": scene_section(result) if is_wrist else None,
             "images": images_section(capture, result) if has_images else None,
             "cameras": cameras_section(result.cameras) if has_images and result.cameras is not None else None,
-            "residuals": residuals_section(result),
-            "uncertainty": motion_section(result) if is_wrist or not has_images else None,
+            "residuals": None if is_published else residuals_section(result),
+            "uncertainty": motion_section(result)
+            if not is_published and (is_wrist or not has_images)
+            else None,
             "objects": None
             if scene is None or measured is None
             else objects_section(measured, scene.label_names),

@@ -28,7 +28,7 @@ PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
 
 def scene_section(result: RunResult) -> Content:
     """Return the section of the 3D view: its data (cameras, grippers, points), check boxes, and legend of labels."""
-    calibration, reconstruction = result.found, result.reconstruction
+    calibration, reconstruction = result.solved, result.reconstruction
     base_from_recon = calibration.base_from_recon
     base_from_camera = base_from_recon.rigid @ scale_translation(
         reconstruction.recon_from_camera, base_from_recon.scale

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.camera import unproject, without_distortion
 from jcr.export.ros import (
     BASE,
@@ -34,20 +34,26 @@ FLANGE_M = 0.0315
 """Radius (m) of the drawn flange: ISO 9409-1-50."""
 
 
-def transform_section(hand_eye: Calibration) -> Content:
+def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
     """Return the section on the result: the transform in all notations, with covariance and a sketch of the camera.
 
-    The transform is gripper_from_camera or, for a fixed camera, base_from_camera.
+    The transform is gripper_from_camera or, for a fixed camera, base_from_camera. The published method has no
+    covariance.
     """
-    x, mount, std = hand_eye.parent_from_camera, hand_eye.mount, hand_eye.uncertainty.std
+    x, mount, covariance = hand_eye.parent_from_camera, hand_eye.mount, None
+    if isinstance(hand_eye, Calibration):
+        covariance = hand_eye.covariance
     parent = PARENT if mount == "gripper" else BASE
     rotation = Rotation.from_matrix(x[:3, :3])
     rpy, order = roll_pitch_yaw(x[:3, :3]), list(COVARIANCE_ORDER)
     angles = ("roll", "pitch", "yaw")
-    along = ", ".join(significant(1e3 * value) for value in std[:3])
-    about = ", ".join(significant(value) for value in np.degrees(std[3:6]))
+    along, about = "± unknown", "± unknown"
+    if covariance is not None:
+        std = np.sqrt(np.diag(covariance))
+        along = f"±{', '.join(significant(1e3 * value) for value in std[:3])} mm"
+        about = f"±{', '.join(significant(value) for value in np.degrees(std[3:6]))}°"
     notations = [
-        ("Translation (m)", "xyz", x[:3, 3], f"±{along} mm"),
+        ("Translation (m)", "xyz", x[:3, 3], along),
         ("Quaternion", "xyzw", rotation.as_quat(canonical=True), "x, y, z, w: the scalar last"),
         ("Roll, pitch, yaw (rad)", angles, rpy, FIXED_AXES),
         ("Roll, pitch, yaw (deg)", angles, np.degrees(rpy), FIXED_AXES),
@@ -64,7 +70,7 @@ def transform_section(hand_eye: Calibration) -> Content:
         "rejected": not hand_eye.converged,
         "matrix": "\n".join("".join(f"{value:>10.6f}" for value in row) for row in x[:3]),
         "copied_matrix": "[" + ",\n ".join(json.dumps(row) for row in x.tolist()) + "]",
-        "along": f"±{along} mm",
+        "along": along,
         "about": about,
         "notations": [
             {
@@ -77,8 +83,12 @@ def transform_section(hand_eye: Calibration) -> Content:
         ],
         "ros": static_transform_publisher(mounted),
         "urdf": urdf_origin(x),
-        "covariance": "\n".join(" ".join(f"{value:>10.2e}" for value in row) for row in hand_eye.covariance),
-        "copied_covariance": json.dumps({"order": order, "covariance": hand_eye.covariance.tolist()}),
+        "covariance": None
+        if covariance is None
+        else "\n".join(" ".join(f"{value:>10.2e}" for value in row) for row in covariance),
+        "copied_covariance": ""
+        if covariance is None
+        else json.dumps({"order": order, "covariance": covariance.tolist()}),
         "order": order,
         "camera_info": None if hand_eye.intrinsics is None else camera_info(mounted),
     }

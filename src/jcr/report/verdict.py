@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from jcr.calibration.record import AnyCalibration, Calibration
+from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.calibration.words import leave_one_out_text, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
 from jcr.report.render import Content
@@ -50,6 +50,11 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     else:
         reason = "nothing contradicts it" if required is None else reached_in_words(required)
     evidence = _leave_one_out(calibration)
+    if isinstance(calibration, PublishedCalibration):
+        reason, evidence = (
+            text(calibration.findings[0]),
+            "Small residuals do not prove accuracy: X is on both sides.",
+        )
     if isinstance(calibration, Calibration):
         worst = worst_direction(calibration)
         evidence += f" Largest uncertainty of the translation: {worst} (1 σ)."
@@ -93,9 +98,15 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     elif uncertainty is not None:
         degrees = significant(max(uncertainty.rotation_std_deg))
         yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", True
+    if isinstance(calibration, PublishedCalibration):
+        found = calibration.residuals
+        yield "Residual δt", f"{significant(1e3 * found.translation)} mm", "paper, eq. 16", True
+        yield "Residual δR", significant(found.rotation), "paper, eq. 16; Frobenius norm", True
     used, count = calibration.images_used, len(calibration.images)
     yield "Images used", f"{used} of {count}", f"{count - used} rejected" if used < count else "", True
-    if uncertainty is not None and calibration.scale is not None:
+    if isinstance(calibration, PublishedCalibration):
+        yield "Scale", f"{calibration.scale:.4g}", "m per unit of the reconstruction", True
+    elif uncertainty is not None and calibration.scale is not None:
         percent = significant(uncertainty.scale_std_percent)
         yield (
             "Scale",

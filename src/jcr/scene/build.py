@@ -7,13 +7,14 @@ from functools import partial
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy import ndarray
 from threadpoolctl import threadpool_limits
 
 from jcr.progress import Progress, silent
 from jcr.records import PointCloud
 from jcr.scene.fields import Field, Fields, Lattice
 from jcr.scene.options import MapOptions
-from jcr.scene.paper import train_paper
 from jcr.scene.scene_map import SceneMap
 from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
 from jcr.scene.train import NEAR, rows_inside, train, workspace_box, workspace_rays
@@ -33,42 +34,50 @@ def build_scene(
 ) -> SceneMap:
     """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
 
-    Raises InputError if fewer than 100 points lie in the workspace. `device` is a torch device, such as "cuda".
+    The networks are those of the preset "default". Raises InputError if fewer than 100 points lie in the workspace.
+    `device` is a torch device, such as "cuda".
     """
     options = options or MapOptions()
+    assert options.preset == "default", "paper.fields.published_scene trains the published networks"
+    report, start = progress or silent, time.perf_counter()
+    with threads_of_one_core(torch.device(device)) as pool:
+        seen, cell, box = carved_workspace(cloud, options, report, device)
+        carved = time.perf_counter()
+        rays = workspace_rays(cloud, box, cell, device)
+        heads = {"color": 3} | ({"label": len(cloud.label_names)} if "label" in rays.targets else {})
+        lattices, generator = feature_lattices(seen), torch.Generator().manual_seed(options.map_seed)
+        occupancy, surface = (
+            Field(own, HIDDEN, seen.box, lattices, grids=grids, generator=generator)
+            for own, grids in (({"occupancy": 1}, OCCUPANCY_GRIDS), (heads, SURFACE_GRIDS))
+        )
+        fields = Fields([occupancy, surface], lattices).to(device)
+
+        def fit(field: Field) -> int:
+            """Train the network `field` on the rays of the cloud, and return the number of training steps."""
+            stage = f"map: {', '.join(field.heads)}"
+            return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
+
+        steps = " + ".join(map(str, pool.map(fit, fields.of)))
+    history = {"preset": "default", "carving_s": f"{carved - start:.3f}", "steps": steps}
+    history["training_s"] = f"{time.perf_counter() - carved:.3f}"
+    return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+
+
+def carved_workspace(
+    cloud: PointCloud, options: MapOptions, progress: Progress | None, device: str
+) -> tuple[SeenGrid, float, Float[ndarray, "2 3"]]:
+    """Return the grid of seen space of a cloud, the side (m) of a map cell, and the corners (m) of the workspace.
+
+    Raises InputError if fewer than 100 points lie in the workspace.
+    """
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
     rows_inside(cloud, box)
-    report, start = progress or silent, time.perf_counter()
-    with threads_of_one_core(torch.device(device)) as pool:
-        report("what was seen", 0.0)
-        # All points are used, because rays that end outside of the workspace may cross it.
-        ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
-        seen = carve(*ends, box, cell / 2, cloud.cleared, device)
-        carved = time.perf_counter()
-        history = {"preset": options.preset, "carving_s": f"{carved - start:.3f}"}
-        if options.preset == "paper":
-            learnt = train_paper(cloud, seed=options.map_seed, box=box, max_seconds=options.max_seconds)
-            fields = Fields(list(learnt.values())).to(device)
-        else:
-            rays = workspace_rays(cloud, box, cell, device)
-            heads = {"color": 3} | ({"label": len(cloud.label_names)} if "label" in rays.targets else {})
-            lattices, generator = feature_lattices(seen), torch.Generator().manual_seed(options.map_seed)
-            occupancy, surface = (
-                Field(own, HIDDEN, seen.box, lattices, grids=grids, generator=generator)
-                for own, grids in (({"occupancy": 1}, OCCUPANCY_GRIDS), (heads, SURFACE_GRIDS))
-            )
-            fields = Fields([occupancy, surface], lattices).to(device)
-
-            def fit(field: Field) -> int:
-                """Train the network `field` on the rays of the cloud, and return the number of training steps."""
-                stage = f"map: {', '.join(field.heads)}"
-                return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
-
-            history["steps"] = " + ".join(map(str, pool.map(fit, fields.of)))
-        history["training_s"] = f"{time.perf_counter() - carved:.3f}"
-    return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+    (progress or silent)("what was seen", 0.0)
+    # All points are used, because rays that end outside of the workspace may cross it.
+    ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
+    return carve(*ends, box, cell / 2, cloud.cleared, device), cell, box
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

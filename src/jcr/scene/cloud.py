@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, UInt8
 from numpy import ndarray
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_bytes
 from jcr.geometry import apply, by_similarity, inverse, scale_translation
@@ -22,7 +22,8 @@ _COLUMNS = {
     **dict.fromkeys(("red", "green", "blue"), "u1"),
     **{"label": "i4", "confidence": "f4", "margin": "f4", "image": "i4", "reason": "u1", "depth_std": "f4"},
 }
-"""Properties of a point in the PLY file and their types; `reason` and `depth_std` are written only if they are known."""
+"""Properties of a point in the PLY file and their types; `margin`, `reason` and `depth_std` are written only if they are
+known."""
 _AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
 """Type in a PointCloud of each type in the file."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
@@ -36,7 +37,7 @@ _FIRST = "comment jcr cloud in the base frame, metres"
 def point_cloud(
     capture: Capture,
     reconstruction: Reconstruction,
-    hand_eye: Calibration,
+    hand_eye: Calibration | PublishedCalibration,
     labels: Integer[ndarray, "m h w"] | None = None,
     options: CloudOptions | None = None,
     label_names: tuple[str, ...] = ("none",),
@@ -45,6 +46,7 @@ def point_cloud(
 
     `options` set the percentile of the least confidence, and the largest number of points. `labels` (m,h,w) are indices
     into `label_names`, 0 = none, at the pixels of the m registered images' depth. None gives label 0 to all points.
+    A calibration by the published method gives no std of the points.
     Raises InputError if no point has enough confidence.
     """
     options = options or CloudOptions()
@@ -75,7 +77,9 @@ def point_cloud(
         points_in_base=hand_eye.base_from_recon(x_in_recon),
         color=dense.colors.reshape(-1, 3)[pixel],
         confidence=confident,
-        margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),
+        margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon)
+        if isinstance(hand_eye, Calibration)
+        else None,
         label=np.zeros(len(pixel), int) if labels is None else labels.reshape(-1)[pixel].astype(int),
         image=image,
         camera_centers_in_base=apply(hand_eye.base_from_recon.rigid, recon_from_camera[:, :3, 3]),
@@ -171,7 +175,11 @@ def read_cloud(path: Path) -> PointCloud:
             f"element vertex {len(vertices)}",
             *(f"property {_PLY_TYPES[_COLUMNS[name]]} {name}" for name in names),
         ]
-        if own != ["ply", _LAYOUT, *elements] or _FIRST not in lines or len(names) < len(_COLUMNS) - 2:
+        if (
+            own != ["ply", _LAYOUT, *elements]
+            or _FIRST not in lines
+            or {*names, "margin", "reason", "depth_std"} != _COLUMNS.keys()
+        ):
             raise ValueError  # cut between two points, or of another writer
         words = [line.split(maxsplit=3) for line in lines]
         cameras, labels = (
@@ -183,6 +191,7 @@ def read_cloud(path: Path) -> PointCloud:
         return PointCloud(
             points_in_base=np.stack([columns.pop(name) for name in "xyz"], 1),
             color=np.stack([columns.pop(name) for name in ("red", "green", "blue")], 1),
+            margin=columns.pop("margin", None),
             camera_centers_in_base=np.array(centers, np.float64).reshape(-1, 3),
             label_names=tuple(name for _, name in labels),
             **columns,

@@ -18,6 +18,9 @@ BISECTIONS = 5
 IsSolid = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]
 """Function that tests which points (n,3) m of the base frame are in solid space."""
 
+SurfaceStd = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
+"""Function that returns the standard deviation (m) of surface points (m, base frame) along unit normals."""
+
 
 @dataclass(frozen=True)
 class DistanceGrid:
@@ -31,6 +34,8 @@ class DistanceGrid:
     """Signed distance (m) at the nodes."""
     gradients: Float[Tensor, "4 nz ny nx"]
     """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
+    std: Float[Tensor, "nz ny nx"] | None = None
+    """Standard deviation (m) of the nearest surface along the gradient; None: unknown."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
         """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
@@ -39,27 +44,27 @@ class DistanceGrid:
         """
         return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
 
-    def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Return the signed distance (n,) m at points (n,3) m of the base frame, interpolated trilinearly.
-
-        A point outside of the grid has the value of the nearest point on its border.
-        """
-        return interpolate_grid(self.nodes[None], self.lower, self.cell, x_in_base)[0]
-
 
 def distance_grid(
-    lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], is_solid: IsSolid, closed: bool
+    lower: Float[Tensor, "3"],
+    cell: float,
+    shape: tuple[int, int, int],
+    is_solid: IsSolid,
+    closed: bool,
+    surface_std: SurfaceStd | None = None,
 ) -> DistanceGrid:
     """Return the signed distances (m) of grid nodes from the boundary of solid space, negative inside.
 
     The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m, base frame) on. `is_solid`
     returns the mask of the points (n,3) m that are in solid space. If `closed`, space outside of the grid is solid.
     Nodes next to the boundary have an interpolated boundary point; every other node takes that of the nearest such
-    node. Without any boundary, the distance is the grid's diagonal.
+    node. Without any boundary, the distance is the grid's diagonal. Every node has the standard deviation
+    `surface_std` of its boundary point.
     """
     node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
     offset, beside = _boundary(lower, cell, solid, is_solid)
+    row = None
     if not beside.any():
         distance = np.full(shape, float(np.linalg.norm(shape)) * cell, np.float32)
     else:
@@ -77,9 +82,19 @@ def distance_grid(
             wall = cell * np.minimum(np.arange(n), np.arange(n)[::-1]).astype(np.float32)
             distance = np.minimum(distance, wall.reshape([-1 if a == axis else 1 for a in range(3)]))
     dz, dy, dx = np.gradient(distance, cell)
+    std = None
+    if surface_std is not None:
+        spread = np.zeros(shape, np.float32)
+        if row is not None:
+            at, normal = np.argwhere(beside), np.stack([one[beside] for one in (dx, dy, dz)], 1)
+            x = lower.cpu().numpy() + cell * (at + offset[:, beside].T)[:, ::-1]
+            spread[beside] = surface_std(
+                x, normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-6)[:, None]
+            )
+        std = torch.as_tensor(spread if row is None else spread.take(row), device=lower.device)
     nodes = torch.as_tensor(distance, device=lower.device)
     gradients = torch.as_tensor(np.stack([distance, dx, dy, dz], -1), device=lower.device)
-    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2))
+    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2), std)
 
 
 def _boundary(

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from jcr.errors import InputError, first_fault
 from jcr.extras import extra
-from jcr.records.json_fields import Positive
+from jcr.records.json_fields import Positive, Spread
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,6 +51,16 @@ class NetworkHeader(BaseModel):
         return self
 
 
+class UncertaintyHeader(BaseModel):
+    """Fields of the map's uncertainty (scene.uncertainty.MapUncertainty) that are no arrays."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    order: tuple[str, ...]
+    shape_m: Spread
+    look_std_m: Spread
+    block_m: Positive
+
+
 class MapHeader(BaseModel):
     """Header of a map file, in JSON: its networks and grids, label names, cell size (m), and how it was made."""
 
@@ -61,6 +71,7 @@ class MapHeader(BaseModel):
     label_names: tuple[str, ...]
     cell: Positive
     history: dict[str, str]
+    uncertainty: UncertaintyHeader | None
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
@@ -103,6 +114,7 @@ def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
     from jcr.scene.fields import Field, Fields
     from jcr.scene.scene_map import SceneMap
     from jcr.scene.seen import SeenGrid
+    from jcr.scene.uncertainty import MapUncertainty
 
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
@@ -117,11 +129,21 @@ def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
         raise ValueError(f"{heads.get('label')} labels with {len(about.label_names)} names")
     lattices = _lattices_of(about, seen, tensors)
     fields = Fields([Field(**dict(of), box=seen.box, lattices=lattices) for of in about.networks], lattices)
+    uncertainty = None
+    if about.uncertainty is not None:
+        own = {
+            name.removeprefix("uncertainty."): value
+            for name, value in tensors.items()
+            if name.startswith("uncertainty.")
+        }
+        uncertainty = MapUncertainty(
+            **dict(about.uncertainty), **{name: value.numpy() for name, value in own.items()}
+        )
     state = {
         name.removeprefix("fields."): value for name, value in tensors.items() if name.startswith("fields.")
     }
     fields.load_state_dict(state)
-    return SceneMap(fields, seen, about.label_names, about.history)
+    return SceneMap(fields, seen, about.label_names, about.history, uncertainty)
 
 
 def _lattices_of(about: "MapHeader", seen: "SeenGrid", tensors: "dict[str, Tensor]") -> "list[Lattice]":

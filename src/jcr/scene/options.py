@@ -24,7 +24,9 @@ class MapOptions:
 
     preset: Literal["default", "paper"] = "default"
     """default: feature grids, free space learnt along the rays; paper: the published networks and their training, with
-    uniform negatives (scene/paper.py), slower and coarser."""
+    uniform negatives (jcr.paper.fields), slower and coarser."""
+    steps: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 1000
+    """Number of training steps of the preset paper; the default preset stops on a plateau."""
     workspace: Annotated[
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),

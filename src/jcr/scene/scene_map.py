@@ -4,7 +4,7 @@ import copy
 import json
 import threading
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -15,13 +15,15 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from numpy.typing import ArrayLike
 from safetensors.torch import save
+from scipy.special import ndtri
 from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.scene.distance import DistanceGrid, distance_grid
-from jcr.scene.fields import Fields, in_chunks
+from jcr.scene.fields import Fields, in_chunks, interpolate_grid
 from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
+from jcr.scene.uncertainty import MapUncertainty
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 """Results of the checks with `unknown="report"`."""
@@ -50,7 +52,10 @@ class Sample:
 
     @property
     def occupancy(self) -> Any:
-        """Probability (n,) of solid space; in unseen space 1, 0 or 0.5 for unknown = "occupied", "free", "report"."""
+        """Probability (n,) of solid space; in unseen space 1, 0 or 0.5 for unknown = "occupied", "free", "report".
+
+        Published networks give their own output everywhere.
+        """
         return self._occupancy_unknown[0]
 
     @property
@@ -72,10 +77,22 @@ class Sample:
         return self._distance_gradient[1]
 
     @cached_property
+    def std(self) -> Any:
+        """Standard deviation (n,) m of the nearest surface's position along `gradient`, by calibration and depth.
+
+        NaN outside of the workspace, and for a map whose calibration states no uncertainty.
+        """
+        grid = self._map.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
+        std = torch.full_like(grid.nodes, torch.nan) if grid.std is None else grid.std
+        return self._inside(lambda x: interpolate_grid(std[None], grid.lower, grid.cell, x).T)[:, 0]
+
+    @cached_property
     def color(self) -> Any:
         """RGB (n,3) in [0, 1] of the colour field, valid at surfaces; NaN outside of the workspace."""
         fields = self._map.fields
-        return self._inside(lambda x: fields(x, ("color",))["color"].clamp(0.0, 1.0))
+        return self._inside(
+            lambda x: fields(x, ("color",))["color"].clamp(0.0, 1.0), everywhere=self._map.is_published
+        )
 
     @cached_property
     def label(self) -> Any:
@@ -86,7 +103,8 @@ class Sample:
             """Return the label of each point (n,), 0 in unseen space."""
             if "label" not in scene.properties:
                 return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
-            return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
+            found = scene.fields(x, ("label",))["label"].argmax(1)
+            return (found if scene.is_published else torch.where(scene.seen.at(x) > 0, found, 0),)
 
         return self._answers(label)[0]
 
@@ -98,6 +116,9 @@ class Sample:
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
             """Return occupancy (n,), and the mask (n,) of unknown points."""
             state = self._map.seen.at(x)
+            if self._map.is_published:
+                occupancy = self._map.fields(x, ("occupancy",))["occupancy"][:, 0].sigmoid()
+                return occupancy, ((state & CROSSED) == 0) & ((state == 0) | (occupancy < 0.5))
             # The field is evaluated at seen points only, because most of a workspace is unseen.
             unknown = state == 0
             occupancy = torch.where(unknown, unseen, 0.0)
@@ -120,9 +141,11 @@ class Sample:
         )
         return answer[:, 0], answer[:, 1:]
 
-    def _inside(self, ask: Callable[[Tensor], Tensor]) -> Any:
-        """Return the result (n,d) of the function `ask` at the query's points, NaN outside of the workspace."""
+    def _inside(self, ask: Callable[[Tensor], Tensor], everywhere: bool = False) -> Any:
+        """Return the result (n,d) of `ask` at the query's points, NaN outside of the workspace unless `everywhere`."""
         inside = self._map.seen.index
+        if everywhere:
+            return self._answers(lambda x: (ask(x),))[0]
         return self._answers(lambda x: (torch.where(inside(x)[1][:, None], ask(x), torch.nan),))[0]
 
     def _answers(self, ask: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Any, ...]:
@@ -146,11 +169,15 @@ class SceneMap:
         seen: SeenGrid,
         label_names: tuple[str, ...],
         history: dict[str, str] | None = None,
+        uncertainty: MapUncertainty | None = None,
     ) -> None:
         """Create a map from trained networks (`fields`) and the grid of seen space.
 
-        `label_names` are the names of the labels, 0 = none; `history` are notes on how the map was made.
+        `label_names` are the names of the labels, 0 = none; `history` are notes on how the map was made. `uncertainty`
+        is None for a map whose calibration states none.
         """
+        self.uncertainty = uncertainty
+        """Covariance of the calibration and standard deviation of the depth; None: unknown."""
         self.fields, self.seen, self.label_names = fields.requires_grad_(False).eval(), seen, label_names
         self.history = history or {}
         """Facts about the training, as texts: preset, steps and seconds."""
@@ -161,6 +188,23 @@ class SceneMap:
                 field.expand()
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
+
+    @property
+    def is_published(self) -> bool:
+        """Whether the networks are the published ones, whose queries are the networks' outputs everywhere."""
+        return any(len(field.frequency) for field in self.fields.of)
+
+    @cached_property
+    def margin_95(self) -> float:
+        """Distance (m) by which 95 % of the surface's errors towards free space are exceeded at most; NaN if unknown.
+
+        It is 1.645 times the 95 % quantile of the standard deviation over the nodes within a cell of seen surfaces.
+        """
+        grid = self.distance_grid("free")
+        if grid.std is None:
+            return float("nan")
+        std = grid.std[grid.nodes.abs() < self.cell]
+        return float(ndtri(0.95) * np.quantile(std.cpu().numpy(), 0.95)) if len(std) else 0.0
 
     @property
     def box(self) -> Float[ndarray, "2 3"]:
@@ -178,7 +222,13 @@ class SceneMap:
     def to(self, device: str) -> "SceneMap":
         """Return a copy of the map on a device, e.g. "cuda", which then computes the queries."""
         seen = SeenGrid(self.seen.lower.to(device), self.seen.cell, self.seen.state.to(device))
-        return SceneMap(copy.deepcopy(self.fields).to(device), seen, self.label_names, self.history)
+        fields = copy.deepcopy(self.fields).to(device)
+        return SceneMap(fields, seen, self.label_names, self.history, self.uncertainty)
+
+    def set_uncertainty(self, uncertainty: MapUncertainty) -> None:
+        """Set the uncertainty of calibration and depth, which is computed from queries of the map itself."""
+        self.uncertainty = uncertainty
+        self._distance.clear()
 
     def query(self, x_in_base: ArrayLike | Float[Tensor, "n 3"], unknown: Unknown = "report") -> Sample:
         """Query the map at points (n,3) m of the base frame; for tensors the results are differentiable tensors.
@@ -191,15 +241,52 @@ class SceneMap:
         return Sample(self, x, unknown=unknown, tensors=tensors)
 
     def check_spheres(
-        self, centers_in_base: ArrayLike, radii: ArrayLike | float, unknown: Unknown = "occupied"
-    ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
+        self,
+        centers_in_base: ArrayLike,
+        radii: ArrayLike | float,
+        unknown: Unknown = "occupied",
+        *,
+        confidence: float | None = None,
+        probability: bool = False,
+        center_std: float = 0.0,
+    ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"] | Float[ndarray, "*batch"]:
         """Test whether spheres collide: centres (…,3) m in the base frame, radii (m) that broadcast to (…).
 
         A sphere collides if the signed distance of its centre is less than its radius. With `unknown` "occupied", a
         sphere that reaches unseen space, or whose centre leaves the workspace, collides; with "free", only seen
-        surfaces count. With "report", the result is FREE, OCCUPIED or UNKNOWN (0, 1, 2) instead of booleans. Raises
-        InputError for a wrong shape, a value that is not finite or a negative radius.
+        surfaces count. With "report", the result is FREE, OCCUPIED or UNKNOWN (0, 1, 2) instead of booleans.
+
+        With `confidence`, such as 0.95, a sphere collides unless it is free with that probability: the distance is
+        reduced by a quantile of the surface's error along the gradient (`Sample.std`). `probability` returns the
+        probability of a collision instead. `center_std` is the standard deviation (m) of the spheres' own positions,
+        such as `uncertainty.look_std_m` for something that the robot located by another image. Raises InputError for a
+        wrong shape, a value that is not finite, a negative radius, and if the map has no uncertainty.
         """
+        x, radius, batch = self._spheres(centers_in_base, radii, unknown)
+        quantile = None
+        if probability or confidence is not None:
+            quantile = self._quantile(0.5 if confidence is None else confidence)
+        if probability and unknown == "report":
+            raise InputError("probability: give unknown as occupied or free, which decide what collides")
+        ask = partial(self._touches, x, radius, quantile=quantile, center_std=center_std)
+        if unknown != "report":
+            return ask(unknown, probability=probability).cpu().numpy().reshape(batch)
+        surface, any_ = ask("free"), ask("occupied")
+        state = torch.where(surface, OCCUPIED, torch.where(any_, UNKNOWN, FREE)).to(torch.uint8)
+        return state.cpu().numpy().reshape(batch)
+
+    def _quantile(self, confidence: float) -> float:
+        """Return the quantile of the standard normal distribution; raise InputError if it or the std is undefined."""
+        if self.uncertainty is None:
+            raise InputError("confidence: the map has no uncertainty, since its calibration states none")
+        if not 0 < confidence < 1:
+            raise InputError(f"confidence {confidence}: give a probability between 0 and 1, such as 0.95")
+        return float(ndtri(confidence))
+
+    def _spheres(
+        self, centers_in_base: ArrayLike, radii: ArrayLike | float, unknown: str
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], tuple[int, ...]]:
+        """Return centres and radii (m) as tensors, and the shape of the result; raise InputError as `check_spheres`."""
         centers = np.asarray(centers_in_base)
         if centers.ndim == 0 or centers.shape[-1] != 3:
             raise InputError(f"sphere centres: expected shape (…, 3) in metres, got {centers.shape}")
@@ -211,31 +298,46 @@ class SceneMap:
             raise InputError(f"radii: shape {np.shape(radii)} does not fit centres of {batch}") from None
         if not (np.isfinite(radius) & (radius >= 0)).all():
             raise InputError("radii: one is negative or not finite; give metres")
-        reach = torch.tensor(radius.reshape(-1), device=x.device)
-        if unknown != "report":
-            return self._touches(x, reach, unknown).cpu().numpy().reshape(batch)
-        surface, any_ = self._touches(x, reach, "free"), self._touches(x, reach, "occupied")
-        state = torch.where(surface, OCCUPIED, torch.where(any_, UNKNOWN, FREE)).to(torch.uint8)
-        return state.cpu().numpy().reshape(batch)
+        return x, torch.tensor(radius.reshape(-1), device=x.device), batch
 
     def _touches(
-        self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
-    ) -> Bool[Tensor, " n"]:
-        """Return True for each of n spheres that collides; `unknown` is "occupied" or "free", as in `check_spheres`.
+        self,
+        x: Float[Tensor, "n 3"],
+        radius: Float[Tensor, " n"],
+        unknown: str,
+        quantile: float | None = None,
+        center_std: float = 0.0,
+        probability: bool = False,
+    ) -> Bool[Tensor, " n"] | Float[Tensor, " n"]:
+        """Return True for each of n spheres that collides, or its `probability`; other arguments as in `check_spheres`.
 
-        `x` are the centres (m, base frame) and `radius` the radii (m).
+        `unknown` is "occupied" or "free", `x` are the centres (m, base frame) and `radius` the radii (m). The distances
+        are reduced by `quantile` standard deviations; None: the surface is taken as exact.
         """
         grid, (lower, upper) = self.distance_grid(unknown), self.seen.box
+        nodes = grid.nodes[None]
+        if quantile is not None and grid.std is not None:
+            nodes = torch.stack([grid.nodes, grid.std])
+            if center_std == 0 and not probability:
+                # One interpolation of the reduced distance takes half the time of two.
+                nodes, quantile = nodes[:1] - quantile * nodes[1:], None
 
         def touches(x: Tensor, radius: Tensor) -> tuple[Tensor]:
-            """Return the mask (n,) of spheres that collide."""
+            """Return the mask (n,) of spheres that collide, or their probabilities."""
             nearest = torch.clamp(x, lower, upper)
-            distance, beyond = grid.distance(nearest), (x - nearest).norm(dim=1)
-            if unknown == "occupied":
-                return ((distance < radius) | (beyond > 0),)
-            # A lower bound of the distance from outside to surfaces in the box, which is convex.
-            outside = (beyond**2 + distance.clamp(min=0) ** 2).sqrt()
-            return (torch.where(beyond > 0, outside, distance) < radius,)
+            beyond, reach, std = (x - nearest).norm(dim=1), radius, None
+            distance, *more = interpolate_grid(nodes, grid.lower, grid.cell, nearest)
+            if quantile is not None:
+                std = (more[0].square() + center_std**2).sqrt()
+                reach = radius + quantile * std
+            if unknown != "occupied":
+                # A lower bound of the distance from outside to surfaces in the box, which is convex.
+                outside = (beyond**2 + distance.clamp(min=0) ** 2).sqrt()
+                distance, beyond = torch.where(beyond > 0, outside, distance), torch.zeros_like(beyond)
+            if probability and std is not None:
+                collides = torch.special.ndtr((radius - distance) / std.clamp(min=1e-6))
+                return (torch.where(beyond > 0, 1.0, collides),)
+            return ((distance < reach) | (beyond > 0),)
 
         return in_chunks(touches, x, radius)[0]
 
@@ -244,7 +346,7 @@ class SceneMap:
 
         Unseen space counts as `unknown` says, "occupied" or "free". Within two map cells behind a seen surface the
         field is used in both cases, although no ray crossed these cells. Otherwise the surface would have no thickness,
-        and the nodes of the grid could miss it.
+        and the nodes of the grid could miss it. Of published networks the field is used everywhere.
         """
         with self._lock:
             if (known := self._distance.get(unknown)) is not None:
@@ -255,13 +357,16 @@ class SceneMap:
             def is_solid(x: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"]]:
                 """Return the mask (n,) of points that count as solid."""
                 inside = self.fields(x, ("occupancy",))["occupancy"][:, 0] >= 0
+                if self.is_published:
+                    return (inside,)
                 if unknown == "occupied":
                     return (inside | ((self.seen.at(x) & CROSSED) == 0),)
                 return (inside & ((self.seen.at(x) | behind.at(x)) != 0),)
 
             nz, ny, nx = (n // 2 + 1 for n in self.seen.state.shape)
             space = self.seen.lower, self.cell, (nz, ny, nx), lambda x: in_chunks(is_solid, x)[0]
-            self._distance[unknown] = distance_grid(*space, closed=unknown == "occupied")
+            std = None if self.uncertainty is None else self.uncertainty.surface_std
+            self._distance[unknown] = distance_grid(*space, closed=unknown == "occupied", surface_std=std)
             return self._distance[unknown]
 
     def _points(self, x: ArrayLike | Tensor, what: str, unknown: str = "free") -> Float[Tensor, "n 3"]:
@@ -289,9 +394,14 @@ class SceneMap:
             "label_names": self.label_names,
             "cell": self.seen.cell,
             "history": self.history,
+            "uncertainty": None,
         }
         tensors = {f"fields.{name}": value for name, value in self.fields.state_dict().items()}
         tensors |= {"seen": self.seen.state, "lower": self.seen.lower}
+        if self.uncertainty is not None:
+            own = vars(self.uncertainty)
+            about["uncertainty"] = {k: v for k, v in own.items() if not isinstance(v, ndarray)}
+            tensors |= {f"uncertainty.{k}": torch.tensor(v) for k, v in own.items() if isinstance(v, ndarray)}
         tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
         text = json.dumps(about)
         write_bytes(

@@ -119,7 +119,8 @@ def workspace_rays(
     confidence = cloud.confidence[inside]
     weight = np.clip(confidence / max(np.median(confidence), 1e-12), 0.25, 4.0)
     depth_std = 0.0 if cloud.depth_std is None else cloud.depth_std[inside]
-    weight /= 1.0 + (cloud.margin[inside] ** 2 + depth_std**2) / cell**2
+    margin = 0.0 if cloud.margin is None else cloud.margin[inside]
+    weight /= 1.0 + (margin**2 + depth_std**2) / cell**2
 
     def tensor(array: ndarray) -> Tensor:
         """Return an array as a float32 tensor on the training device."""

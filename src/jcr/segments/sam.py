@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch.nn import functional as F
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.hub import cached_files
@@ -77,7 +77,7 @@ def load_sam(weights: str) -> "Sam2Model":
 def sam_labels(
     model: "Sam2Model",
     reconstruction: Reconstruction,
-    hand_eye: Calibration,
+    hand_eye: Calibration | PublishedCalibration,
     progress: Progress | None = None,
 ) -> LabelImages:
     """Return label images of the registered images, on the pixel grid of the pointmaps, and label names.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt16
 from numpy import ndarray
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.camera import project, rays
 from jcr.capture.images import read_one_channel
 from jcr.errors import InputError
@@ -95,7 +95,7 @@ def _read_names(path: Path) -> dict[int, str]:
 def image_labels(
     capture: Capture,
     reconstruction: Reconstruction,
-    hand_eye: Calibration,
+    hand_eye: Calibration | PublishedCalibration,
     options: SegmentOptions,
     progress: Progress | None = None,
 ) -> LabelImages | None:

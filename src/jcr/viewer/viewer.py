@@ -395,7 +395,7 @@ class Viewer:
                 nearest = int(np.linalg.norm(cloud.points_in_base - point, axis=1).argmin())
                 image = self.calibration.images[int(self.image_index[cloud.image[nearest]])].image
                 rows.append(("measured point", f"from {image}, confidence {cloud.confidence[nearest]:.2g}"))
-                if np.isfinite(cloud.margin[nearest]):
+                if cloud.margin is not None and np.isfinite(cloud.margin[nearest]):
                     rows.append(("its margin (1 σ)", f"{1e3 * cloud.margin[nearest]:.2f} mm"))
             self.clicked.content = render("values.html", {"rows": rows}, "jcr.viewer")
             return self.clicked.content

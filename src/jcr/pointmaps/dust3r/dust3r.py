@@ -41,19 +41,33 @@ def reconstruct_dust3r(
     `weights` decide which of both networks runs, on the torch device `device`. `backend` is the name that the result
     states, "dust3r" or "mast3r". Raises InputError for images or weights that cannot be used.
     """
-    network = load_weights(weights, device)
-    images = prepare_images(capture)
     edges = pairs_to_predict(capture.base_from_gripper)
-    predictions, notes = predict_pairs(network, images, capture.images, edges, progress)
-    del network
-    give_back()  # the memory of the network
-    notes = (weights.note, *notes)
+    predictions, images, notes = predict_capture(capture, edges, weights, device, progress)
     try:
         maps = align_pairs(predictions, images, progress)
         maps = replace(maps, notes=(*notes, *maps.notes))
         return reconstruct_pointmaps(capture, images, maps, backend, progress)
     except RejectedError as error:  # a rejection also names the weights and their licence
         raise error.with_more(*notes) from None
+
+
+def predict_capture(
+    capture: Capture,
+    edges: Int[ndarray, "e 2"],
+    weights: Weights,
+    device: str,
+    progress: Progress | None = None,
+) -> tuple[PairPredictions, PreparedImages, tuple[str, ...]]:
+    """Predict the pointmaps of the pairs `edges` of a capture's images (rows); return them, the images and notes.
+
+    The notes name the weights and their licence. Raises InputError for images or weights that cannot be used.
+    """
+    network = load_weights(weights, device)
+    images = prepare_images(capture)
+    predictions, notes = predict_pairs(network, images, capture.images, edges, progress)
+    del network
+    give_back()  # the memory of the network
+    return predictions, images, (weights.note, *notes)
 
 
 def pairs_to_predict(base_from_gripper: Float[ndarray, "n 4 4"]) -> Int[ndarray, "e 2"]:
