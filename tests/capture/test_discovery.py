@@ -1,4 +1,4 @@
-"""Folders of images and numbers as people hold them, and the decision of the images between readings, orders and rows."""
+"""Folders of images and numbers as people hold them, and the decision of the images between readings."""
 
 import json
 import shutil

@@ -172,7 +172,11 @@ NAMED = {
     "w named first": (W_FIRST, f"{XYZ} qw qx qy qz", "quat:xyzw"),
     "tum": (QUATERNION, "tx ty tz qx qy qz qw", "quat:xyzw"),
     "ethz": (QUATERNION, "x y z q_x q_y q_z q_w", "quat:xyzw"),
-    "ros topic": (QUATERNION, MESSAGE + f" {MESSAGE}".join("xyzw").replace(f" {MESSAGE}", " pose.orientation."), "quat:xyzw"),
+    "ros topic": (
+        QUATERNION,
+        MESSAGE + f" {MESSAGE}".join("xyzw").replace(f" {MESSAGE}", " pose.orientation."),
+        "quat:xyzw",
+    ),
     "rosbag csv": (QUATERNION, " ".join(f"field.pose.{part}" for part in (
         "position.x", "position.y", "position.z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")),
         "quat:xyzw"),

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -136,9 +136,8 @@ def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
             for name, value in tensors.items()
             if name.startswith("uncertainty.")
         }
-        uncertainty = MapUncertainty(
-            **dict(about.uncertainty), **{name: value.numpy() for name, value in own.items()}
-        )
+        arrays: dict[str, Any] = {name: value.numpy() for name, value in own.items()}
+        uncertainty = MapUncertainty(**dict(about.uncertainty), **arrays)
     state = {
         name.removeprefix("fields."): value for name, value in tensors.items() if name.startswith("fields.")
     }
