@@ -121,7 +121,10 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "reversed": (lambda g: g[::-1].copy(), "reverse order"),
     "late by one": (lambda g: np.roll(g, 1, 0), "one ahead of the images"),
     "left-handed base": (mirrored, "mirrored ones"),
-    "transposed": (rotated(lambda r: r.inv()), "rotation matrix by columns that were taken as rotation matrix"),
+    "transposed": (
+        rotated(lambda r: r.inv()),
+        "rotation matrix by columns that were taken as rotation matrix",
+    ),
     "w first": (
         rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [3, 0, 1, 2]])),
         "quaternion w, x, y, z that were taken as quaternion x, y, z, w",

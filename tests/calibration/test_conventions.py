@@ -30,9 +30,7 @@ def test_each_mistake_is_named(mistake: str):
         np.random.default_rng(1), 9, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
     )
     # Rows of images: pairs of poses do not tell inverses of the gripper from inverses of the marker.
-    (found,) = better_reading(
-        write(problem.base_from_gripper), problem.recon_from_camera, rows=np.arange(9)
-    )
+    (found,) = better_reading(write(problem.base_from_gripper), problem.recon_from_camera, rows=np.arange(9))
     assert re.search(words, sentence(found)) and found.value is not None
     # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
     assert misfit(found.details["fits"]) < 1.0 and found.value < 0.5e-3
@@ -83,13 +81,21 @@ def test_sound_poses_are_left_alone(noise):
 def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
     """ZYZ angles that were read as ZYX: the remedy is an option that reads the file."""
     problem = hand_eye_problem(np.random.default_rng(5), 10, robot_noise=(2e-4, 5e-4))
-    numbers, position = numbers_of(problem.base_from_gripper[:, :3, :3], "euler:ZYZ"), problem.base_from_gripper[:, :3, 3]
+    numbers, position = (
+        numbers_of(problem.base_from_gripper[:, :3, :3], "euler:ZYZ"),
+        problem.base_from_gripper[:, :3, 3],
+    )
     kinds = ("euler:XYZ", "euler:ZYZ", "rotvec")
     untaken = [(Reading(file="poses.csv", notation=one), poses_of(position, numbers, one)) for one in kinds]
     (found,) = better_reading(
-        poses_of(position, numbers, "euler:ZYX"), problem.recon_from_camera, rows=np.arange(10), untaken=untaken
+        poses_of(position, numbers, "euler:ZYX"),
+        problem.recon_from_camera,
+        rows=np.arange(10),
+        untaken=untaken,
     )
-    assert found.details["remedy"] == "give --pose-convention euler:ZYZ" and misfit(found.details["fits"]) < 1.0
+    assert (
+        found.details["remedy"] == "give --pose-convention euler:ZYZ" and misfit(found.details["fits"]) < 1.0
+    )
 
 
 @pytest.mark.slow
@@ -111,5 +117,7 @@ def test_inverted_samples_name_both_possibilities():
 def test_poses_of_the_camera_itself_are_named():
     """A board's inverse pose, given for the robot's: gripper_from_camera would be the identity."""
     problem = hand_eye_problem(np.random.default_rng(7), 10)
-    (found,) = better_reading(inverse(problem.base_from_camera), problem.recon_from_camera, rows=np.arange(10))
+    (found,) = better_reading(
+        inverse(problem.base_from_camera), problem.recon_from_camera, rows=np.arange(10)
+    )
     assert found.kind is FindingKind.POSES_OF_CAMERA and found.severity == "rejects"

@@ -9,7 +9,16 @@ import pytest
 
 import jcr
 from jcr.capture.documents import Table
-from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, natural, other_orders, pair, poses_at_images, stamp_ns, stamps_of_names
+from jcr.capture.pairing import (
+    AS_NUMBERS,
+    AS_TEXT,
+    natural,
+    other_orders,
+    pair,
+    poses_at_images,
+    stamp_ns,
+    stamps_of_names,
+)
 from simulation.problems import hand_eye_problem
 
 POSES = hand_eye_problem(np.random.default_rng(3), 6).base_from_gripper
@@ -26,7 +35,9 @@ def table_of(
     names = columns or [None] * len(cells[0])
     rows = tuple((*row, float(k), 0.5, 0.25) for k, row in enumerate(cells))
     of_rows = None if keys is None else tuple(keys)
-    return Table(file=Path("p.csv"), place="", columns=(*names, "x", "y", "z"), rows=rows, keys=of_rows, words="")
+    return Table(
+        file=Path("p.csv"), place="", columns=(*names, "x", "y", "z"), rows=rows, keys=of_rows, words=""
+    )
 
 
 IMAGES = [f"images/{k}.png" for k in range(7, 13)]
@@ -44,11 +55,14 @@ COLUMN_NAMES = ("img", "rgb", "Bild", "id", "photo", "color_image", None)
 
 
 @pytest.mark.parametrize(
-    ("cell", "column"), [(cell, name) for cell in CELLS for name in COLUMN_NAMES if cell != "stem" or name == "id"]
+    ("cell", "column"),
+    [(cell, name) for cell in CELLS for name in COLUMN_NAMES if cell != "stem" or name == "id"],
 )
 def test_any_column_of_images_names_pairs_them(cell: str, column: str | None):
     numbers = [7 + k for k in ORDER]
-    cells: list[list[float | str]] = [[float(n) if cell == "stem" else CELLS[cell].format(n)] for n in numbers]
+    cells: list[list[float | str]] = [
+        [float(n) if cell == "stem" else CELLS[cell].format(n)] for n in numbers
+    ]
     found = pair(table_of(cells, [column]), IMAGES)
     assert found.row is not None and found.is_by_name and 0 in found.skipped
     assert [ORDER[row] for row in found.row] == list(range(6))
@@ -115,14 +129,20 @@ COLUMNS = {
 }
 
 
-@pytest.mark.parametrize(("name", "column"), [*((name, "ns") for name in NAMES), *(("nanoseconds", one) for one in COLUMNS)])
+@pytest.mark.parametrize(
+    ("name", "column"), [*((name, "ns") for name in NAMES), *(("nanoseconds", one) for one in COLUMNS)]
+)
 def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
     """Samples at each second, images a quarter of a second later: poses are interpolated."""
     columns, write = COLUMNS[column]
     table = table_of([write(second) for second in EVERY], columns)
     images = [NAMES[name](second) for second in EVERY[:5]]
     found = pair(table, images)
-    assert found.stamp_ns is not None and found.image_ns is not None and found.skipped >= set(range(len(columns)))
+    assert (
+        found.stamp_ns is not None
+        and found.image_ns is not None
+        and found.skipped >= set(range(len(columns)))
+    )
     assert found.stamp_ns.tolist() == [second * 10**9 for second in EVERY]
     assert (found.image_ns - found.stamp_ns[:5]).tolist() == [250_000_000] * 5
     poses = np.tile(np.eye(4), (6, 1, 1))
@@ -157,16 +177,25 @@ def test_clocks_in_other_time_zones_are_found_where_the_arm_rests(hours: float):
 def test_clocks_that_differ_otherwise_are_named_with_the_difference():
     table = table_of([[f"{second}000000000"] for second in EVERY], ["stamp"])
     found = pair(table, [f"{second + 1234567}000000000.png" for second in EVERY])
-    with pytest.raises(jcr.InputError, match=r"p.csv: no image lies within the times.*\+1234567\.0 s.*the two clocks differ"):
+    with pytest.raises(
+        jcr.InputError, match=r"p.csv: no image lies within the times.*\+1234567\.0 s.*the two clocks differ"
+    ):
         poses_at_images(np.tile(np.eye(4), (6, 1, 1)), found, 100.0, "p.csv")
 
 
 def test_names_without_stamps_have_none():
-    for names in (["a.png", "b.png"], ["1.png", "2.png"], ["img_0001.png", "img_0002.png"], ["1700000000.png"] * 2):
+    for names in (
+        ["a.png", "b.png"],
+        ["1.png", "2.png"],
+        ["img_0001.png", "img_0002.png"],
+        ["1700000000.png"] * 2,
+    ):
         assert stamps_of_names(names) is None
 
 
-@pytest.mark.parametrize("text", ["9700000000000000000", "1e30", "0.58E58800781040842", "nan", "now", "2023-99-99 99:99:99"])
+@pytest.mark.parametrize(
+    "text", ["9700000000000000000", "1e30", "0.58E58800781040842", "nan", "now", "2023-99-99 99:99:99"]
+)
 def test_a_stamp_that_64_bits_do_not_hold_is_refused(text: str):
     """By fuzzing: the first made floats of all the stamps beside it, the third was too large to compare."""
     assert stamp_ns("9200000000000000000", "a table") == 9_200_000_000_000_000_000

@@ -9,7 +9,16 @@ from scipy.spatial.transform import Rotation
 import jcr
 from capture_writers import rows_as
 from jcr.capture.documents import Table, read_tables
-from jcr.capture.notations import EULERS, MAKERS, NUMBERS, angle_unit, length_unit, numbers_of, poses_of, poses_of_rows
+from jcr.capture.notations import (
+    EULERS,
+    MAKERS,
+    NUMBERS,
+    angle_unit,
+    length_unit,
+    numbers_of,
+    poses_of,
+    poses_of_rows,
+)
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import Candidate, pose_columns, readings_of, text_of
 from jcr.geometry import inverse
@@ -55,7 +64,11 @@ def notations(found: list[Candidate]) -> list[str]:
         ("rpy", [0.1, 0.2, 0.3, np.pi / 2, 0, np.pi / 2], (Y, Z, X)),
         ("staubli", [100, 200, 300, 90, 0, 90], (Z, -X, -Y)),  # rx about x, then rz about the new z
         ("mecademic", [100, 200, 300, 90, 0, 90], (Z, -X, -Y)),
-        ("doosan", [100, 200, 300, 90, 90, 0], (-Z, -X, Y)),  # A about z, B about the new y, C about the new z
+        (
+            "doosan",
+            [100, 200, 300, 90, 90, 0],
+            (-Z, -X, Y),
+        ),  # A about z, B about the new y, C about the new z
         ("doosan", [100, 200, 300, 0, 90, 90], (Y, Z, X)),
         ("kawasaki", [100, 200, 300, 0, 90, 90], (Y, Z, X)),
         ("abb", [100, 200, 300, 0, 1, 0, 0], (X, -Y, -Z)),
@@ -77,15 +90,24 @@ def test_every_maker_is_read_as_it_writes(maker: str):
 
 
 @pytest.mark.parametrize("notation", NUMBERS)
-@pytest.mark.parametrize(("units", "length", "angle"), [("m-rad", 1, 1), ("mm-deg", 1e3, np.degrees(1)), ("cm-rad", 100, 1)])
-def test_notations_and_units_are_inverted_by_the_writer(notation: str, units: str, length: float, angle: float):
+@pytest.mark.parametrize(
+    ("units", "length", "angle"), [("m-rad", 1, 1), ("mm-deg", 1e3, np.degrees(1)), ("cm-rad", 100, 1)]
+)
+def test_notations_and_units_are_inverted_by_the_writer(
+    notation: str, units: str, length: float, angle: float
+):
     numbers = as_numbers(notation, length, angle)
     np.testing.assert_allclose(poses_of(numbers[:, :3], numbers[:, 3:], notation, units), POSES, atol=1e-9)
 
 
 def test_rows_that_are_no_transform_are_nan():
     quaternion = np.array([[0, 0, 0, 1.005], [0, 0, 0, 1.02], [0, 0, 0, np.nan], [0, 0, 1e200, 0]])
-    assert np.isnan(poses_of(np.zeros((4, 3)), quaternion, "quat:xyzw")[:, 0, 0]).tolist() == [False, True, True, True]
+    assert np.isnan(poses_of(np.zeros((4, 3)), quaternion, "quat:xyzw")[:, 0, 0]).tolist() == [
+        False,
+        True,
+        True,
+        True,
+    ]
     mirror, shear = np.diag([1.0, 1, -1]), np.eye(3) + 0.03 * np.outer(X, Y)
     matrices = np.stack([np.eye(3), mirror, shear]).reshape(3, 9)
     assert np.isnan(poses_of(np.zeros((3, 3)), matrices, "matrix")[:, 0, 0]).tolist() == [False, True, True]
@@ -93,7 +115,9 @@ def test_rows_that_are_no_transform_are_nan():
 
 @pytest.mark.parametrize("name", ["kukka", "euler:xx", "euler:abc", "euler:", "quat", "euler:zyx "])
 def test_an_unknown_notation_lists_those_there_are(name: str):
-    with pytest.raises(jcr.InputError, match=r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"):
+    with pytest.raises(
+        jcr.InputError, match=r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"
+    ):
         poses_of_rows(np.zeros((1, 6)), name)
 
 
@@ -105,6 +129,14 @@ def test_units_of_length_follow_from_the_size(scale: float, stated: str | None, 
     assert length_unit(scale * POSITION, stated, "poses.csv") == unit
 
 
+def test_one_wrong_row_does_not_change_the_unit_of_the_others():
+    """It made all others a thousand times too small, silently."""
+    wrong = POSITION.copy()
+    wrong[1] = [812.5, 0.2, 0.3]
+    assert length_unit(wrong, None, "poses.csv") == length_unit(wrong, "m", "poses.csv") == "m"
+    assert length_unit(np.vstack([1e3 * POSITION, [[0.1, 0.2, 0.3]]]), None, "poses.csv") == "mm"
+
+
 @pytest.mark.parametrize(
     ("position", "stated", "words"),
     [
@@ -112,7 +144,10 @@ def test_units_of_length_follow_from_the_size(scale: float, stated: str | None, 
         (POSITION, "cm", "too near for cm; these look like metres"),
         (1e3 * POSITION, "m", "these look like millimetres: give --pose-units mm-rad"),
         # An arm on a vehicle 35 m from the origin of a map, in metres; whatever unit is stated.
-        *((POSITION + [35, 2, 0], stated, "base frame is far away: subtract one offset") for stated in (None, "mm", "cm")),
+        *(
+            (POSITION + [35, 2, 0], stated, "base frame is far away: subtract one offset")
+            for stated in (None, "mm", "cm")
+        ),
         (POSITION + [35, 2, 0], "m", "far away: subtract one offset"),
         (1e3 * POSITION + [35e3, 0, 0], "mm", "far away: subtract one offset"),
     ],
@@ -229,12 +264,16 @@ def test_units_stated_by_a_name_or_an_option_are_refused_where_numbers_contradic
         read(table_of(MM_DEG, "x y z roll_rad pitch_rad yaw_rad"))
     with pytest.raises(jcr.InputError, match="too near for cm"):
         read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_units="cm-rad")
-    ((reading, poses),) = read(table_of(as_numbers("euler:xyz", 100), f"{XYZ} roll pitch yaw"), pose_units="cm-rad")
+    ((reading, poses),) = read(
+        table_of(as_numbers("euler:xyz", 100), f"{XYZ} roll pitch yaw"), pose_units="cm-rad"
+    )
     assert reading.units == "cm-rad" and np.allclose(poses, POSES, atol=1e-9)
 
 
 def test_columns_without_the_numbers_of_the_notation_are_named():
-    with pytest.raises(jcr.InputError, match="no columns hold the 4 numbers of --pose-convention abb; .*euler:xyz"):
+    with pytest.raises(
+        jcr.InputError, match="no columns hold the 4 numbers of --pose-convention abb; .*euler:xyz"
+    ):
         read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_convention="abb")
 
 
