@@ -174,13 +174,13 @@ def test_units_of_angles_follow_from_the_size():
 
 QUATERNION, RPY, VECTOR = as_numbers("quat:xyzw"), as_numbers("euler:xyz"), as_numbers("rotvec")
 MM_DEG, W_FIRST = as_numbers("euler:xyz", 1e3, np.degrees(1)), as_numbers("quat:wxyz")
-XYZ, MESSAGE = "x y z", "pose.position.x pose.position.y pose.position.z pose.orientation."
+XYZ, MESSAGE = "x y z", "pose.position.x pose.position.y pose.position.z"
 NAMED = {
     "usual": (QUATERNION, f"{XYZ} qx qy qz qw", "quat:xyzw"),
     "w named first": (W_FIRST, f"{XYZ} qw qx qy qz", "quat:xyzw"),
     "tum": (QUATERNION, "tx ty tz qx qy qz qw", "quat:xyzw"),
     "ethz": (QUATERNION, "x y z q_x q_y q_z q_w", "quat:xyzw"),
-    "ros topic": (QUATERNION, MESSAGE + f" {MESSAGE}".join("xyzw").replace(f" {MESSAGE}", " pose.orientation."), "quat:xyzw"),
+    "ros topic": (QUATERNION, MESSAGE + "".join(f" pose.orientation.{axis}" for axis in "xyzw"), "quat:xyzw"),
     "rosbag csv": (QUATERNION, " ".join(f"field.pose.{part}" for part in (
         "position.x", "position.y", "position.z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")),
         "quat:xyzw"),
@@ -279,7 +279,7 @@ def test_columns_without_the_numbers_of_the_notation_are_named():
 
 BOARD = hand_eye_problem(np.random.default_rng(4), 12).base_from_gripper
 OTHER = np.hstack([BOARD[:, :3, 3], Rotation.from_matrix(BOARD[:, :3, :3]).as_quat()])
-PARTS = "x y z qx qy qz qw".split()
+PARTS = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
 @pytest.mark.parametrize(
