@@ -99,7 +99,7 @@ def test_options_take_text_for_paths_lists_for_tuples_and_name_what_they_are(tab
     assert found == ReadOptions(poses=Path("poses.csv"), episode=(0, 2))
     assert checked_options(None, RunOptions) == RunOptions()
     assert jcr.read_capture(str(tabletop), {"frames": 12}).images
-    with pytest.raises(jcr.InputError, match="pose_convention: 'kukka'.*did you mean kuka"):
+    with pytest.raises(jcr.InputError, match="--pose-convention 'kukka': not one of .*did you mean kuka"):
         jcr.read_capture(tabletop, {"pose_convention": "kukka"})
     with pytest.raises(jcr.InputError, match="give jcr.RunOptions"):
         checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]

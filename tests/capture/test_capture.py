@@ -122,7 +122,7 @@ truncate = second(lambda file: file.write_bytes(file.read_bytes()[:2000]))
 
 
 FAULTS = {
-    "no capture.json": (lambda c: (c / "capture.json").unlink(), "no capture.json and no poses.csv beside its"),
+    "no capture.json": (lambda c: (c / "capture.json").unlink(), "no gripper poses for its 4 images"),
     "not JSON": (lambda c: (c / "capture.json").write_text("{'frames': []"), "not JSON at line 1.*correct it there"),
     "deeply nested": (lambda c: (c / "capture.json").write_text("[" * 100_000), "nested too deeply"),
     "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),

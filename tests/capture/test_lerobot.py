@@ -149,7 +149,10 @@ def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: Han
             "the robot's state: state is not there; choose one with --joint-topic: .*cartesian_position",
         ),
         ({"urdf": Path("nowhere.urdf")}, "the robot's state: choose one with --joint-topic"),
-        ({"pose_convention": "matrix"}, "6 numbers, a pose of this convention has 16"),
+        (
+            {"pose_convention": "matrix"},
+            "no columns hold the 9 numbers of --pose-convention matrix; .*euler:xyz",
+        ),
     ],
 )
 def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: dict, words: str):

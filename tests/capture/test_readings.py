@@ -129,6 +129,14 @@ def test_units_of_length_follow_from_the_size(scale: float, stated: str | None, 
     assert length_unit(scale * POSITION, stated, "poses.csv") == unit
 
 
+def test_one_wrong_row_does_not_change_the_unit_of_the_others():
+    """It made all others a thousand times too small, silently."""
+    wrong = POSITION.copy()
+    wrong[1] = [812.5, 0.2, 0.3]
+    assert length_unit(wrong, None, "poses.csv") == length_unit(wrong, "m", "poses.csv") == "m"
+    assert length_unit(np.vstack([1e3 * POSITION, [[0.1, 0.2, 0.3]]]), None, "poses.csv") == "mm"
+
+
 @pytest.mark.parametrize(
     ("position", "stated", "words"),
     [
@@ -166,17 +174,13 @@ def test_units_of_angles_follow_from_the_size():
 
 QUATERNION, RPY, VECTOR = as_numbers("quat:xyzw"), as_numbers("euler:xyz"), as_numbers("rotvec")
 MM_DEG, W_FIRST = as_numbers("euler:xyz", 1e3, np.degrees(1)), as_numbers("quat:wxyz")
-XYZ, MESSAGE = "x y z", "pose.position.x pose.position.y pose.position.z pose.orientation."
+XYZ, MESSAGE = "x y z", "pose.position.x pose.position.y pose.position.z"
 NAMED = {
     "usual": (QUATERNION, f"{XYZ} qx qy qz qw", "quat:xyzw"),
     "w named first": (W_FIRST, f"{XYZ} qw qx qy qz", "quat:xyzw"),
     "tum": (QUATERNION, "tx ty tz qx qy qz qw", "quat:xyzw"),
     "ethz": (QUATERNION, "x y z q_x q_y q_z q_w", "quat:xyzw"),
-    "ros topic": (
-        QUATERNION,
-        MESSAGE + f" {MESSAGE}".join("xyzw").replace(f" {MESSAGE}", " pose.orientation."),
-        "quat:xyzw",
-    ),
+    "ros topic": (QUATERNION, MESSAGE + "".join(f" pose.orientation.{axis}" for axis in "xyzw"), "quat:xyzw"),
     "rosbag csv": (QUATERNION, " ".join(f"field.pose.{part}" for part in (
         "position.x", "position.y", "position.z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")),
         "quat:xyzw"),

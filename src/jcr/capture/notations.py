@@ -164,8 +164,12 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
     position = position[np.isfinite(position).all(1)]
     if not len(position):
         return stated or "m"
-    far = float(np.linalg.norm(position, axis=1).max())
-    spread = float(np.linalg.norm(position - np.median(position, axis=0), axis=1).max())
+    # A few wrong rows, which are left out later, must not change the unit of the others.
+    counted = len(position) - (tolerated(len(position)) if len(position) > 3 else 0)
+    far, spread = (
+        float(np.sort(np.linalg.norm(position - origin, axis=1))[counted - 1])
+        for origin in (np.zeros(3), np.median(position, axis=0))
+    )
     unit = stated or ("m" if far <= METRES_LIMIT else "mm")
     per = METRES[unit]
     if stated in ("mm", "cm") and 0 < far <= METRES_LIMIT:

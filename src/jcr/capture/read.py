@@ -11,6 +11,7 @@ from jcr.capture import folder as folders
 from jcr.capture import samples
 from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.formats import bag, capture_json, lerobot
+from jcr.capture.notations import notation_of
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError
 from jcr.geometry import inverse
@@ -68,6 +69,8 @@ def read_source(
         raise InputError(f"{path}: no such capture; name a folder with a capture.json, or another format")
     if options.frames < MIN_FRAMES:
         raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed, 8 to 15 are good")
+    if options.pose_convention != "auto":
+        notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     name = format_of(path) if options.format == "auto" else options.format
     if name not in RECORDINGS:
         folder, origin, found = None, [], FORMATS[name].read(path, options)

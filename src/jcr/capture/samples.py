@@ -38,6 +38,7 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
     if found is None:
         raise InputError(f"{path}: no samples of MoveIt Calibration or easy_handeye2; name such a file")
     entries, keys = found
+    require_frames(len(entries), str(path))
     kind = "eye_in_hand"  # MoveIt Calibration writes a list, without parameters
     if isinstance(content, dict):
         parameters = content.get("parameters")
