@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.capture.documents import Table
-from jcr.capture.pose_track import NEVER, interpolated_poses, speed
+from jcr.capture.pose_track import NEVER, interpolated_poses
 from jcr.errors import InputError, shown
+from jcr.geometry import inverse, motion_length
 
 _LATEST_NS = np.iinfo(np.int64).max
 """Largest time stamp (ns) that fits 64 bits, in the year 2262."""
@@ -56,6 +57,8 @@ STAMP_NAMES = {
 }
 ZONE_NS = 900 * 10**9
 """Step (ns) of the differences between time zones, a quarter of an hour."""
+MOMENT_NS = 1_000_000
+"""Time (ns) before and after a stamp by which the speed there is measured."""
 AT_REST = 0.005
 """Largest speed (m/s) of an arm at rest, as in jcr.capture.recording."""
 DATE = re.compile(
@@ -277,6 +280,9 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
             continue  # a turn of an axis, such as KUKA's T
         numeric = [cell for cell in cells if isinstance(cell, float)]
         rising = len(numeric) == len(cells) and bool((np.diff(numeric) >= 0).all())
+        is_named = is_named and (
+            words != {"t"} or (rising and len(set(numeric)) == len(cells))
+        )  # or Kawasaki's T
         if not is_named and not (name is None and k == 0 and rising and abs(numeric[0]) > 1e4):
             dated = [
                 isinstance(cell, str) and (DATE.search(cell) or re.fullmatch(r"\d{16,19}", cell))
@@ -362,7 +368,8 @@ def _zone(
     for step in steps if len(steps) <= 200 else ():
         at = stamps + step * ZONE_NS
         _, gap = interpolated_poses(times, poses, at)
-        slow = speed(lambda when: interpolated_poses(times, poses, when), at) < AT_REST
+        before, after = (interpolated_poses(times, poses, at + side * MOMENT_NS)[0] for side in (-1, 1))
+        slow = np.asarray(motion_length(inverse(before) @ after)) / (2e-9 * MOMENT_NS) < AT_REST
         if (gap != NEVER).all() and slow.mean() >= NEARLY:
             fitting.append(step * ZONE_NS)
     return fitting[0] if len(fitting) == 1 else None

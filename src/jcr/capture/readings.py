@@ -115,7 +115,7 @@ def _split(name: str) -> tuple[tuple[str, ...], str, str | None]:
     parts = [parts[0], *(one for one in parts[1:] if one not in UNITS)] if parts else [""]
     if len(parts) > 1 and parts[-1].isdecimal() and parts[-2].isdecimal():
         return tuple(parts[:-2]), f"{parts[-2]},{parts[-1]}", unit
-    if (entry := re.fullmatch(r"([a-z]*?)_?([0-4])([0-4])", parts[-1])) and (entry[1] or len(parts) > 1):
+    if (entry := re.fullmatch(r"([a-z]*?)_?([0-4])([0-4])", parts[-1])) and entry[1]:
         return (*parts[:-1], *filter(None, [entry[1]])), f"{entry[2]},{entry[3]}", unit
     if (short := re.fullmatch(r"(?:pos|p|t)([xyz])", parts[-1])) is not None:
         return (*parts[:-1], "position"), short[1], unit
@@ -177,7 +177,7 @@ def _of_groups(groups: dict[tuple[str, str], dict[str, int]], numbers: Numbers) 
             positions[pose] = tuple(cells[axis] for axis in "xyz")
         elif half == "position" and (ordered := _numbered(cells)) and len(ordered) == 3:
             positions[pose] = tuple(ordered)
-        elif half == "rotation":
+        elif half == "rotation" and len(_numbered(cells) or ()) not in (12, 16):
             rotations.setdefault(pose, []).extend(_rotations(cells, words))
         elif ordered := _numbered(cells):
             yield from (
@@ -194,8 +194,9 @@ def _of_groups(groups: dict[tuple[str, str], dict[str, int]], numbers: Numbers) 
 
 def _numbered(cells: dict[str, int]) -> list[int] | None:
     """Return the columns 0, 1, 2, … or (0,0), (0,1), … in their order; None if the names are no such numbers."""
+    is_matrix = all(re.fullmatch(r"[0-4]{2}", last) for last in cells)  # T_00, T_01, … T_33
     try:
-        places = {tuple(map(int, last.split(","))): k for last, k in cells.items()}
+        places = {tuple(map(int, last if is_matrix else last.split(","))): k for last, k in cells.items()}
     except ValueError:
         return None
     return [places[place] for place in sorted(places)]

@@ -19,6 +19,8 @@ MAX_ITEMS = 1_000_000
 _LONGEST_WORDS = 4000
 """Largest length of `Table.words`; a title and a few comments need 1 % of it."""
 _LONGEST_NUMBER = 64
+_LATIN = {*map(chr, range(128)), *"äöüÄÖÜßéèêàâçñóòôíìúùåøæÅØÆ°µ²³·±§«»"}
+"""Characters of Western European texts of numbers: ASCII, accented letters, and signs of units."""
 _BINARY = re.compile(r"[\0-\x08\x0e-\x1f\x7f]")
 
 
@@ -111,6 +113,9 @@ def decode_text(file: Path, data: bytes) -> str:
         try:
             text = data.decode(encoding).rstrip("\0\x1a")
         except UnicodeDecodeError:
+            continue
+        # Few accented letters in a Latin-1 text may be valid pairs of bytes in GB18030.
+        if encoding == "gb18030" and not set(data.decode("cp1252", "replace")) - _LATIN:
             continue
         if not _BINARY.search(text):
             return text
