@@ -1,4 +1,4 @@
-"""Folders of images and numbers as people hold them, and the decision of the images between readings, orders and rows."""
+"""Folders of images and numbers as people hold them, and the decision of the images between readings and orders."""
 
 import json
 import shutil
@@ -82,7 +82,7 @@ LAYOUTS: dict[str, Layout] = {
     "above": lambda f: [in_images(f), write(f / "poses.txt", [HEADER, *ROWS])],
     "images and poses in one folder": lambda f: write(draw(f / "a") / "p.txt", [HEADER, *ROWS]),
     "image column, another order": lambda f: write(
-        in_images(f) / "p.csv", [f"{HEADER},Bild", *(f"{row},{name}" for row, name in zip(ROWS, NAMES, strict=True))][::1]
+        in_images(f) / "p.csv", [f"{HEADER},Bild", *sorted(f"{row},{name}" for row, name in zip(ROWS, NAMES, strict=True))]
     ),
     "a file for each image": lambda f: each(in_images(f), "robot/{stem}.txt"),
     "a file for each image, counted": lambda f: each(in_images(f), "poses/pos{}.txt"),
@@ -154,7 +154,10 @@ def test_a_copy_of_the_poses_in_another_file_counts_once(tmp_path: Path):
 
 
 PROBLEM = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4))
-NOTATIONS = ("quat:xyzw", "quat:wxyz", "rotvec", "euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ", "matrix", "matrix:columns")  # fmt: skip
+NOTATIONS = (
+    *("quat:xyzw", "quat:wxyz", "rotvec", "matrix", "matrix:columns"),
+    *("euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ"),
+)
 
 
 def undecided(

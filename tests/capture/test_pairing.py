@@ -154,7 +154,7 @@ def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
 
 
 def resting() -> tuple[np.ndarray, np.ndarray]:
-    """Return times (ns) and poses of an arm that stands at six poses for a second each, with a second of motion between."""
+    """Return times (ns) and poses of an arm that stands at six poses for a second each and moves for a second between."""
     seconds = np.arange(0, 12, 0.1)
     at = np.interp(seconds, np.arange(12), np.repeat(np.arange(6), 2))
     poses = np.tile(np.eye(4), (len(seconds), 1, 1))
@@ -167,8 +167,8 @@ def test_clocks_in_other_time_zones_are_found_where_the_arm_rests(hours: float):
     times, poses = resting()
     images = [dated("%Y-%m-%d_%H-%M-%S.5.png", int(START + 3600 * hours + 2 * k)) for k in range(6)]
     rows = [[str(one), *row[:3, 3].tolist()] for one, row in zip(times.tolist(), poses, strict=True)]
-    table = Table(file=Path("p.csv"), place="", columns=("stamp", "x", "y", "z"), rows=tuple(map(tuple, rows)), keys=None,
-                  words="")  # fmt: skip
+    facts = {"file": Path("p.csv"), "place": "", "keys": None, "words": ""}
+    table = Table(columns=("stamp", "x", "y", "z"), rows=tuple(map(tuple, rows)), **facts)  # pyright: ignore
     at_images, _, note = poses_at_images(poses, pair(table, images), 500.0, "p.csv")
     assert note is not None and f"{-hours:+.2f} h" in note
     np.testing.assert_allclose(at_images[:, :3, 3], POSES[:, :3, 3], atol=1e-9)
