@@ -3,6 +3,7 @@
 import unicodedata
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -69,7 +70,9 @@ def test_any_column_of_images_names_pairs_them(cell: str, column: str | None):
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
-def test_names_in_another_unicode_form_are_the_same(forms: tuple[str, str]):
+def test_names_in_another_unicode_form_are_the_same(
+    forms: tuple[Literal["NFC", "NFD"], Literal["NFC", "NFD"]],
+):
     images = [unicodedata.normalize(forms[0], f"Größe é {k}.png") for k in range(6)]
     cells: list[list[float | str]] = [[unicodedata.normalize(forms[1], f"Größe é {k}.png")] for k in ORDER]
     found = pair(table_of(cells), images)
@@ -154,7 +157,7 @@ def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
 
 
 def resting() -> tuple[np.ndarray, np.ndarray]:
-    """Return times (ns) and poses of an arm that stands at six poses for a second each and moves for a second between."""
+    """Return times (ns) and poses of an arm that rests at six poses for a second each, and moves between them."""
     seconds = np.arange(0, 12, 0.1)
     at = np.interp(seconds, np.arange(12), np.repeat(np.arange(6), 2))
     poses = np.tile(np.eye(4), (len(seconds), 1, 1))

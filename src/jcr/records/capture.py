@@ -124,7 +124,7 @@ class Reading:
     inverted: bool = False
     """Whether the numbers are gripper_from_base."""
     decided_by: Literal["names", "numbers", "option", "images"] = "names"
-    """What left this reading alone: names of columns or files, sizes of the numbers, an option, or the images."""
+    """Source of the decision for this reading: names of columns or files, sizes of the numbers, an option, or the images."""
     misfit_mm: float | None = None
     """Misfit (mm) of this reading to the camera poses, 1° counted as 5 mm; None if the images were not asked."""
     next_best: str | None = None

@@ -220,7 +220,7 @@ class CaptureFile(Entry, extra="allow"):
     urdf: str | None = None
     cameras: CameraEntries | None = None
     reading: Annotated[Reading, BeforeValidator(_read_reading)] | None = None
-    """How the poses were read from a file; absent where they were written as base_from_gripper."""
+    """Reading of the file of poses; absent where they were written as base_from_gripper."""
 
     def as_text(self) -> str:
         """Return the text of the capture.json."""

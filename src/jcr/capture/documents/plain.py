@@ -29,7 +29,7 @@ _STARTS = {
     "JSON": re.compile(r'\s*(?:\{\s*"|\[\s*\{)'),
     "YAML": re.compile(r"%YAML|---\s*\n|(?:- )?\w+:\s*\n\s+(?:- )?\w+:\s"),
 }
-"""What a text begins with that has a syntax, whatever the ending of the file is."""
+"""Patterns at the start of a text that show its syntax, whatever the ending of the file is."""
 _CONSTANTS = {
     "": None, "~": None, "null": None, "true": True, "false": False,
     ".nan": math.nan, ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf,
