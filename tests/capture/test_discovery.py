@@ -1,4 +1,4 @@
-"""Folders of images and numbers as people hold them, and the decision of the images between readings, orders and rows."""
+"""Folders of images and numbers as people hold them, and the decision of the images between readings and orders."""
 
 import json
 import shutil
@@ -32,6 +32,7 @@ NAMES = [f"{k}.png" for k in range(8, 8 + COUNT)]
 """8.png … 13.png, whose order as text is another one."""
 HEADER = "x,y,z,qx,qy,qz,qw"
 ROWS = [",".join(map(repr, row)) for row in rows_as("quat:xyzw", POSES).tolist()]
+NAMED_ROWS = [f"{row},{name}" for row, name in zip(ROWS, NAMES, strict=True)]
 
 
 def draw(folder: Path, names: list[str] = NAMES, size: tuple[int, int] = (32, 24), seed: int = 0) -> Path:
@@ -81,9 +82,7 @@ LAYOUTS: dict[str, Layout] = {
     "beside the images": lambda f: write(in_images(f) / "images/numbers.dat", [HEADER, *ROWS]),
     "above": lambda f: [in_images(f), write(f / "poses.txt", [HEADER, *ROWS])],
     "images and poses in one folder": lambda f: write(draw(f / "a") / "p.txt", [HEADER, *ROWS]),
-    "image column, another order": lambda f: write(
-        in_images(f) / "p.csv", [f"{HEADER},Bild", *(f"{row},{name}" for row, name in zip(ROWS, NAMES, strict=True))][::1]
-    ),
+    "image column, another order": lambda f: write(in_images(f) / "p.csv", [f"{HEADER},Bild", *sorted(NAMED_ROWS)]),
     "a file for each image": lambda f: each(in_images(f), "robot/{stem}.txt"),
     "a file for each image, counted": lambda f: each(in_images(f), "poses/pos{}.txt"),
     "index": lambda f: index(in_images(f)),
@@ -154,7 +153,10 @@ def test_a_copy_of_the_poses_in_another_file_counts_once(tmp_path: Path):
 
 
 PROBLEM = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4))
-NOTATIONS = ("quat:xyzw", "quat:wxyz", "rotvec", "euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ", "matrix", "matrix:columns")  # fmt: skip
+NOTATIONS = (
+    *("quat:xyzw", "quat:wxyz", "rotvec", "matrix", "matrix:columns"),
+    *("euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ"),
+)
 
 
 def undecided(

@@ -3,6 +3,7 @@
 import unicodedata
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -69,7 +70,9 @@ def test_any_column_of_images_names_pairs_them(cell: str, column: str | None):
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
-def test_names_in_another_unicode_form_are_the_same(forms: tuple[str, str]):
+def test_names_in_another_unicode_form_are_the_same(
+    forms: tuple[Literal["NFC", "NFD"], Literal["NFC", "NFD"]],
+):
     images = [unicodedata.normalize(forms[0], f"Größe é {k}.png") for k in range(6)]
     cells: list[list[float | str]] = [[unicodedata.normalize(forms[1], f"Größe é {k}.png")] for k in ORDER]
     found = pair(table_of(cells), images)
@@ -154,7 +157,7 @@ def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
 
 
 def resting() -> tuple[np.ndarray, np.ndarray]:
-    """Return times (ns) and poses of an arm that stands at six poses for a second each, and moves for a second."""
+    """Return times (ns) and poses of an arm that rests at six poses for a second each, and moves between them."""
     seconds = np.arange(0, 12, 0.1)
     at = np.interp(seconds, np.arange(12), np.repeat(np.arange(6), 2))
     poses = np.tile(np.eye(4), (len(seconds), 1, 1))
@@ -167,8 +170,8 @@ def test_clocks_in_other_time_zones_are_found_where_the_arm_rests(hours: float):
     times, poses = resting()
     images = [dated("%Y-%m-%d_%H-%M-%S.5.png", int(START + 3600 * hours + 2 * k)) for k in range(6)]
     rows = [[str(one), *row[:3, 3].tolist()] for one, row in zip(times.tolist(), poses, strict=True)]
-    cells, columns = tuple(map(tuple, rows)), ("stamp", "x", "y", "z")
-    table = Table(file=Path("p.csv"), place="", columns=columns, rows=cells, keys=None, words="")
+    facts = {"file": Path("p.csv"), "place": "", "keys": None, "words": ""}
+    table = Table(columns=("stamp", "x", "y", "z"), rows=tuple(map(tuple, rows)), **facts)  # pyright: ignore
     at_images, _, note = poses_at_images(poses, pair(table, images), 500.0, "p.csv")
     assert note is not None and f"{-hours:+.2f} h" in note
     np.testing.assert_allclose(at_images[:, :3, 3], POSES[:, :3, 3], atol=1e-9)
