@@ -233,6 +233,12 @@ def poses_of_rows(
         matrix = numbers.reshape(len(numbers), -1, 4)
         if notation == "matrix:columns" and numbers.shape[1] == 16:
             matrix = np.swapaxes(matrix, 1, 2)
+        last = matrix[:, 3:] - (0, 0, 0, 1)  # empty for twelve numbers
+        if (wrong := np.flatnonzero(~(np.abs(last) < UNIT_TOLERANCE).all((1, 2)))).size:
+            raise InputError(
+                f"{where}: the last row of pose {wrong[0] + 1} is not 0 0 0 1; if the translation stands in it, the "
+                "convention is matrix:columns, else matrix"
+            )
         position, rotation, notation = matrix[:, :3, 3], matrix[:, :3, :3].reshape(-1, 9), "matrix"
     else:
         position, rotation = numbers[:, :3], numbers[:, 3:]
