@@ -184,7 +184,7 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
             "frame"
         )
     if far * per > METRES_LIMIT:
-        if stated is None or spread * per <= METRES_LIMIT:
+        if stated is None or (len(position) > 1 and spread * per <= METRES_LIMIT):
             raise InputError(
                 f"{where}: the positions are up to {far * per:.4g} m from the origin; a map frame is far away: "
                 "subtract one offset from all, or give the poses in the arm's own base frame"
@@ -229,6 +229,8 @@ def poses_of_rows(
     width = 12 if notation.startswith("matrix") else 3 + NUMBERS[notation]
     if numbers.ndim != 2 or numbers.shape[1] not in ((12, 16) if width == 12 else (width,)):
         raise InputError(f"{where}: rows of {numbers.shape[-1]} numbers; {convention} has {width}")
+    if (wrong := np.flatnonzero(~np.isfinite(numbers).all(axis=1))).size:
+        raise InputError(f"{where}: pose {wrong[0] + 1} has a NaN or infinite number; record it again")
     if width == 12:
         matrix = numbers.reshape(len(numbers), -1, 4)
         if notation == "matrix:columns" and numbers.shape[1] == 16:
