@@ -113,6 +113,16 @@ def test_rows_that_are_no_transform_are_nan():
     assert np.isnan(poses_of(np.zeros((3, 3)), matrices, "matrix")[:, 0, 0]).tolist() == [False, True, True]
 
 
+@pytest.mark.parametrize("convention", ["matrix", "matrix:columns"])
+def test_a_transposed_or_scaled_matrix_is_refused(convention: str):
+    """The translation in the last row was ignored."""
+    right = POSES if convention == "matrix" else np.swapaxes(POSES, 1, 2)
+    np.testing.assert_allclose(poses_of_rows(right.reshape(-1, 16), convention), POSES, atol=1e-9)
+    for wrong in (np.swapaxes(right, 1, 2), 2 * right):
+        with pytest.raises(jcr.InputError, match="poses: the last row of pose 1 is not 0 0 0 1"):
+            poses_of_rows(wrong.reshape(-1, 16), convention)
+
+
 @pytest.mark.parametrize("name", ["kukka", "euler:xx", "euler:abc", "euler:", "quat", "euler:zyx "])
 def test_an_unknown_notation_lists_those_there_are(name: str):
     with pytest.raises(

@@ -184,7 +184,7 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
             "frame"
         )
     if far * per > METRES_LIMIT:
-        if stated is None or spread * per <= METRES_LIMIT:
+        if stated is None or (len(position) > 1 and spread * per <= METRES_LIMIT):
             raise InputError(
                 f"{where}: the positions are up to {far * per:.4g} m from the origin; a map frame is far away: "
                 "subtract one offset from all, or give the poses in the arm's own base frame"
@@ -229,10 +229,18 @@ def poses_of_rows(
     width = 12 if notation.startswith("matrix") else 3 + NUMBERS[notation]
     if numbers.ndim != 2 or numbers.shape[1] not in ((12, 16) if width == 12 else (width,)):
         raise InputError(f"{where}: rows of {numbers.shape[-1]} numbers; {convention} has {width}")
+    if (wrong := np.flatnonzero(~np.isfinite(numbers).all(axis=1))).size:
+        raise InputError(f"{where}: pose {wrong[0] + 1} has a NaN or infinite number; record it again")
     if width == 12:
         matrix = numbers.reshape(len(numbers), -1, 4)
         if notation == "matrix:columns" and numbers.shape[1] == 16:
             matrix = np.swapaxes(matrix, 1, 2)
+        last = matrix[:, 3:] - (0, 0, 0, 1)  # empty for twelve numbers
+        if (wrong := np.flatnonzero(~(np.abs(last) < UNIT_TOLERANCE).all((1, 2)))).size:
+            raise InputError(
+                f"{where}: the last row of pose {wrong[0] + 1} is not 0 0 0 1; if the translation stands in it, the "
+                "convention is matrix:columns, else matrix"
+            )
         position, rotation, notation = matrix[:, :3, 3], matrix[:, :3, :3].reshape(-1, 9), "matrix"
     else:
         position, rotation = numbers[:, :3], numbers[:, 3:]
