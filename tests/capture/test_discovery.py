@@ -321,15 +321,12 @@ STOPS: Case = (
     0,
     "up to",
 )
-NO_STOPS = pytest.mark.xfail(
-    strict=True, reason="a stop is where frames follow each other, not where the pose rests"
-)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "words", "status", "said"),
-    [*CASES, pytest.param(*STOPS, marks=NO_STOPS)],
+    [*CASES, STOPS],
     ids=lambda one: str(one)[:40],
 )
 def test_small_inputs_of_others_have_the_right_outcome(
