@@ -69,7 +69,11 @@ FORMATS: dict[str, Callable[[Path, Capture], Path]] = {
     "bag": lambda folder, capture: write_bag(folder / "scan", capture, "mcap", 8.0, fps=10.0, tf_hz=50.0),
     "LeRobot": lerobot,
 }
-OPTIONS = {"bag": ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", str(COUNT)]}
+OPTIONS = {
+    "poses.npy": ["--pose-convention", "matrix"],
+    "poses.txt": ["--pose-convention", "quat:xyzw"],
+    "bag": ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", str(COUNT)],
+}
 
 
 def stamps_of(folder: Path) -> dict[Path, int]:

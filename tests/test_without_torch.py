@@ -18,6 +18,7 @@ MAY_NEED_TORCH = (
     "features/learned", "features/xfeat",
     "pointmaps/dust3r/",
     "pointmaps/", "pointmaps/predictions", "scene/", "segments/sam",
+    "paper/alignment", "paper/fields", "paper/run",
     "export/rrd", "export/volume", "viewer/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""

@@ -170,7 +170,7 @@ def undecided(
     table = Table(file=Path(name), place="", columns=(None,) * len(rows[0]), rows=rows, keys=None, words="")
     candidates = tuple(readings_of(table, ReadOptions(), name)[1])
     nothing = np.full((images or len(poses), 4, 4), np.nan)
-    return replace(capture_of(nothing), source=Path(name), candidates=candidates)
+    return capture_of(nothing, source=Path(name), candidates=candidates)
 
 
 def decided(capture: Capture, problem: HandEyeProblem = PROBLEM, rows: np.ndarray | None = None) -> Capture:

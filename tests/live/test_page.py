@@ -103,7 +103,10 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
 
 def test_few_images_forecast_no_failure():
     """The bound with three images is too uncertain for the advice that more images would not help."""
-    short = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "rejects", "none", value=0.008)
+    short = Finding.of(
+        FindingKind.NOT_EXACT_ENOUGH, "rejects", "none", value=0.008, distance_m=0.4, reached_mm=8.0, reached_deg=0.5,
+        translation_mm=5.0, rotation_deg=1.0,
+    )  # fmt: skip
     ten = a_hand_eye(False)
     state = Progress(images=("a",), findings=(short,), hand_eye=replace(ten, images=ten.images[:3]))
     assert advice(state) == FIRST_ADVICE

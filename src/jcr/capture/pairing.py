@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.capture.documents import Table
+from jcr.capture.options import MAX_FRAMES
 from jcr.capture.pose_track import NEVER, interpolated_poses
 from jcr.errors import InputError, shown
 from jcr.geometry import inverse, motion_length
@@ -140,7 +141,7 @@ def _by_cells(table: Table, images: Sequence[str]) -> Pairing | None:
         for r, cell in enumerate(cells):
             text = unicodedata.normalize("NFC", cell).strip().replace("\\", "/").removeprefix("./")
             like = [whole[text]] if text in whole else own.get(plain_name(text), [])
-            if not like and len(text) >= LEAST_TEXT and not _is_number(text):
+            if not like and len(cells) <= MAX_FRAMES and len(text) >= LEAST_TEXT and not _is_number(text):
                 like = [k for name, ks in own.items() if text.casefold() in name for k in ks]
             if len(like) == 1 and row[like[0]] < 0:
                 row[like[0]] = r

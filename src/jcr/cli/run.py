@@ -242,9 +242,9 @@ def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: 
         others = 0 if result.cameras is None else len(result.cameras.cameras)
         most = MOST_LINES - others - 1  # one line is left to the caller
         lines = summary(result.calibration, most).splitlines()
-        read = result.capture
-        if isinstance(read, Capture) and read.reading is not None:
-            lines += labelled("Poses", decision_in_words(read.reading))
+        reading = None if isinstance(capture, PosePairs) else result.capture.reading
+        if reading is not None:
+            lines += labelled("Poses", decision_in_words(reading))
         notes = [line for note in capture.notes for line in labelled("Note", note)]
         lines += notes[: max(most - 2 - len(lines), 0)]
         sys.stdout.write("\n".join(lines) + "\n")

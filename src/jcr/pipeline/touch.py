@@ -1,5 +1,6 @@
 """Touch test: distances between points that the robot's tip touched and the same points of the surface in images."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scipy.linalg import block_diag
 from jcr.calibration.record import Calibration
 from jcr.camera import project, unproject
 from jcr.capture.documents import read_tables
+from jcr.capture.documents.table import decode_text, read_limited
 from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import Poses, apply, by_similarity, inverse, scale_translation
@@ -168,18 +170,21 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()
-    tables = [table for table in read_tables(path) if set(COLUMNS) <= set(table.columns)]
-    if not tables:
-        raise InputError(f"{path}: has no columns {', '.join(COLUMNS)}; give them in the first line")
-    for line, row in enumerate(tables[0].rows, start=2):
-        named = dict(zip(tables[0].columns, row, strict=True))
-        cells = [named[name] for name in COLUMNS[1:]]
+    tables = read_tables(path)
+    header = decode_text(path, read_limited(path)).partition("\n")[0]
+    named = [cell.strip().strip('"') for cell in re.split(r"[,;\t]", header)]
+    if missing := [name for name in COLUMNS if name not in named]:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
+    rows = next((table.rows for table in tables if set(COLUMNS) <= set(table.columns)), ())
+    for line, row in enumerate(rows, start=2):
+        cell_of = dict(zip(named, row, strict=True))
+        cells = [cell_of[name] for name in COLUMNS[1:]]
         if not all(isinstance(cell, float) for cell in cells):
             raise InputError(f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers")
         own = np.array(cells, dtype=np.float64)
         if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
             raise InputError(f"{path}: line {line}: positions are finite and in metres")
-        images.append(str(named["image"] or ""))
+        images.append(str(cell_of["image"] or ""))
         numbers.append(own)
     if len(images) < LEAST:
         raise InputError(f"{path}: {len(images)} points; touch {LEAST} or more, spread over the scene")

@@ -21,6 +21,8 @@ from jcr.records import Reading
 
 FITTED = 60
 """Largest number of readings, ranked by screw congruence, that are fitted; each takes 10 ms."""
+USUAL = 9
+"""Number of first readings that are always fitted: inverses, mirrored poses, and other orders."""
 SAME_ANGLE = np.radians(0.1)
 """Step (rad) to which differences of angles are rounded for the ranking, so that usual mistakes come first among equals;
 many readings differ by names of axes only, which leaves all angles equal."""
@@ -31,8 +33,8 @@ BETTER = 3.0
 BOARD = (0.01, np.radians(2.0))
 """Largest gripper_from_camera (m, rad) that counts as none; no camera of a real arm is nearer to the gripper's frame."""
 INVERTED_BOARD = 0.03
-"""As the first number of BOARD, for inverse poses. A board's pose in the camera is one; its errors of some millimetres,
-and a scale that is observed badly, move the camera by 7 to 23 mm in a real capture."""
+"""Largest translation (m) that counts as none for inverse poses. A board's pose in the camera is one; its errors of some
+millimetres, and a scale that is observed badly, move the camera by 7 to 23 mm in a real capture."""
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
 INVERSES = "their inverses (gripper_from_base was given)"
 AT_SOURCE = "correct them at their source"
@@ -103,10 +105,10 @@ def better_reading(
     if given.mm < FITS_MM:
         return ()
     angles, ranked = pair_angles(recon_from_camera), list[tuple[float, _Alternative]]()
-    for one in _alternatives(base_from_gripper, rows, names, untaken):
+    for k, one in enumerate(_alternatives(base_from_gripper, rows, names, untaken)):
         if len(one[3]) > 3:
             gap = angle_gap(pair_angles(one[2]), angles[np.ix_(one[3], one[3])])
-            ranked.append((round(gap / SAME_ANGLE), one))
+            ranked.append((0 if k < USUAL else round(gap / SAME_ANGLE), one))
     ranked.sort(key=lambda pair: pair[0])
     fits = [(pose_misfit(one[2], recon_from_camera[one[3]]), one) for _, one in ranked[:FITTED]]
     if not fits:
