@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
+import numpy.testing  # noqa: F401 - numpy 1.26 starts lscpu when it is first imported
 import pytest
 from PIL import Image
 

@@ -108,6 +108,8 @@ def rotations_of(
     if notation.startswith("quat:"):
         sound &= np.abs(np.linalg.norm(np.where(sound[:, None], numbers, 0.0), axis=1) - 1) < UNIT_TOLERANCE
         order = [notation[5:].index(axis) for axis in "xyzw"]
+        if not sound.any():  # SciPy 1.11 takes no empty arrays
+            return made
         made[sound] = Rotation.from_quat(numbers[sound][:, order]).as_matrix()
     elif notation.startswith("matrix"):
         matrix = numbers.reshape(-1, 3, 3)
@@ -116,6 +118,8 @@ def rotations_of(
         gap = np.abs(usable @ np.swapaxes(usable, 1, 2) - np.eye(3)).max((1, 2))
         sound &= (gap < 2 * UNIT_TOLERANCE) & (np.linalg.det(usable) > 0)
         made[sound] = nearest_rotation(matrix[sound])
+    elif not sound.any():
+        return made
     elif notation == "rotvec":
         made[sound] = Rotation.from_rotvec(numbers[sound] * radians).as_matrix()
     else:
