@@ -335,6 +335,8 @@ def poses_at_images(
         at_images[paired.row < 0] = np.nan
         return at_images, np.zeros(len(at_images), bool), None
     sound, stamps, note = np.isfinite(poses).all((1, 2)), paired.image_ns, None
+    if not sound.any():
+        raise InputError(f"{where}: no row holds a pose; correct its numbers")
     times, known = paired.stamp_ns[sound], poses[sound]
     inside = (stamps >= times.min()) & (stamps <= times.max())
     if not inside.any():

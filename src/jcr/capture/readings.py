@@ -25,7 +25,7 @@ from jcr.capture.notations import (
 )
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
-from jcr.geometry import inverse
+from jcr.geometry import HUGE, inverse
 from jcr.records import Reading
 
 Numbers = Float[ndarray, "n c"]
@@ -127,8 +127,11 @@ def _split(name: str) -> tuple[tuple[str, ...], str, str | None]:
 
 
 def numbers_of_table(table: Table) -> Numbers:
-    """Return the cells of a table as numbers (n,c); NaN for texts and missing cells."""
-    made = [[cell if isinstance(cell, float) else np.nan for cell in row] for row in table.rows]
+    """Return the cells of a table as numbers (n,c); NaN for texts, missing cells, and numbers that no pose has."""
+    made = [
+        [cell if isinstance(cell, float) and abs(cell) < HUGE else np.nan for cell in row]
+        for row in table.rows
+    ]
     return np.array(made, dtype=np.float64).reshape(len(table.rows), len(table.columns))
 
 
@@ -252,7 +255,10 @@ def _most_exact(found: list[PoseColumns], numbers: Numbers) -> list[PoseColumns]
     """Return the poses whose quaternions have the most exact length; those of shifted columns are near 1 by chance."""
     if len(found[0].rotation) != 4:
         return found
-    off = [float(np.nanmax(np.abs(np.linalg.norm(numbers[:, one.rotation], axis=1) - 1))) for one in found]
+    off = [
+        float(np.nanmax(np.abs(np.linalg.norm(numbers[:, one.rotation], axis=1) - 1), initial=0.0))
+        for one in found
+    ]
     return [one for one, size in zip(found, off, strict=True) if size <= 10 * min(off) + 1e-5]
 
 
