@@ -45,7 +45,7 @@ class _Fit(NamedTuple):
     @property
     def is_of_camera(self) -> bool:
         """Whether gripper_from_camera is almost the identity, as for a board's poses that a camera measured."""
-        return of_camera(self.misfit.x, self.reading.inverted) is not None
+        return self.misfit is not NO_FIT and of_camera(self.misfit.x, self.reading.inverted) is not None
 
 
 def decided_by_images(
