@@ -223,7 +223,7 @@ def test_smooth_errors_have_a_covariance_at_all_rotations(about_one_axis: bool):
     turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)[:, None] * np.array([0.0, 0.6, 0.8])
     rotations = rotation_exp(turns)
     if not about_one_axis:
-        rotations = Rotation.random(60, rng=0).as_matrix()
+        rotations = Rotation.from_quat(np.random.default_rng(0).normal(size=(60, 4))).as_matrix()
     covariance = smooth_errors(transform(rotations, np.zeros((60, 3))))
     assert np.linalg.eigvalsh(covariance).min() > -1e-12
     assert np.diag(covariance).reshape(60, 2, 3) == pytest.approx(np.tile([[0.45**2], [1.0]], (60, 1, 3)))
