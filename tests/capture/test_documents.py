@@ -1,10 +1,14 @@
 """Documents: each syntax with a known answer, hostile files, real files, and a round trip."""
 
+import io
 import json
 import pickle
+import struct
 import subprocess
 import sys
 import time
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +85,22 @@ NESTED = {
               "<dt>d</dt><data>1. 2.\n 3.</data></_>" * 5 + "</p></opencv_storage>",
               ("0", "1", "2"), (1.0, 2.0, 3.0), None),
 }  # fmt: skip
+
+
+def npy(array: np.ndarray) -> bytes:
+    """Return an array as the bytes of a .npy file."""
+    np.save(stream := io.BytesIO(), array)
+    return stream.getvalue()
+
+
+def npz(method: int, *sizes: int) -> bytes:
+    """Return the bytes of a .npz file with an array of zeros of each size."""
+    with zipfile.ZipFile(stream := io.BytesIO(), "w", method) as archive:
+        for k, size in enumerate(sizes):
+            archive.writestr(f"{k}.npy", npy(np.zeros((size, 1), np.int8)))
+    return stream.getvalue()
+
+
 HOSTILE = {
     "aliases.yaml": b"- &a [1, 2]\n- *a\n", "itself.yaml": b"&a [*a]", "merge.yaml": b"a: {<<: {b: 1}}",
     "object.yaml": b"!!python/object/apply:os.system ['true']", "twice.yaml": b"a: 1\na: 2",
@@ -96,10 +116,21 @@ HOSTILE = {
     "cut.mat": b"MATLAB 5.0" + bytes(90),
     "cut.npy": b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999,), }" + b" " * 50,
     "bad.npz": b"PK\x03\x04" + bytes(50),
+    "bracket.txt": b"[" + b"1;" * 1_000_000 + b"]", "index.txt": b"a" + b"[1]" * 600_000 + b" = 1",
+    "values.jsonl": b"1\n" * 1_000_001,
+    "values.xml": b"<opencv_storage><a>" + b"1 " * 1_000_000 + b"</a></opencv_storage>",
+    "name.json": b'[' + b",".join([b'{"%s":[%s]}' % (b"k" * 10_000, b",".join([b"1"] * 1000))] * 3) + b"]",
+    "place.json": b'{"%s":[[{}],[{}],[{}]]}' % (b"k" * 10_000),
+    "name.txt": b"k" * 10_000 + b"=(1,2) x=(3,4)\n",
+    "bz2.npz": npz(zipfile.ZIP_BZIP2, 6), "members.npz": npz(zipfile.ZIP_DEFLATED, *[900_000] * 3),
+    "characters.npy": npy(np.array(["abcd"] * 6))[:-96] + b"\xff" * 96,
 }  # fmt: skip
 HARMLESS = ("", "\n\n", "(" * 100_000, "9" * 1_000_000 + " 1 2", "1." + "1" * 1_000_000, '"' * 50_000, "(a" * 50_000,
             "'(,)" * 20_000, "a=" * 50_000, "1 " * 100_000, "- " * 50_000, "[1 2\n" * 20_000, "x" * 1_000_000,
-            ", ,\n1 , 2\n")  # fmt: skip
+            ", ,\n1 , 2\n", "".join(f"{'x' * 100_000}{k}\n1 2 3\n" for k in range(6)), "a:" + "\n" * 200_000,
+            "( " + " ".join(f"w{k}" for k in range(100_000)) + " 1mm" * 100_000 + ")",
+            "".join(f"a{k}=1\n" for k in range(40_000)),
+            "".join("( " * 5000 + f"\n{','.join('1' * k)}" * 6 + "\n" for k in (*range(3, 13),) * 6))  # fmt: skip
 
 
 def tables_of(folder: Path, text: str | bytes, name: str = "a.txt") -> tuple[Table, ...]:
@@ -185,9 +216,21 @@ def test_arrays(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([{}], object))
     with pytest.raises(InputError, match="pickle"):
         read_tables(tmp_path / "a.npy")
-    savemat(tmp_path / "c.mat", {"A": np.zeros(3_000_000)}, do_compression=True)
-    with pytest.raises(InputError, match="20 MB"):
-        read_tables(tmp_path / "c.mat")
+    for bomb, what in ((np.zeros(3_000_000), "20 MB"), (np.zeros(9_000_000, np.int8), "1,000,000 values")):
+        savemat(tmp_path / "c.mat", {"A": bomb}, do_compression=True)
+        with pytest.raises(InputError, match=what):
+            read_tables(tmp_path / "c.mat")
+
+
+def test_an_archive_unpacks_no_more_than_it_states(tmp_path: Path) -> None:
+    data = bytearray(npz(zipfile.ZIP_DEFLATED, 200_000_000))
+    struct.pack_into("<I", data, data.rfind(b"PK\x01\x02") + 24, 200)
+    (tmp_path / "a.npz").write_bytes(data)
+    tracemalloc.start()
+    with pytest.raises(InputError):
+        read_tables(tmp_path / "a.npz")
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("name", HOSTILE)

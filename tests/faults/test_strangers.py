@@ -4,6 +4,8 @@ import json
 import math
 import os
 import shutil
+import socket
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -25,16 +27,18 @@ import capture_writers as writers
 import jcr
 from corpus import RUN_IMAGES, sound_run
 from corpus import small_capture as noise_capture
+from jcr.capture.documents import Table
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.pairing import natural
+from jcr.capture.pairing import natural, pair
 from jcr.capture.read import read_source
 from jcr.capture.ros import read_ros_depth, read_ros_image
 from jcr.cli import dispatch
 from jcr.errors import InputError, shown
 from jcr.geometry import transform
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Intrinsics, Reading, Tracks
+from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.segments.segments import read_labels
 from jcr.sfm.given import reconstruct_given
@@ -113,6 +117,39 @@ def test_other_links_must_not_lead_out(tmp_path: Path):
     (capture / "views").symlink_to(tmp_path / "private")
     with pytest.raises(InputError, match="leads out of"):
         jcr.read_capture(capture)
+
+
+def test_a_link_to_poses_elsewhere_is_refused_and_no_linked_folder_is_searched(tmp_path: Path):
+    capture = table_capture(tmp_path / "cap", str)
+    for k in range(40):
+        (capture / f"here{k}").symlink_to(".")
+    (capture / "all").symlink_to("/")
+    assert len(jcr.read_capture(capture)) == 5
+    (capture / "poses.csv").rename(tmp_path / "private")
+    (capture / "poses.csv").symlink_to(tmp_path / "private")
+    with pytest.raises(InputError, match="leads out of"):
+        jcr.read_capture(capture)
+
+
+@pytest.mark.parametrize("name", ["\ud800{}", "字" * 200 + "{}", "loop{}", "../poses{}", "images"])
+def test_a_table_that_lists_no_files_is_read_itself(tmp_path: Path, name: str):
+    capture = table_capture(tmp_path / "cap", str)
+    for k in range(5):
+        (capture / f"loop{k}").symlink_to(f"loop{k}")
+    header, *rows = (line.split(",") for line in (capture / "poses.csv").read_text().splitlines())
+    listed = [dict(zip(header, row, strict=True)) | {"file": name.format(k)} for k, row in enumerate(rows)]
+    (capture / "poses.csv").unlink()
+    (capture / "poses.json").write_text(json.dumps(listed))
+    assert len(jcr.read_capture(capture)) == 5
+
+
+def test_numbers_of_any_length_are_names(tmp_path: Path):
+    capture = table_capture(tmp_path / "cap", str)
+    table = Table(
+        file=capture, place="", columns=("x",), rows=((1.0,),) * 5, keys=tuple(f"{k}" * 5000 for k in range(5)),
+        words="",
+    )  # fmt: skip
+    assert not pair(table, [f"{k}.png" for k in range(5)]).is_by_name
 
 
 def test_a_run_folder_with_links_is_not_written_through(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -246,6 +283,56 @@ def test_a_file_that_starts_a_program_is_no_image(tmp_path: Path):
     Image.new("RGB", SIZE).save(file, format="EPS")
     with pytest.raises(InputError, match="not a readable image"):
         read_image(file)
+
+
+def tiff_of_tiles(image: tuple[int, int], tile: tuple[int, int], data: bytes) -> bytes:
+    """Return a grey TIFF whose tiles, of any size, are packed by Deflate."""
+    tags = (
+        (256, image[0]),
+        (257, image[1]),
+        (258, 8),
+        (259, 8),
+        (262, 1),
+        (277, 1),
+        (322, tile[0]),
+        (323, tile[1]),
+    )
+    entries = [*tags, (324, 8), (325, len(data))]
+    listed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
+    return (
+        b"II*\0"
+        + struct.pack("<I", 8 + len(data))
+        + data
+        + struct.pack("<H", len(entries))
+        + listed
+        + bytes(4)
+    )
+
+
+def test_a_small_image_in_a_large_tile_is_refused(tmp_path: Path):
+    file = tmp_path / "a.tif"
+    file.write_bytes(tiff_of_tiles(SIZE, (112, 80), zlib.compress(bytes(112 * 80))))
+    assert read_image(file).shape == (72, 96, 3)
+    file.write_bytes(tiff_of_tiles(SIZE, HUGE, zlib.compress(bytes(1000))))
+    with pytest.raises(InputError, match="over 64 million pixels"):
+        read_image(file)
+
+
+def test_images_in_a_file_are_not_counted(tmp_path: Path):
+    Image.new("L", SIZE).save(file := tmp_path / "a.tif")
+    data = bytearray(file.read_bytes()) + bytes(file.stat().st_size % 2)
+    (begin,) = struct.unpack_from("<I", data, 4)
+    end = begin + 2 + 12 * struct.unpack_from("<H", data, begin)[0]
+    entry = bytes(data[begin:end])
+    struct.pack_into("<I", data, end, len(data))
+    places = len(data) + (len(entry) + 4) * np.arange(1, 30_001)
+    file.write_bytes(
+        bytes(data) + b"".join(entry + struct.pack("<I", at) for at in (*places[:-1].tolist(), 0))
+    )
+    started = time.process_time()
+    with pytest.raises(InputError, match="several images"):
+        read_image(file)
+    assert time.process_time() - started < 2
 
 
 def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
@@ -636,7 +723,68 @@ def test_depth_of_a_run_folder_is_checked(tmp_path: Path):
             read_depth(tmp_path / "depth.npz", made, None)
 
 
+def test_a_reconstruction_is_not_compressed(tmp_path: Path):
+    """Zeros pack 1000 to 1; jcr writes without compression."""
+    about = np.array(json.dumps({"format": "jcr.reconstruction/9"}))
+    np.savez_compressed(tmp_path / "reconstruction.npz", about=about)
+    with pytest.raises(InputError, match="compressed"):
+        read_reconstruction(tmp_path / "reconstruction.npz")
+
+
+@pytest.mark.parametrize(
+    "reading", [{"notation": "zz"}, {"notation": "euler:abc"}, {"units": "m"}, {"columns": "c" * 2000}]
+)
+def test_a_reading_is_one_that_jcr_writes(tmp_path: Path, reading: dict[str, str]):
+    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    content = json.loads((folder / "capture.json").read_text())
+    for stated in ({"file": "poses.csv"}, {"file": "poses.csv", **reading}):
+        (folder / "capture.json").write_text(json.dumps(content | {"reading": stated}))
+        if reading.keys() <= stated.keys():
+            with pytest.raises(InputError, match="reading"):
+                jcr.read_capture(folder)
+        else:
+            assert jcr.read_capture(folder).reading == Reading(file="poses.csv")
+
+
+def test_a_message_quotes_no_number_of_thousands_of_digits(tmp_path: Path):
+    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    content = json.loads((folder / "capture.json").read_text())
+    given = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "width": 10**4000}
+    (folder / "capture.json").write_text(json.dumps(content | {"intrinsics": given}))
+    with pytest.raises(InputError) as caught:
+        jcr.read_capture(folder)
+    assert len(str(caught.value)) < 300 + len(str(folder))
+
+
+def test_a_bag_with_computed_columns_is_refused(tmp_path: Path):
+    with sqlite3.connect(tmp_path / "a.db3") as bag:
+        bag.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format, offered_qos_profiles);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob(900000000)));"
+            "INSERT INTO topics VALUES (1, '/image', 'sensor_msgs/msg/Image', 'cdr', '');"
+            "INSERT INTO topics VALUES (2, '/tf', 'tf2_msgs/msg/TFMessage', 'cdr', '');"
+            "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1), (2, 2);"
+        )
+    bag.close()
+    with pytest.raises(InputError, match="computed columns"):
+        jcr.read_capture(tmp_path / "a.db3", into=tmp_path / "into")
+
+
 # Pages
+
+
+def test_a_length_of_thousands_of_digits_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    from jcr.live.server import LiveServer
+
+    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
+    session, _ = a_capture(folder, still_frames(lambda: np.zeros((72, 96, 3), np.uint8)))
+    with LiveServer(session, takes_samples=True) as server:
+        host, port = server.server_address[:2]
+        head = f"Host: {host}:{port}\r\nAuthorization: Bearer {server.key}\r\nContent-Length: {'9' * 5000}"
+        with socket.create_connection((str(host), port), timeout=10) as client:
+            client.sendall(f"POST /sample HTTP/1.1\r\n{head}\r\n\r\n".encode())
+            assert b" 400 " in client.recv(100)
+    assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.slow

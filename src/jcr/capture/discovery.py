@@ -9,9 +9,11 @@ from pathlib import Path
 from PIL import Image
 
 from jcr.capture.documents import Table, read_record_tables, read_tables
+from jcr.capture.images import FORMATS
 from jcr.capture.pairing import NEARLY, Pairing, natural, pair, plain_name
 from jcr.capture.readings import words_of
 from jcr.errors import InputError, first_few
+from jcr.files import IMAGES, capture_file, path_inside
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OTHER_IMAGES = {
@@ -83,14 +85,27 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     folder, or beside it if there are none. Raises InputError if the folder has no images.
     """
     images, notes = find_images(folder)
-    documents = list(_files(folder)) if poses is None else [poses]
+    documents, outside = ([poses], []) if poses is not None else _own(folder, list(_files(folder)))
     tables, refused = _tables_of(documents, images)
+    refused += outside
     if not tables and not refused and poses is None:
-        beside = sorted(one for one in folder.resolve().parent.iterdir() if one.is_file())
-        tables, _ = _tables_of([one for one in beside if _may_hold_poses(one)], images)
+        parent = folder.resolve().parent
+        beside = sorted(one for one in parent.iterdir() if one.is_file() and _may_hold_poses(one))
+        tables, _ = _tables_of(_own(parent, beside)[0], images)
     return Discovery(
         images=images, tables=tuple(tables), documents=tuple(documents), refused=tuple(refused), notes=notes
     )
+
+
+def _own(folder: Path, files: Sequence[Path]) -> tuple[list[Path], list[InputError]]:
+    """Return the files of a folder without links that lead out of it, and an error for each of those."""
+    own, errors = list[Path](), list[InputError]()
+    for file in files:
+        try:
+            own.append(capture_file(folder, str(file.relative_to(folder)), str(folder)))
+        except InputError as error:
+            errors.append(error)
+    return own, errors
 
 
 def find_images(folder: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -146,18 +161,19 @@ def _preference(one: Path, folder: Path, found: dict[Path, list[Path]]) -> tuple
 def _size(file: Path) -> tuple[int, int] | None:
     """Return the size of an image file by its header; None for a damaged one."""
     try:
-        with Image.open(file) as opened:
+        with Image.open(file, formats=FORMATS) as opened:
             return opened.size
     except Exception:  # decoders raise errors of many types for a damaged file
         return None
 
 
 def _walk(folder: Path, depth: int = 0) -> Iterator[Path]:
-    """Yield the files of a folder and its subfolders, without hidden ones, nearest first."""
+    """Yield the files of a folder and its subfolders, without hidden ones and linked folders, nearest first."""
     entries = sorted(one for one in folder.iterdir() if not one.name.startswith((".", "__")))
     yield from (one for one in entries if one.is_file())
     for one in entries if depth < DEEPEST else ():
-        if one.is_dir():
+        # Links to folders would lead out, or back to where they are; only that of the images may be the user's.
+        if one.is_dir() and (not one.is_symlink() or (depth == 0 and one.name == IMAGES)):
             yield from _walk(one, depth + 1)
 
 
@@ -242,13 +258,12 @@ def _indexed(table: Table, images: Sequence[str]) -> list[Table]:
     if not of_images or len({plain_name(cell) for cell in of_images[0]} & own) < NEARLY * len(own):
         return []
     for cells in whole:
-        files = [table.file.parent / cell for cell in cells if len(cell) < 255 and "\0" not in cell]
-        inside = all(
-            file.resolve().is_relative_to(table.file.parent.resolve()) and file.is_file() for file in files
-        )
-        if cells is of_images[0] or len(files) < len(cells) or not inside:
+        if cells is of_images[0] or len(set(cells)) < len(cells):
             continue
         try:
+            if not all(path_inside(table.file.parent, cell, "").is_file() for cell in cells):
+                continue
+            files = [table.file.parent / cell for cell in cells]
             made = read_record_tables(files)
         except InputError:
             continue

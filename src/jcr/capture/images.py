@@ -37,6 +37,8 @@ BLURRED = 0.25
 """Sharpness below which a frame is blurred, as a share of the median sharpness of the frames."""
 ORIENTATION = 0x0112
 """EXIF tag that holds an image's orientation."""
+TILE = 0x0142, 0x0143
+"""Tags of a TIFF that hold width and height of its tiles (px); a tile may be larger than the image."""
 BLURRED_EDGE = 1 / 80
 """Largest `edge_width` of a sharp image; images of eleven real arms have 1/300 to 1/98."""
 EDGES_AT = 640
@@ -75,9 +77,11 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
                 if opened.format in ("JPEG", "MPO"):
                     _require_few_scans(source, where)
                 # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
-                count = getattr(opened, "n_frames", 1)
-                if opened.format != "MPO" and count > 1:
-                    raise InputError(f"{where}: holds {count} images; save one as PNG or JPEG")
+                # Counting the images would take hours for a file of a million.
+                if opened.format != "MPO" and getattr(opened, "is_animated", False):
+                    raise InputError(f"{where}: holds several images; save one as PNG or JPEG")
+                if opened.format == "TIFF":
+                    require_pixels(tuple(opened.getexif().get(tag, 1) for tag in TILE), where)
                 yield opened
     except FileNotFoundError:
         raise InputError(f"{where}: no such image; correct its name or add the file") from None

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.capture.documents import Table
-from jcr.capture.options import MAX_FRAMES
 from jcr.capture.pose_track import NEVER, interpolated_poses
 from jcr.errors import InputError, shown
+from jcr.files import LONGEST
 from jcr.geometry import inverse, motion_length
 
 _LATEST_NS = np.iinfo(np.int64).max
@@ -135,14 +135,16 @@ def _by_cells(table: Table, images: Sequence[str]) -> Pairing | None:
     best, most, own = None, 0, dict[str, list[int]]()
     for k, image in enumerate(images):
         own.setdefault(plain_name(image), []).append(k)
+    listed = "\n".join(own)
     whole = {unicodedata.normalize("NFC", image): k for k, image in enumerate(images)}
     for column, cells in _columns(table):
         row = np.full(len(images), -1)
         for r, cell in enumerate(cells):
             text = unicodedata.normalize("NFC", cell).strip().replace("\\", "/").removeprefix("./")
             like = [whole[text]] if text in whole else own.get(plain_name(text), [])
-            if not like and len(cells) <= MAX_FRAMES and len(text) >= LEAST_TEXT and not _is_number(text):
-                like = [k for name, ks in own.items() if text.casefold() in name for k in ks]
+            folded = text.casefold()
+            if not like and len(text) >= LEAST_TEXT and folded in listed and not _is_number(text):
+                like = [k for name, ks in own.items() if folded in name for k in ks]
             if len(like) == 1 and row[like[0]] < 0:
                 row[like[0]] = r
         count = int((row >= 0).sum())
@@ -192,7 +194,8 @@ def _numbers_of(names: Sequence[str]) -> list[int] | None:
     parts = [re.findall(r"\d+", plain_name(name)) for name in names]
     if not parts or len({len(one) for one in parts}) != 1:
         return None
-    columns = [[int(one[k]) for one in parts] for k in range(len(parts[0]))]
+    short = [k for k in range(len(parts[0])) if all(len(one[k]) <= LONGEST for one in parts)]
+    columns = [[int(one[k]) for one in parts] for k in short]
     unique = [column for column in columns if len(set(column)) == len(column)]
     return unique[-1] if unique else None
 

@@ -1,5 +1,6 @@
 """Pairwise pointmaps as a record and an npz file, the input of global alignment; lists of image pairs."""
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,13 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             if file.zip is not None:
-                require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
+                members = file.zip.infolist()
+                require_memory(sum(member.file_size for member in members), str(path))
+                # Of other methods than NumPy's, a few bytes unpack to gigabytes, whatever size is stated.
+                if any(
+                    one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for one in members
+                ):
+                    raise ValueError("a compression that NumPy does not write")
             arrays = dict(file)
         # NumPy returns raw bytes for members that are no arrays.
         if strangers := [name for name, array in arrays.items() if not isinstance(array, ndarray)]:

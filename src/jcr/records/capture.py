@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, StringConstraints
 
 from jcr.errors import InputError
 from jcr.records.checked import require_counts, require_fields, require_finite, require_rows
@@ -25,6 +25,15 @@ COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
 rational_polynomial (8 or 12 coefficients) and equidistant."""
 LARGEST_PX = 100_000
 """Largest width and height of an image (px)."""
+_Words = Annotated[str, StringConstraints(max_length=1000)]
+"""Text of a reading; those of jcr have a few hundred characters."""
+_Notation = Annotated[
+    str,
+    StringConstraints(
+        pattern=r"^(matrix(:columns)?|quat:(xyzw|wxyz)|rotvec|euler:([xyz]{3}|[XYZ]{3}))$", max_length=20
+    ),
+]
+_Units = Annotated[str, StringConstraints(pattern=r"^(m|cm|mm)-(rad|deg)$")]
 Pixels = Annotated[int, Field(ge=1, le=LARGEST_PX)]
 
 
@@ -121,13 +130,13 @@ class CellCamera:
 class Reading:
     """Meaning of the numbers of a pose file: columns, notation of the rotation, units, direction, and who decided it."""
 
-    file: str
+    file: _Words
     """Name of the file, or of the folder with one file for each image."""
-    columns: str = ""
+    columns: _Words = ""
     """First part of the names of the columns that hold the pose, such as `robot_coords`; empty without names."""
-    notation: str = "matrix"
+    notation: _Notation = "matrix"
     """Notation of the rotation, as in the option `--pose-convention`: matrix, quat:xyzw, rotvec, euler:ZYX, …"""
-    units: str = "m-rad"
+    units: _Units = "m-rad"
     """Units of length and angle, as in the option `--pose-units`."""
     inverted: bool = False
     """Whether the numbers are gripper_from_base."""
@@ -135,10 +144,14 @@ class Reading:
     """Evidence that left this reading alone: names of columns or files, the numbers, an option, or the images."""
     misfit_mm: float | None = None
     """Misfit (mm) of this reading to the camera poses, 1° counted as 5 mm; None if the images were not asked."""
-    next_best: str | None = None
+    next_best: _Words | None = None
     """Words for the reading with the next smallest misfit; None without one."""
     next_misfit_mm: float | None = None
     """Misfit (mm) of `next_best`."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless notation and units are known, and texts short."""
+        require_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)

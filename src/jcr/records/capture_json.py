@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from jcr.errors import InputError
+from jcr.errors import InputError, shown
 from jcr.geometry import HUGE, require_rigid
 from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
@@ -44,7 +44,7 @@ def other_size(
     Both are width and height (px). `remedy` is the end of the message. The error is not raised.
     """
     return InputError(
-        f"{what} of {size[0]}x{size[1]} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
+        f"{what} of {shown(size[0])}x{shown(size[1])} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
     )
 
 

@@ -1,6 +1,7 @@
 """Reading and writing of reconstruction.npz, a Reconstruction from which calibration and map can be made again."""
 
 import json
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -103,6 +104,10 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             if file.zip is not None:
                 require_memory(sum(member.file_size for member in file.zip.infolist()), str(path))
+                if any(member.compress_type != zipfile.ZIP_STORED for member in file.zip.infolist()):
+                    raise ValueError(
+                        "its content is compressed"
+                    )  # which may unpack to a thousand times its size
             text = str(file["about"])
             kind = json.loads(text)["format"]
             if kind != expected:

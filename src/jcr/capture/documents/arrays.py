@@ -3,6 +3,7 @@
 import io
 import math
 import struct
+import sys
 import warnings
 import zipfile
 import zlib
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from jcr.capture.documents.nested import nested_tables
+from jcr.capture.documents.nested import nested_tables, require_short
 from jcr.capture.documents.plain import MAX_DEPTH
 from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
 from jcr.errors import InputError, shown
@@ -70,11 +71,11 @@ def array_tables(file: Path, data: bytes) -> list[Table] | None:
             arrays = _read_mat(file, data)
         else:
             return None
+        return _tables_of(file, arrays)
     except InputError:
         raise
     except Exception as error:  # NumPy and SciPy parse headers with errors of many types
         raise InputError(f"{file}: not readable as arrays ({str(error)[:80]}); save it again") from None
-    return _tables_of(file, arrays)
 
 
 def _read_npy(file: Path, data: bytes) -> ndarray:
@@ -94,6 +95,8 @@ def _read_npy(file: Path, data: bytes) -> ndarray:
             f"{file}: an array of shape {shown(shape)}, too large or cut off; save the poses alone"
         )
     flat = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+    if dtype.kind == "U" and flat.size and flat.view(dtype.byteorder + "u4").max() > sys.maxunicode:
+        raise ValueError("a text with numbers of no characters")  # with which Python fails later
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
@@ -109,7 +112,16 @@ def _read_npz(file: Path, data: bytes) -> dict[str, Any]:
             raise InputError(f"{file}: an archive; unpack it")
         if sum(member.file_size for member in members.values()) > MAX_BYTES:
             raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
-        return {name.removesuffix(".npy"): _read_npy(file, archive.read(name)) for name in members}
+        if any(
+            member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+            for member in members.values()
+        ):
+            raise InputError(f"{file}: a compression that NumPy does not write; save it with numpy.savez")
+        arrays = dict[str, Any]()
+        for name, member in members.items():
+            with archive.open(member) as stream:  # its content may be longer than its stated size
+                arrays[name.removesuffix(".npy")] = _read_npy(file, stream.read(member.file_size))
+        return arrays
 
 
 def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
@@ -120,6 +132,7 @@ def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
     if len(data) <= 128:
         raise ValueError("the file is cut off")
     order, found, left, objects = "<" if data[126:128] == b"IM" else ">", dict[str, Any](), MAX_BYTES, False
+    items = 0
     for kind, content in _elements(data[128:], order):
         if kind == _COMPRESSED:
             unpacked = zlib.decompressobj().decompress(content, left + 1)
@@ -135,6 +148,9 @@ def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
             if isinstance(value, dict):
                 queue += [(f"{name}.{field}", part) for field, part in value.items()]
             else:
+                items += _count(value)
+                if items > MAX_ITEMS:
+                    raise InputError(f"{file}: more than {MAX_ITEMS:,} values; save the poses alone")
                 found[name] = value if isinstance(value, ndarray) else _plain(value)
     if objects and not found:
         raise InputError(f"{file}: {_MATLAB_OBJECT}")
@@ -159,6 +175,8 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 def _variable(content: bytes, order: str, depth: int) -> tuple[str, Any]:
     """Return name and value of a variable: array, list (cell array), dictionary (struct), text, or an object's mark."""
     parts = list(_elements(content, order))
+    if len(parts) > MAX_ITEMS:
+        raise ValueError(f"more than {MAX_ITEMS:,} values")
     if not parts or depth > MAX_DEPTH:
         return "", None
     numbers = [np.frombuffer(part, order + _KINDS.get(kind, "u1")) for kind, part in parts]
@@ -186,6 +204,13 @@ def _variable(content: bytes, order: str, depth: int) -> tuple[str, Any]:
     ] if kind == 4 else array
 
 
+def _count(value: Any) -> int:
+    """Return the number of numbers and texts in what a variable of MATLAB holds."""
+    if isinstance(value, dict | list):
+        return len(value) + sum(map(_count, value.values() if isinstance(value, dict) else value))
+    return value.size if isinstance(value, ndarray) else 1
+
+
 def _plain(value: Any) -> Any:
     """Return what a cell array or a struct array of MATLAB holds as nested lists and dictionaries."""
     if isinstance(value, dict):
@@ -201,7 +226,10 @@ def _plain(value: Any) -> Any:
 def _tables_of(file: Path, arrays: dict[str, Any]) -> list[Table]:
     """Return the tables of arrays and nested lists by name: each alone, and those of equal length joined."""
     tables, equal = list[Table | None](), defaultdict[int, dict[str, list[dict[str | int, Cell]]]](dict)
+    if sum(value.size for value in arrays.values() if isinstance(value, ndarray)) > MAX_ITEMS:
+        raise InputError(f"{file}: more than {MAX_ITEMS:,} values; save the poses alone")
     for name, value in arrays.items():
+        require_short(file, name)
         if not isinstance(value, ndarray):
             tables += nested_tables(file, {name: value} if name else value)
             continue

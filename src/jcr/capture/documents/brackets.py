@@ -5,11 +5,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
-from jcr.capture.documents.nested import is_container, leaves
+from jcr.capture.documents.nested import is_container, leaves, require_short
 from jcr.capture.documents.plain import MAX_DEPTH
-from jcr.capture.documents.table import Cell, cell_of
+from jcr.capture.documents.table import LONGEST_NAME, Cell, cell_of
 
 NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
 GLUED = re.compile(rf"({NUMBER})(mm|cm|m|deg|degrees|°|rad|s|ms)")
@@ -32,19 +33,26 @@ class Statement:
     """Line of text, continued where a bracket is open, that has numbers in brackets or numbers with names.
 
     Attributes:
+        file: Document with the line.
         lines: Index of the first line and of the line after the last one.
         key: Name of the only value, such as p10 in "CONST robtarget p10:=[…]"; None without one.
         words: Words that are no names, such as "movej p".
         entries: Values of the statement.
+        names: Names of the values if all are numbers or texts with different names; otherwise empty.
     """
 
+    file: Path
     lines: tuple[int, int]
     key: str | None
     words: str
     entries: list[Entry]
+    names: set[str]
 
     def row(self, header: Sequence[str] | None = None) -> dict[str | int, Cell]:
-        """Return the cells by column name; a cell that has no name is counted. `header` has a name for each entry."""
+        """Return the cells by column name; a cell that has no name is counted. `header` has a name for each entry.
+
+        Raises InputError for a name that is too long.
+        """
         several = sum(is_container(value) for _, value in self.entries) > 1
         row, place = dict[str | int, Cell](), 0
         for k, (name, value) in enumerate(self.entries):
@@ -53,9 +61,10 @@ class Statement:
                 row[name or len(row)] = value
                 continue
             start = name or (str(place) if several else "")
+            require_short(self.file, start)
             place += 1
             flat = isinstance(value, list) and not any(map(is_container, value))
-            for path, cell in leaves(value).items():
+            for path, cell in leaves(self.file, value).items():
                 row[f"{start}.{path}" if start else len(row) if flat else path] = cell
         return row
 
@@ -63,12 +72,12 @@ class Statement:
 class _Bracket:
     """Open bracket, or the line outside of all brackets, whose content is being read."""
 
-    __slots__ = "opening", "glued", "entries", "words", "breaks", "word", "assigned", "last"
+    __slots__ = "opening", "glued", "entries", "words", "breaks", "word", "assigned", "last", "units"
 
     def __init__(self, opening: str = "", glued: bool = False) -> None:
         self.opening, self.glued = opening, glued
         self.entries, self.words, self.breaks = list[Entry](), list[str](), list[tuple[int, str]]()
-        self.word, self.assigned, self.last = "", False, ""
+        self.word, self.assigned, self.last, self.units = "", False, "", set[str]()
 
     def add(self, value: Any, unit: str = "") -> None:
         """Append a value; a name before it with = or :, or without in braces, is the name of the value."""
@@ -79,7 +88,8 @@ class _Bracket:
         else:
             self.end_word()
             self.entries.append((None, value))
-            self.words += [unit] if unit and unit not in self.words else []
+            self.words += [unit] if unit and unit not in self.units else []
+            self.units.add(unit)
 
     def end_word(self) -> None:
         """End a word that names nothing: a file name or a word that begins with a digit is a value."""
@@ -131,7 +141,7 @@ class _Bracket:
         return parts
 
 
-def read_statements(lines: Sequence[str], across_lines: bool = True) -> list[Statement]:
+def read_statements(file: Path, lines: Sequence[str], across_lines: bool = True) -> list[Statement]:
     """Return the statements in lines of text; where a bracket is never closed, those that are within one line."""
     statements, stack, first, line, before = list[Statement](), [_Bracket()], 0, 0, -1
     for match in _TOKEN.finditer("\n".join(lines) + "\n"):
@@ -149,12 +159,12 @@ def read_statements(lines: Sequence[str], across_lines: bool = True) -> list[Sta
             break
         if token == "\n":
             line += 1
-            if len(stack) == 1 and (statement := _statement(stack[0], (first, line))):
+            if len(stack) == 1 and (statement := _statement(file, stack[0], (first, line))):
                 _append(statements, statement)
             if len(stack) == 1 or not across_lines:
                 stack, first = [_Bracket()], line
     if len(stack) > 1:
-        return read_statements(lines, False) if across_lines else []
+        return read_statements(file, lines, False) if across_lines else []
     return [
         one
         for one in statements
@@ -168,7 +178,7 @@ def _close(outer: _Bracket, inner: _Bracket) -> None:
     if (
         inner.glued
         and inner.opening == "["
-        and outer.word
+        and 0 < len(outer.word) < LONGEST_NAME
         and inner.entries[1:] == []
         and inner.last.isdigit()
     ):
@@ -176,28 +186,33 @@ def _close(outer: _Bracket, inner: _Bracket) -> None:
     elif value:
         outer.add(value)
     outer.words += inner.words
+    outer.units |= inner.units
 
 
-def _statement(line: _Bracket, lines: tuple[int, int]) -> Statement | None:
+def _statement(file: Path, line: _Bracket, lines: tuple[int, int]) -> Statement | None:
     """Return a line as a statement; None if it has neither two numbers in brackets nor only numbers with names."""
     line.end_word()
     entries, key = list[Entry](line.entries), None
-    inside = [cell for _, value in entries if is_container(value) for cell in leaves(value).values()]
+    inside = [cell for _, value in entries if is_container(value) for cell in leaves(file, value).values()]
     named = bool(entries) and all(name and not is_container(value) for name, value in entries)
     if len(entries) == 1 and inside and entries[0][0]:
         key, entries[0] = entries[0][0], (None, entries[0][1])
     if sum(isinstance(cell, float) for cell in inside) < 2 and not named and not (key and len(inside) > 2):
         return None
-    return Statement(lines=lines, key=key, words=" ".join(line.words), entries=entries)
+    names = {name for name, _ in entries if name} if named else set[str]()
+    names = names if len(names) == len(entries) else set()
+    words = " ".join(line.words)
+    return Statement(file=file, lines=lines, key=key, words=words, entries=entries, names=names)
 
 
 def _append(statements: list[Statement], new: Statement) -> None:
     """Append a statement; numbers with names that follow others on the line before, with new names, continue these."""
     if statements and statements[-1].lines[1] == new.lines[0]:
         last = statements[-1]
-        names = [name for name, value in (*last.entries, *new.entries) if name and not is_container(value)]
-        if len(set(names)) == len(names) == len(last.entries) + len(new.entries):
-            last.entries, last.lines = last.entries + new.entries, (last.lines[0], new.lines[1])
+        if last.names and new.names and last.names.isdisjoint(new.names):
+            last.entries += new.entries
+            last.names |= new.names
+            last.lines = last.lines[0], new.lines[1]
             return
     statements.append(new)
 

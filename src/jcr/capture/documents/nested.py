@@ -7,7 +7,8 @@ from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
-from jcr.capture.documents.table import MAX_TABLES, Cell, Table, cell_of, table_of
+from jcr.capture.documents.table import LONGEST_NAME, MAX_TABLES, Cell, Table, cell_of, table_of
+from jcr.errors import InputError, shown
 
 FEWEST = 3
 """Smallest number of children of a table in nested data; two are rather a pair than a table."""
@@ -18,13 +19,15 @@ Family = tuple[str, Sequence[Any], Sequence[str] | None]
 def nested_tables(file: Path, content: Any, words: str = "") -> list[Table]:
     """Return the tables in nested lists and maps, outer ones first; `words` is the text around the content.
 
-    A table is a list, a map, a group of keys that differ by a number, or a map of lists of one length.
+    A table is a list, a map, a group of keys that differ by a number, or a map of lists of one length. Raises InputError
+    for names that are too long.
     """
     tables, queue = list[Table](), deque([("", content, words)])
     while queue and len(tables) < MAX_TABLES:
         place, value, around = queue.popleft()
+        require_short(file, place)
         for name, children, keys in _families(value):
-            rows = [leaves(child) if is_container(child) else None for child in children]
+            rows = [leaves(file, child) if is_container(child) else None for child in children]
             if table := table_of(file, rows, place=_joined(place, name), keys=keys, words=around):
                 tables.append(table)
         if isinstance(value, dict):
@@ -37,11 +40,15 @@ def nested_tables(file: Path, content: Any, words: str = "") -> list[Table]:
     return tables[:MAX_TABLES]
 
 
-def leaves(value: Any) -> dict[str | int, Cell]:
-    """Return the cells of nested data by their path, such as "position.x" or "matrix.0.3"."""
+def leaves(file: Path, value: Any) -> dict[str | int, Cell]:
+    """Return the cells of nested data by their path, such as "position.x" or "matrix.0.3".
+
+    Raises InputError, begun with `file`, for a path that is too long.
+    """
     found = dict[str | int, Cell]()
 
     def descend(part: Any, path: str) -> None:
+        require_short(file, path)
         if isinstance(part, dict | list):
             parts = part.items() if isinstance(part, dict) else enumerate(part)
             start = f"{path}." if path else ""
@@ -54,6 +61,12 @@ def leaves(value: Any) -> dict[str | int, Cell]:
 
     descend(value, "")
     return found
+
+
+def require_short(file: Path, name: str) -> None:
+    """Raise InputError if the keys that lead to a value are too long together, because each value has a copy."""
+    if len(name) > LONGEST_NAME:
+        raise InputError(f"{file}: a name of {len(name)} characters, {shown(name)}; give a shorter one")
 
 
 def is_container(value: Any) -> bool:

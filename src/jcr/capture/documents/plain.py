@@ -28,7 +28,7 @@ _SYNTAXES = {
 _STARTS = {
     "XML": re.compile(r"\s*<(?:\?xml|opencv_storage)"),
     "JSON": re.compile(r'\s*(?:\{\s*"|\[\s*\{)'),
-    "YAML": re.compile(r"%YAML|---\s*\n|(?:- )?\w+:\s*\n\s+(?:- )?\w+:\s"),
+    "YAML": re.compile(r"%YAML|---\s*\n|(?:- )?\w+:[ \t\r]*\n\s+(?:- )?\w+:\s"),
 }
 """First characters of a text in each syntax, whatever the ending of the file is."""
 _CONSTANTS = {
@@ -108,6 +108,7 @@ def _parse_json(file: Path, text: str) -> list[Any]:
         value, end = decoder.raw_decode(text, end)
         require_depth(value, 0)
         values.append(value)
+        _limit(file, len(values), 0)
         while end < len(text) and text[end].isspace():
             end += 1
     return values
@@ -149,7 +150,7 @@ def _parse_xml(file: Path, text: str) -> list[Any]:
     """Return the content of a FileStorage of OpenCV in XML, in a list; raise InputError for other XML."""
     if "<!DOCTYPE" in text.upper() or "<!ENTITY" in text.upper():
         _refuse(file, "XML with a document type or entities; remove them")
-    _limit(file, text.count("<"), 0)
+    _limit(file, text.count("<") + len(text.split()), 0)
     depth, root = 0, None
     for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):  # nosec B314: no entities
         root = element if root is None else root

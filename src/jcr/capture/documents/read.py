@@ -60,7 +60,7 @@ def _records(file: Path) -> list[tuple[tuple[object, ...], dict[str | int, Cell]
     data = read_limited(file)
     if array_tables(file, data) is None and (syntax := syntax_of(file, text := decode_text(file, data))):
         content = parse_content(file, text, syntax)
-        return [(("", type(content)), leaves(content), "")]
+        return [(("", type(content)), leaves(file, content), "")]
     records = list[tuple[tuple[object, ...], dict[str | int, Cell], str]]()
     for table in read_tables(file):
         row = dict[str | int, Cell]()

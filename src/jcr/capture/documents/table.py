@@ -16,6 +16,9 @@ MAX_TABLES = 64
 """Largest number of tables of a document; further ones, which are deeper inside, are left out."""
 MAX_ITEMS = 1_000_000
 """Largest number of numbers and texts in a document; it bounds the memory that a hostile file takes."""
+LONGEST_NAME = 500
+"""Largest number of characters of the keys that lead to a value, joined by "."; those of poses have 50. It bounds the
+memory that the names of MAX_ITEMS values take: half a GB."""
 _LONGEST_WORDS = 4000
 """Largest length of `Table.words`; a title and a few comments need 1 % of it."""
 _LONGEST_NUMBER = 64

@@ -1,7 +1,8 @@
 """ROS 1 bags, ROS 2 sqlite3 and MCAP: images of one camera, with gripper poses from tf or from joint states."""
 
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from jcr.capture.pose_track import Stamps, TfTree, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
-from jcr.errors import LONGEST_SHOWN, InputError
+from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
@@ -157,6 +158,14 @@ class _Bag:
         return intrinsics_of_ros(info, size, where, is_rectified="image_rect" in self.topic)
 
 
+def _require_plain(file: Path) -> None:
+    """Raise ValueError if a table of a sqlite3 bag has columns that are computed: few bytes then yield gigabytes."""
+    with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as bag:
+        for (name,) in bag.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
+            if any(row[0] for row in bag.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,))):
+                raise ValueError(f"its table {shown(name)} has computed columns")
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open a bag and yield its rosbags AnyReader; raise InputError if the path is no bag or the bag is damaged."""
@@ -168,6 +177,8 @@ def _opened(path: Path) -> Iterator[Any]:
         files = about["rosbag2_bagfile_information"]["relative_file_paths"] if about is not None else []
         if not isinstance(files, list):  # a text would be taken for as many files as it has letters
             raise ValueError("its metadata has no list of files")
+        for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] * (path.suffix.lower() == ".db3"):
+            _require_plain(file)
         # Older sqlite3 bags hold no message definitions; the standard messages have not changed since.
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=standard)
