@@ -9,6 +9,7 @@ import sys
 import time
 import tracemalloc
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -244,7 +245,8 @@ def test_hostile(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_hostile_text_ends_soon(text: str, tmp_path: Path) -> None:
     begin = time.process_time()
-    assert len(tables_of(tmp_path, text)) <= 64
+    with suppress(InputError):  # a text with over a million values is refused
+        assert len(tables_of(tmp_path, text)) <= 64
     assert time.process_time() - begin < 5
 
 
