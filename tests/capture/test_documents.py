@@ -9,7 +9,6 @@ import sys
 import time
 import tracemalloc
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -126,12 +125,12 @@ HOSTILE = {
     "bz2.npz": npz(zipfile.ZIP_BZIP2, 6), "members.npz": npz(zipfile.ZIP_DEFLATED, *[900_000] * 3),
     "characters.npy": npy(np.array(["abcd"] * 6))[:-96] + b"\xff" * 96,
 }  # fmt: skip
-HARMLESS = ("", "\n\n", "(" * 100_000, "9" * 1_000_000 + " 1 2", "1." + "1" * 1_000_000, '"' * 50_000, "(a" * 50_000,
+HARMLESS = ("", "\n\n", "(" * 50_000, "9" * 1_000_000 + " 1 2", "1." + "1" * 1_000_000, '"' * 50_000, "(a" * 50_000,
             "'(,)" * 20_000, "a=" * 50_000, "1 " * 100_000, "- " * 50_000, "[1 2\n" * 20_000, "x" * 1_000_000,
             ", ,\n1 , 2\n", "".join(f"{'x' * 100_000}{k}\n1 2 3\n" for k in range(6)), "a:" + "\n" * 200_000,
             "( " + " ".join(f"w{k}" for k in range(100_000)) + " 1mm" * 100_000 + ")",
             "".join(f"a{k}=1\n" for k in range(40_000)),
-            "".join("( " * 5000 + f"\n{','.join('1' * k)}" * 6 + "\n" for k in (*range(3, 13),) * 6))  # fmt: skip
+            "".join("( " * 4900 + f"\n{','.join('1' * k)}" * 6 + "\n" for k in range(3, 17)))  # fmt: skip
 
 
 def tables_of(folder: Path, text: str | bytes, name: str = "a.txt") -> tuple[Table, ...]:
@@ -245,8 +244,7 @@ def test_hostile(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_hostile_text_ends_soon(text: str, tmp_path: Path) -> None:
     begin = time.process_time()
-    with suppress(InputError):  # a text with over a million values is refused
-        assert len(tables_of(tmp_path, text)) <= 64
+    assert len(tables_of(tmp_path, text)) <= 64
     assert time.process_time() - begin < 5
 
 

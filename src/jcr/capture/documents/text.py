@@ -24,7 +24,8 @@ _HEADER = re.compile(r"\"[^\"]*\"|[^\s,;]+(?:\s*[\[(][^\[\]()]*[\])])?")
 _BOUNDS = ",;:=\"'[](){}\n"
 """Characters between which values may be, besides spaces."""
 _BRACKET = 10
-"""Values whose reading takes the time of one pair of brackets, about 40 µs; 90,000 pairs are read in 4 s."""
+"""Number of values that are read in the time of a pair of brackets: 36 µs for a line of its own, 4 µs for a value. The
+largest text of such lines, 60,000, is read in 2 s."""
 _MARKS = str.maketrans("，：；−", ",:;-")
 _GAP = re.compile(r"(?<=\d)[ \t]+(?=(?:mm|cm|deg|rad|°)(?!\w))")
 _COMMENT = re.compile(r"^\s*(?:#|%|//|;|\(\*|!)+(.*)|\s(?:#|//)(.*)")
