@@ -356,3 +356,17 @@ def test_a_makers_word_beside_the_numbers_states_the_notation(text: str, convent
     found = [one for table in read_tables(tmp_path / "poses.txt") for one in read(table)]
     assert {reading.notation for reading, _ in found} == {MAKERS[convention].notation}
     assert any(np.abs(poses - POSES).max() < 1e-9 for reading, poses in found if not reading.inverted)
+
+
+def test_the_configuration_of_a_robtarget_is_no_quaternion():
+    """Without rotation, a configuration of ones and zeros has the more exact length."""
+    rows = tuple(
+        (300.0 + 20 * k, 100.0 - 20 * k, 500.0, -0.1008, -0.4892, 0.8584, -0.1165, 0.0, 0.0, -1.0, 0.0)
+        for k in range(5)
+    )
+    table = Table(
+        file=Path("a.mod"), place="", columns=(None,) * 11, rows=rows, keys=None, words="const robtarget"
+    )
+    ((reading, poses),) = readings_of(table, ReadOptions(), "a.mod")[1]
+    assert reading.notation == "quat:wxyz" and not reading.inverted
+    assert np.allclose(poses[:, :3, 3], [[0.3 + 0.02 * k, 0.1 - 0.02 * k, 0.5] for k in range(5)])

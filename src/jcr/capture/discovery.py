@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -85,13 +85,23 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     folder, or beside it if there are none. Raises InputError if the folder has no images.
     """
     images, notes = find_images(folder)
-    documents, outside = ([poses], []) if poses is not None else _own(folder, list(_files(folder)))
+    files, large = _limited(_walk(folder))
+    documents, outside = ([poses], []) if poses is not None else _own(folder, files)
     tables, refused = _tables_of(documents, images)
     refused += outside
     if not tables and not refused and poses is None:
         parent = folder.resolve().parent
-        beside = sorted(one for one in parent.iterdir() if one.is_file() and _may_hold_poses(one))
+        beside, _ = _limited(sorted(one for one in parent.iterdir() if one.is_file()))
         tables, _ = _tables_of(_own(parent, beside)[0], images)
+    if large and poses is None:
+        names = first_few([one.name for one in large])
+        notes += (
+            f"not searched for poses, over {MOST_BYTES // 1_000_000} MB in all: {names}; name one with --poses",
+        )
+    if linked := [one.name for one in sorted(folder.iterdir()) if _is_left_link(one)]:
+        notes += (
+            f"linked folders are left out: {first_few(linked)}; copy them, or name their poses with --poses",
+        )
     return Discovery(
         images=images, tables=tuple(tables), documents=tuple(documents), refused=tuple(refused), notes=notes
     )
@@ -172,24 +182,26 @@ def _walk(folder: Path, depth: int = 0) -> Iterator[Path]:
     entries = sorted(one for one in folder.iterdir() if not one.name.startswith((".", "__")))
     yield from (one for one in entries if one.is_file())
     for one in entries if depth < DEEPEST else ():
-        # Links to folders would lead out, or back to where they are; only that of the images may be the user's.
-        if one.is_dir() and (not one.is_symlink() or (depth == 0 and one.name == IMAGES)):
+        if one.is_dir() and not (one.is_symlink() if depth else _is_left_link(one)):
             yield from _walk(one, depth + 1)
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder that may hold poses, up to the limit of bytes."""
-    total = 0
-    for file in _walk(folder):
-        if _may_hold_poses(file):
+def _is_left_link(one: Path) -> bool:
+    """Test whether an entry of the capture's folder is a link to a folder other than that of the images.
+
+    Such links may lead out, or back to where they are; a link to the images may be the user's.
+    """
+    return one.is_symlink() and one.is_dir() and one.name != IMAGES and not one.name.startswith(".")
+
+
+def _limited(files: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the files that may hold poses by their endings, up to the limit of bytes, and those above the limit."""
+    taken, left, total = list[Path](), list[Path](), 0
+    for file in files:
+        if file.suffix.lower() not in {*IMAGE_SUFFIXES, *IGNORED, *OTHER_IMAGES}:
             total += file.stat().st_size
-            if total <= MOST_BYTES:
-                yield file
-
-
-def _may_hold_poses(file: Path) -> bool:
-    """Test whether a file may hold poses, by its ending."""
-    return file.suffix.lower() not in {*IMAGE_SUFFIXES, *IGNORED, *OTHER_IMAGES}
+            (taken if total <= MOST_BYTES else left).append(file)
+    return taken, left
 
 
 def _tables_of(

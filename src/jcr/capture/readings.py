@@ -252,9 +252,13 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
 
 
 def _most_exact(found: list[PoseColumns], numbers: Numbers) -> list[PoseColumns]:
-    """Return the poses whose quaternions have the most exact length; those of shifted columns are near 1 by chance."""
+    """Return the poses whose quaternions have the most exact length; those of shifted columns are near 1 by chance.
+
+    Four numbers that are 0 or 1 in all rows, such as the configuration of an arm, are no quaternion beside others.
+    """
     if len(found[0].rotation) != 4:
         return found
+    found = [one for one in found if not np.isin(np.abs(numbers[:, one.rotation]), (0.0, 1.0)).all()] or found
     off = [
         float(np.nanmax(np.abs(np.linalg.norm(numbers[:, one.rotation], axis=1) - 1), initial=0.0))
         for one in found
@@ -340,9 +344,8 @@ def readings_of(
         if np.ptp(numbers[:, one.position], axis=0).max(initial=0.0) > 0 or len(numbers) < 2
     ]
     sets = moving or sets  # a position that never changes is something else, such as an arm's configuration
-    if (
-        options.pose_convention != "auto" or _maker_in(table.words) is not None
-    ):  # all makers write the position first
+    # All makers write the position first.
+    if options.pose_convention != "auto" or _maker_in(table.words) is not None:
         sets = [one for one in sets if one.position < one.rotation or len(one.rotation) == 9] or sets
     best = max((relevance(table, one) for one in sets), default=0)
     for columns in sets:

@@ -18,6 +18,7 @@ from jcr.capture.notations import tolerated
 from jcr.capture.pairing import FARTHEST, other_orders
 from jcr.capture.readings import text_of, undecided
 from jcr.errors import InputError, RejectedError, first_few
+from jcr.estimation.observability import observability
 from jcr.estimation.pose_misfit import MM_PER_DEG, NO_FIT, Misfit, angle_gap, pair_angles, pose_misfit
 from jcr.geometry import Poses, rotation_angle
 from jcr.progress import Progress
@@ -119,13 +120,20 @@ def _taken(
         rivals = [best, *(fit for fit in others if fit.misfit.mm < BETTER * size)]
         sizes = ", ".join(_size(fit.misfit) for fit in rivals[:6])
         raise InputError(
-            f"{undecided(where, [fit.reading for fit in rivals])}; the images fit them all ({sizes}): or add images, "
-            "rotated by 20° or more about other axes"
+            f"{undecided(where, [fit.reading for fit in rivals])}, as the robot's manual has it, and do not try them in "
+            f"turn: the images fit them all ({sizes}); or add images, rotated by 20° or more about other axes"
         )
-    if len(best.poses) < FEWEST:
+    known = int(np.isfinite(best.poses[image_index]).all((1, 2)).sum())
+    if known < FEWEST:
         raise InputError(
-            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {len(best.poses)} images are too few to decide, "
-            f"{FEWEST} are needed"
+            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {known} images are too few to decide, {FEWEST} are "
+            "needed"
+        )
+    observed = observability(best.poses[np.isfinite(best.poses).all((1, 2))], best.misfit.x)
+    if not observed.observable and capture.candidates[1:]:
+        raise InputError(
+            f"{undecided(where, [fit.reading for fit in fits[:6]])}, as the robot's manual has it; these motions do not "
+            f"show it: {observed.advice[0]}"
         )
     has_pose = np.isfinite(best.poses).all((1, 2))
     rows, lost = np.flatnonzero(has_pose), [capture.images[k] for k in np.flatnonzero(~has_pose).tolist()]
