@@ -27,6 +27,7 @@ from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
 from jcr.geometry import HUGE, inverse
 from jcr.records import Reading
+from jcr.rounding import significant
 
 Numbers = Float[ndarray, "n c"]
 Candidate = tuple[Reading, Float[ndarray, "n 4 4"]]
@@ -490,3 +491,25 @@ def undecided(where: str, readings: Sequence[Reading]) -> InputError:
     listed = [f"{options_of(one, files, columns)} ({text_of(one)})" for one in readings[:6]]
     more = f", and {len(readings) - 6} more" if len(readings) > 6 else ""
     return InputError(f"{where}: the poses may be read as {'; '.join(listed)}{more}: say which")
+
+
+def decision_in_words(reading: Reading) -> str:
+    """Return a sentence on how the poses were read and what decided it, for the terminal and the report."""
+    by = {
+        "names": "by names",
+        "numbers": "by the numbers",
+        "option": "by option",
+        "images": "decided by the images",
+    }
+    text = f"{reading.file}: {text_of(reading)}; {by[reading.decided_by]}"
+    if reading.misfit_mm is None:
+        return text
+    following = ""
+    if reading.next_best is not None:
+        size = (
+            "none of them fits"
+            if reading.next_misfit_mm is None
+            else f"{significant(reading.next_misfit_mm)} mm"
+        )
+        following = f"; next best: {reading.next_best}, {size}"
+    return f"{text} ({significant(reading.misfit_mm)} mm{following})"

@@ -86,8 +86,8 @@ def read_arguments(read: ReadOptions) -> list[str]:
 def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
+    from jcr.capture.readings import decision_in_words
     from jcr.pipeline.check import QUICK
-    from jcr.pipeline.decision import decision_in_words
 
     capture = found.capture
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"

@@ -236,7 +236,7 @@ def _run(
 def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
     """Print the summary of a calibration and the capture's notes; nothing with --json, for which `show` prints all."""
     from jcr.calibration.words import MOST_LINES, summary
-    from jcr.pipeline.decision import decision_in_words
+    from jcr.capture.readings import decision_in_words
 
     if not output.json:
         others = 0 if result.cameras is None else len(result.cameras.cameras)

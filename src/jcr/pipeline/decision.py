@@ -317,25 +317,3 @@ def _size(misfit: Misfit) -> str:
     if not np.isfinite(misfit.mm):
         return "no fit"
     return f"{significant(1e3 * misfit.metres)} mm and {significant(float(np.degrees(misfit.radians)))}°"
-
-
-def decision_in_words(reading: Reading) -> str:
-    """Return a sentence on how the poses were read and what decided it, for the terminal and the report."""
-    by = {
-        "names": "by names",
-        "numbers": "by the numbers",
-        "option": "by option",
-        "images": "decided by the images",
-    }
-    text = f"{reading.file}: {text_of(reading)}; {by[reading.decided_by]}"
-    if reading.misfit_mm is None:
-        return text
-    following = ""
-    if reading.next_best is not None:
-        size = (
-            "none of them fits"
-            if reading.next_misfit_mm is None
-            else f"{significant(reading.next_misfit_mm)} mm"
-        )
-        following = f"; next best: {reading.next_best}, {size}"
-    return f"{text} ({significant(reading.misfit_mm)} mm{following})"

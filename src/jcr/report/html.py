@@ -4,6 +4,7 @@ from datetime import UTC, datetime
 
 from jcr.calibration.record import FailedCalibration, PublishedCalibration
 from jcr.capture.formats.capture_json import origin
+from jcr.capture.readings import decision_in_words
 from jcr.errors import printable
 from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
@@ -85,6 +86,8 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
             f"fx {found.fx:.2f}, fy {found.fy:.2f}{focal} · cx {found.cx:.2f}, cy {found.cy:.2f}{centre} px · "
             f"{found.model} distortion {', '.join(f'{value:.4g}' for value in found.distortion)}"
         )
+    if isinstance(capture, Capture) and capture.reading is not None:
+        lines.append(printable(f"poses: {decision_in_words(capture.reading)}"))
     content = {
         "name": printable(named.resolve().name),
         "about": [*lines, run, printable(str(source))],
