@@ -11,7 +11,7 @@ from PIL import Image
 from jcr.capture.documents import Table, read_record_tables, read_tables
 from jcr.capture.images import FORMATS
 from jcr.capture.pairing import NEARLY, Pairing, natural, pair, plain_name
-from jcr.capture.readings import words_of
+from jcr.capture.readings import pose_columns, words_of
 from jcr.errors import InputError, first_few
 from jcr.files import IMAGES, capture_file, path_inside
 
@@ -73,8 +73,8 @@ class Discovery:
     tables: tuple[tuple[Table, Pairing], ...]
     documents: tuple[Path, ...]
     """Files that may hold intrinsics or poses."""
-    refused: tuple[InputError, ...]
-    """Errors of files that cannot be read."""
+    refused: tuple[tuple[Path, InputError], ...]
+    """Files that cannot be read, or whose poses differ in number from the images, with the error of each."""
     notes: tuple[str, ...]
 
 
@@ -87,12 +87,13 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     images, notes = find_images(folder)
     files, large = _limited(_walk(folder))
     documents, outside = ([poses], []) if poses is not None else _own(folder, files)
-    tables, refused = _tables_of(documents, images)
+    tables, refused, others = _tables_of(documents, images)
     refused += outside
     if not tables and not refused and poses is None:
         parent = folder.resolve().parent
         beside, _ = _limited(sorted(one for one in parent.iterdir() if one.is_file()))
-        tables, _ = _tables_of(_own(parent, beside)[0], images)
+        tables = _tables_of(_own(parent, beside)[0], images)[0]
+    refused += others
     if large and poses is None:
         names = first_few([one.name for one in large])
         notes += (
@@ -107,14 +108,14 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     )
 
 
-def _own(folder: Path, files: Sequence[Path]) -> tuple[list[Path], list[InputError]]:
+def _own(folder: Path, files: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, InputError]]]:
     """Return the files of a folder without links that lead out of it, and an error for each of those."""
-    own, errors = list[Path](), list[InputError]()
+    own, errors = list[Path](), list[tuple[Path, InputError]]()
     for file in files:
         try:
             own.append(capture_file(folder, str(file.relative_to(folder)), str(folder)))
         except InputError as error:
-            errors.append(error)
+            errors.append((file, error))
     return own, errors
 
 
@@ -206,12 +207,14 @@ def _limited(files: Iterable[Path]) -> tuple[list[Path], list[Path]]:
 
 def _tables_of(
     documents: Sequence[Path], images: Sequence[str]
-) -> tuple[list[tuple[Table, Pairing]], list[InputError]]:
+) -> tuple[list[tuple[Table, Pairing]], list[tuple[Path, InputError]], list[tuple[Path, InputError]]]:
     """Return the tables of documents with a row for nearly every image, each paired with the images, and errors.
 
-    Files of which there is one for each image are read as one table; so are those that an index lists beside images.
+    The errors are those of files that cannot be read, and of files with too few or too many poses. Files of which there
+    is one for each image are read as one table; so are those that an index lists beside images.
     """
-    found, refused, grouped = list[tuple[Table, Pairing]](), list[InputError](), set[Path]()
+    found, grouped = list[tuple[Table, Pairing]](), set[Path]()
+    refused, others = list[tuple[Path, InputError]](), list[tuple[Path, InputError]]()
 
     def add(tables: Sequence[Table]) -> None:
         """Append the tables that may belong to the images."""
@@ -220,13 +223,17 @@ def _tables_of(
             off = abs(len(table.rows) - len(images))
             if paired.row is not None or paired.stamp_ns is not None or off <= max(2, len(images) // 4):
                 found.append((table, paired))
+            elif pose_columns(table, paired.skipped):
+                what = f"{len(table.rows)} poses for {len(images)} images ({images[0]} … {images[-1]})"
+                remedy = "give one for each image, or add a column with the images' names"
+                others.append((table.file, InputError(f"{table.file}: {what}; {remedy}")))
 
     for files in _groups([one for one in documents if one.is_file()], images):
         grouped |= set(files)
         try:
             add(read_record_tables(files))
         except InputError as error:
-            refused.append(error)
+            refused.append((files[0], error))
     for folder in (one for one in documents if one.is_dir()):
         files = sorted((one for one in folder.iterdir() if one.is_file()), key=lambda one: natural(one.name))
         add(read_record_tables(files))
@@ -234,12 +241,12 @@ def _tables_of(
         try:
             tables = read_tables(file)
         except InputError as error:
-            refused.append(error)
+            refused.append((file, error))
             continue
         add(tables)
         for table in tables:
             add(_indexed(table, images))
-    return found, refused
+    return found, refused, others
 
 
 def _groups(documents: Sequence[Path], images: Sequence[str]) -> list[list[Path]]:

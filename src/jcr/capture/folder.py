@@ -54,12 +54,12 @@ def read(path: Path, options: ReadOptions) -> Capture:
     """
     folder, poses = (path, options.poses) if path.is_dir() else (path.parent, path)
     found = discover(folder, poses)
-    sources, errors = list[_Source](), list[InputError]()
+    sources, errors = list[_Source](), list[tuple[Path, InputError]]()
     for table, paired in found.tables:
         try:
             source = _source(table, paired, options)
         except InputError as error:
-            errors.append(error)
+            errors.append((table.file, error))
             continue
         sources += [source] if source.candidates else []
     if not sources:
@@ -178,11 +178,11 @@ def _unpaired(folder: Path, found: Discovery, chosen: list[_Source], options: Re
     )
 
 
-def _no_poses(folder: Path, found: Discovery, errors: list[InputError]) -> InputError:
+def _no_poses(folder: Path, found: Discovery, errors: list[tuple[Path, InputError]]) -> InputError:
     """Return the error that no document holds poses: that of the file that most probably should, else how to add one."""
-    named = [error for error in errors if POSE_WORDS.search(Path(str(error).split(":")[0]).name)]
+    named = [one for one in errors if POSE_WORDS.search(one[0].name)]
     if named or errors:
-        return (named or errors)[0]
+        return (named or errors)[0][1]
     listed = first_few([one.name for one in found.documents])
     images = found.images
     return InputError(

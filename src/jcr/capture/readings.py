@@ -44,6 +44,8 @@ ROTATION = {
     "vector", "axis", "aa", "r", "xyzw", "wxyz", "matrix",
 }  # fmt: skip
 """Words of column names that stand for one half of a pose; the rest of the name is that of the whole pose."""
+WIDEST = 100
+"""Largest number of columns without names in which a pose is looked for; poses and joints of two arms have 30."""
 VECTOR = {"rvec", "rotvec", "vector", "aa"}
 ROBOT = {
     "robot", "tcp", "ee", "eef", "flange", "tool", "tool0", "gripper", "hand", "end", "end2base", "ee2base", "tcp2base",
@@ -233,7 +235,7 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
     Six numbers are a position and three numbers of a rotation, in either order; seven a position and a quaternion;
     twelve or sixteen a matrix. A quaternion or a matrix is found among more numbers by its length or its axes.
     """
-    for group in _layouts(len(columns)):
+    for group in _layouts(len(columns)) if len(columns) <= WIDEST else ():
         found = []
         for position, rotation, notations, zero in group:
             at, of_rotation, none = (
@@ -264,7 +266,8 @@ def _most_exact(found: list[PoseColumns], numbers: Numbers) -> list[PoseColumns]
         float(np.nanmax(np.abs(np.linalg.norm(numbers[:, one.rotation], axis=1) - 1), initial=0.0))
         for one in found
     ]
-    return [one for one, size in zip(found, off, strict=True) if size <= 10 * min(off) + 1e-5]
+    largest = 10 * min(off) + 1e-5
+    return [one for one, size in zip(found, off, strict=True) if size <= largest]
 
 
 _Layout = tuple[Sequence[int], Sequence[int], tuple[str, ...], Sequence[int]]
