@@ -248,7 +248,7 @@ MANY = {
     "columns": (
         "poses.csv",
         ",".join(f"c{k}" for k in range(30_000)) + "\n" + ",".join("0" * 30_000),
-        "poses for 1002 images",
+        "no gripper poses for its 1002 images",
     ),
 }
 
