@@ -52,3 +52,17 @@ def test_several_or_no_transforms_are_refused(tmp_path: Path):
     (tmp_path / "none.txt").write_text("hello\n1 2 3\n")
     with pytest.raises(InputError, match="holds no transform"):
         read_transform(tmp_path / "none.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ('<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>', "document type or entities"),
+        (FILES["camera.urdf"].replace("</", "<//"), "not XML"),
+        (FILES["camera.urdf"].replace("0.05 -0.02", "0.05"), "three numbers"),
+    ],
+)
+def test_a_damaged_urdf_is_refused(text: str, fault: str, tmp_path: Path):
+    (tmp_path / "arm.urdf").write_text(text)
+    with pytest.raises(InputError, match=fault):
+        read_transform(tmp_path / "arm.urdf")

@@ -4,11 +4,10 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
-from jcr.capture.documents import read_content, read_tables
+from jcr.capture.documents import read_content, read_tables, root_of_xml
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import numbers_of_table, words_of
@@ -259,12 +258,7 @@ def _of_ost(text: str) -> Iterator[dict[str, Any]]:
 
 def _of_visp(file: Path, text: str) -> Iterator[dict[str, Any]]:
     """Yield the intrinsics of a camera.xml of ViSP: the model without distortion comes first."""
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{file}: XML with a document type; remove it")
-    try:
-        camera = ElementTree.fromstring(text).find(".//camera")
-    except ElementTree.ParseError:
-        return
+    camera = root_of_xml(file, text).find(".//camera")
     if camera is None:
         return
     for model in camera.findall("model"):

@@ -2,14 +2,13 @@
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.capture.documents import read_record_tables, read_tables
+from jcr.capture.documents import read_record_tables, read_tables, root_of_xml
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.notations import poses_of_rows
 from jcr.capture.options import ReadOptions
@@ -29,7 +28,7 @@ def read_transform(file: Path) -> Float[ndarray, "4 4"]:
     or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several.
     """
     text = "" if file.suffix.lower() in ARRAYS else decode_text(file, read_limited(file))
-    found = [*_of_arguments(text), *_of_urdf(text)]
+    found = [*_of_arguments(text), *_of_urdf(file, text)]
     if not found:
         found = [*_of_matrix(file), *_of_record(file)]
     if not found:
@@ -53,17 +52,21 @@ def _from_quaternion(numbers: list[float]) -> Float[ndarray, "4 4"]:
     return transform(Rotation.from_quat(numbers[3:]).as_matrix(), np.array(numbers[:3]))
 
 
-def _of_urdf(text: str) -> list[Float[ndarray, "4 4"]]:
+def _of_urdf(file: Path, text: str) -> list[Float[ndarray, "4 4"]]:
     """Return the transforms of a URDF's fixed joints that have an origin."""
-    if "<robot" not in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
+    if "<robot" not in text:
         return []
-    try:
-        joints = ElementTree.fromstring(text).findall("joint[@type='fixed']")
-    except ElementTree.ParseError:
-        return []
+    joints = root_of_xml(file, text).findall("joint[@type='fixed']")
     made = []
     for origin in (one for joint in joints for one in joint.findall("origin")):
-        xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
+        try:
+            xyz, rpy = (
+                np.array(origin.get(key, "0 0 0").split(), float).reshape(3) for key in ("xyz", "rpy")
+            )
+        except ValueError:
+            raise InputError(
+                f"{file}: an origin whose xyz and rpy are not three numbers each; write three"
+            ) from None
         made.append(transform(Rotation.from_euler("xyz", rpy).as_matrix(), xyz))
     return made
 

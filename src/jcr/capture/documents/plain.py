@@ -70,8 +70,6 @@ def parse_content(file: Path, text: str, syntax: str) -> Any:
         _refuse(
             file, f"not JSON at line {error.lineno}, column {error.colno} ({error.msg}); correct it there"
         )
-    except ElementTree.ParseError as error:
-        _refuse(file, f"not XML ({str(error)[:80]}); correct it there")
     except RecursionError:
         _refuse(file, f"nested deeper than {MAX_DEPTH}; give a list of poses")
     return documents[0] if len(documents) == 1 else documents or None
@@ -148,17 +146,26 @@ def _scalar(text: str) -> Any:
 
 def _parse_xml(file: Path, text: str) -> list[Any]:
     """Return the content of a FileStorage of OpenCV in XML, in a list; raise InputError for other XML."""
+    root = root_of_xml(file, text)
+    if root.tag != "opencv_storage":
+        _refuse(file, "XML that is not OpenCV's FileStorage; give the numbers as YAML or CSV")
+    return [_element(file, root)]
+
+
+def root_of_xml(file: Path, text: str) -> ElementTree.Element:
+    """Return the root of a text of XML; raise InputError for document types, entities, bad syntax, size and depth."""
     if "<!DOCTYPE" in text.upper() or "<!ENTITY" in text.upper():
         _refuse(file, "XML with a document type or entities; remove them")
     _limit(file, text.count("<") + len(text.split()), 0)
-    depth, root = 0, None
-    for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):  # nosec B314: no entities
-        root = element if root is None else root
-        depth += 1 if event == "start" else -1
-        _limit(file, 0, depth)
-    if root is None or root.tag != "opencv_storage":
-        _refuse(file, "XML that is not OpenCV's FileStorage; give the numbers as YAML or CSV")
-    return [_element(file, root)]
+    depth, elements = 0, list[ElementTree.Element]()
+    try:
+        for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):  # nosec B314: no entities
+            elements = elements or [element]
+            depth += 1 if event == "start" else -1
+            _limit(file, 0, depth)
+    except ElementTree.ParseError as error:
+        _refuse(file, f"not XML ({str(error)[:80]}); correct it there")
+    return elements[0]
 
 
 def _element(file: Path, element: ElementTree.Element) -> Any:
