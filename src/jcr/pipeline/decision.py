@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.checks.convention import BETTER, of_camera
+from jcr.calibration.checks.convention import BETTER, FITTED, of_camera
 from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.folder import count_differs
 from jcr.capture.notations import tolerated
@@ -19,7 +19,15 @@ from jcr.capture.pairing import FARTHEST, other_orders
 from jcr.capture.readings import text_of, undecided
 from jcr.errors import InputError, RejectedError, first_few
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_misfit import MM_PER_DEG, NO_FIT, Misfit, angle_gap, pair_angles, pose_misfit
+from jcr.estimation.pose_misfit import (
+    LIMIT,
+    MM_PER_DEG,
+    NO_FIT,
+    Misfit,
+    angle_gap,
+    pair_angles,
+    pose_misfit,
+)
 from jcr.geometry import Poses, rotation_angle
 from jcr.progress import Progress
 from jcr.records import Capture, Reading, Reconstruction
@@ -31,6 +39,9 @@ FEWEST = 5
 """Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
 SAME_ROW = 1e-3
 """Largest difference (m, and of the entries of a rotation) of two poses of an arm at rest."""
+NO_ROBOT = float(2 * np.sqrt(3) * LIMIT[1])
+"""Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
+have the largest error on three axes."""
 MOST_CHOICES = 3000
 """Largest number of choices of rows that are tried where rows and images differ in number."""
 
@@ -159,27 +170,33 @@ def _ranked(
     candidates: Sequence[tuple[Reading, Poses]],
     recon_from_camera: Float[ndarray, "m 4 4"],
     image_index: Int[ndarray, " m"],
+    most_mm: float = np.inf,
+    fitted: int | None = None,
 ) -> list[_Fit]:
-    """Return the readings with their misfits, best first.
+    """Return the readings with their misfits, best first; a misfit above `most_mm` does not matter.
 
-    Readings are fitted in the order of their screw congruence, until the rest cannot be near the best: a difference of
-    angles is a misfit by itself. The misfit of the rest is that lower bound.
+    Readings are fitted in the order of their screw congruence, the first `fitted` ones (None: all), until the rest
+    cannot be near the best, or none of the rest can be that of a robot: a difference of angles is a misfit by itself.
+    The rest has no fit.
     """
-    cameras, gaps = pair_angles(recon_from_camera), list[float]()
-    for _, poses in candidates:
-        known = np.flatnonzero(np.isfinite(poses[image_index]).all((1, 2)))
-        of_known = pair_angles(poses[image_index[known]])
-        gaps.append(angle_gap(of_known, cameras[np.ix_(known, known)]) if len(known) > 2 else np.inf)
-    fits, best = list[_Fit](), np.inf
-    for k in np.argsort(gaps, kind="stable").tolist():
-        reading, poses = candidates[k]
-        least_mm = (
-            MM_PER_DEG * float(np.degrees(gaps[k])) / 2
-        )  # of two rotations that differ, each has half of the error
-        if least_mm > 2 * BETTER * max(best, LEAST_MISFIT) or not np.isfinite(gaps[k]):
+    cameras, fits, best, ranked = pair_angles(recon_from_camera), list[_Fit](), np.inf, []
+    for reading, poses in candidates:
+        at_images = poses[image_index]
+        known = np.flatnonzero(np.isfinite(at_images).all((1, 2)))
+        gap = (
+            angle_gap(pair_angles(at_images[known]), cameras[np.ix_(known, known)])
+            if len(known) > 2
+            else np.inf
+        )
+        ranked.append((gap, reading, poses, known))
+    for gap, reading, poses, known in sorted(ranked, key=lambda one: one[0]):
+        # Of two rotations that differ, each has half of the error.
+        least_mm = MM_PER_DEG * float(np.degrees(gap)) / 2
+        is_hopeless = gap > NO_ROBOT and best < np.inf and not any(fit.misfit.is_of_robot for fit in fits)
+        is_late = fitted is not None and len(fits) >= fitted
+        if not least_mm < min(2 * BETTER * max(best, LEAST_MISFIT), most_mm) or is_hopeless or is_late:
             fits.append(_Fit(reading, poses, NO_FIT))
             continue
-        known = np.flatnonzero(np.isfinite(poses[image_index]).all((1, 2)))
         fits.append(_Fit(reading, poses, pose_misfit(poses[image_index[known]], recon_from_camera[known])))
         best = min(best, fits[-1].misfit.mm)
     return sorted(fits, key=lambda fit: fit.misfit.mm)
@@ -207,17 +224,13 @@ def _refuse_order(
     capture: Capture, best: _Fit, recon_from_camera: Poses, image_index: Int[ndarray, " m"]
 ) -> None:
     """Raise InputError if the poses of a reading fit in another order, three times better than in the given one."""
-    size = max(best.misfit.mm, LEAST_MISFIT)
-    tried = list[_Fit]()
+    size, moved = max(best.misfit.mm, LEAST_MISFIT), list[tuple[Reading, Poses]]()
     for how, order in other_orders(capture.images):
-        candidates = []
         for reading, poses in capture.candidates:
-            moved = np.full_like(poses, np.nan)
-            has = order >= 0
-            moved[has] = poses[order[has]]
-            candidates.append((replace(reading, next_best=how), moved))
-        tried += _ranked(candidates, recon_from_camera, image_index)[:1]
-    tried = sorted((fit for fit in tried if not fit.is_of_camera), key=lambda fit: fit.misfit.mm)
+            of_order = np.where((order >= 0)[:, None, None], poses[order], np.nan)
+            moved.append((replace(reading, next_best=how), of_order))
+    ranked = _ranked(moved, recon_from_camera, image_index, size / BETTER, FITTED)
+    tried = [fit for fit in ranked if not fit.is_of_camera]
     if tried and tried[0].misfit.is_of_robot and tried[0].misfit.mm * BETTER < size:
         found = tried[0]
         raise InputError(
