@@ -21,7 +21,7 @@ from jcr.live.folder import LiveFolder
 from jcr.live.progress import Progress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
-from jcr.records import LeaveOneOut, Requirement
+from jcr.records import LeaveOneOut, PointUncertainty, PointUncertaintyOverImage, Requirement
 
 REQUIRED = (2.0, 0.3)
 RATE = 10
@@ -36,12 +36,20 @@ def a_hand_eye(met: bool, reached_mm: float = 1.0) -> Calibration:
     required = Requirement(
         translation_mm=REQUIRED[0],
         rotation_deg=REQUIRED[1],
-        asked=True,
         distance_mm=500.0,
         reached_mm=min(reached_mm, REQUIRED[0]) if met else max(reached_mm, 1.1 * REQUIRED[0]),
         reached_deg=0.1,
     )
-    return replace(found, requirement=required)
+    seen = PointUncertainty(
+        distance_mm=500.0,
+        within_95_mm=required.reached_mm,
+        lateral_95_mm=0.0,
+        along_95_mm=0.0,
+        ray_95_deg=0.0,
+        rotation_95_deg=required.reached_deg,
+    )
+    seen = PointUncertaintyOverImage(**vars(seen), corners=seen)
+    return replace(found, requirement=required, uncertainty=replace(found.uncertainty, seen=seen))
 
 
 @dataclass
@@ -90,13 +98,13 @@ class Scripted:
 
     def finish(self) -> Any:
         self.finished += 1
-        requirement = a_hand_eye(True).requirement
+        made = a_hand_eye(True)
         blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/000.png", value=5.0)
         error = LeaveOneOut(
             translation_mm=0.0123, rotation_deg=0.00456, reprojection_px=0.0789, how="joint adjustment"
         )
         findings = (blurred,) if self.warns else ()
-        found = SimpleNamespace(requirement=requirement, findings=findings, held_out=error)
+        found = replace(made, findings=findings, held_out=error)
         return SimpleNamespace(
             converged=True, calibration=found, verdict="accepted", out=self.live.folder / "result"
         )

@@ -34,7 +34,8 @@ def checked_options(options: object, kind: type[Options]) -> Options:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
+        # pydantic puts the type of a union's member into the place.
+        place = ".".join(str(part) for part in first["loc"] if "[" not in str(part))
         allowed = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")
         like = did_you_mean(str(first["input"]), allowed.split(", ")) if allowed else ""
         raise InputError(f"{kind.__name__}: {place}: {first['input']!r:.80}: {first['msg']}{like}") from None

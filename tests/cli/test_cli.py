@@ -21,6 +21,7 @@ from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.cli.use import read_points
 from jcr.errors import InputError
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation
 from jcr.live.session import SessionOptions
 from jcr.pipeline import run
@@ -107,11 +108,14 @@ def test_options_that_cannot_be_are_refused_before_any_work(
 def result(name: str, reached_mm: float) -> Any:
     """A calibration of all images, accepted or rejected, that reaches an accuracy."""
     required = Requirement(
-        translation_mm=2.0, rotation_deg=0.3, asked=True, distance_mm=500.0, reached_mm=reached_mm, reached_deg=0.1
+        translation_mm=2.0, rotation_deg=0.3, distance_mm=500.0, reached_mm=reached_mm, reached_deg=0.1
     )  # fmt: skip
     content = read_calibration(ROOT / "tests" / "calibrations" / f"{name}.json")
     assert isinstance(content, Calibration)
     content = replace(content, requirement=required)
+    if not required.met:
+        missed = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "warns", "none", **required.details)
+        content = content.with_findings(missed)
     return SimpleNamespace(
         converged=content.converged,
         verdict=content.verdict,
@@ -242,7 +246,7 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
         (["run", "a", "b", "--requre", "1", "1"], "did you mean --require? (jcr run --help)"),
         (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
         (["export", "a", "octomapp"], "did you mean octomap?"),
-        (["run", "a", "b", "--require", "2"], "--require takes MM DEG, not '2' (jcr run --help)"),
+        (["run", "a", "b", "--require", "2"], "--require takes MM DEG|none, not '2' (jcr run --help)"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),

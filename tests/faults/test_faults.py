@@ -307,7 +307,7 @@ def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
 ):
     out, temporary = tmp_path / "out", tmp_path / "temporary"
     temporary.mkdir()
-    words = ["calibrate", str(small_capture), str(out), "--quiet", "--json"]
+    words = ["calibrate", str(small_capture), str(out), "--quiet", "--json", "--require", "none"]
     with subprocess.Popen(
         [sys.executable, "-m", "jcr", *words],
         env=os.environ | {"TMPDIR": str(temporary)},

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +20,12 @@ import pytest
 import jcr
 from chromium import Chromium
 from jcr.capture.images import read_image
-from jcr.findings import Finding, FindingKind
-from jcr.live.progress import FIRST_ADVICE, Progress, advice, progress_lines
+from jcr.live.progress import progress_lines
 from jcr.live.robot import RobotState
 from jcr.live.server import MAX_SAMPLE, LiveServer
 from jcr.live.session import LiveSession
 from places import ROOT
-from scripted_capture import Scripted, a_capture, a_hand_eye, poses, still_frames, video
+from scripted_capture import Scripted, a_capture, poses, still_frames, video
 from waiting import until
 
 
@@ -99,18 +97,6 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
             "± 1.0 mm" in done["head"]
             and str(live.folder.folder / "result").replace("<c>", "&lt;c&gt;") in done["head"]
         )
-
-
-def test_few_images_forecast_no_failure():
-    """The bound with three images is too uncertain for the advice that more images would not help."""
-    short = Finding.of(
-        FindingKind.NOT_EXACT_ENOUGH, "rejects", "none", value=0.008, distance_m=0.4, reached_mm=8.0, reached_deg=0.5,
-        translation_mm=5.0, rotation_deg=1.0,
-    )  # fmt: skip
-    ten = a_hand_eye(False)
-    state = Progress(images=("a",), findings=(short,), hand_eye=replace(ten, images=ten.images[:3]))
-    assert advice(state) == FIRST_ADVICE
-    assert "would not be enough" in advice(replace(state, hand_eye=ten))
 
 
 def test_the_page_advises_until_the_requirement_is_met(capture: tuple[LiveSession, Scripted], tabletop: Path):

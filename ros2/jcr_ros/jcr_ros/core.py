@@ -238,9 +238,9 @@ class Calibrator:
             f"camera at {offset} mm on {self.settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
             f"{np.degrees(std[3:6].max()):.2g} deg; {result.verdict}"
         )
-        reasons = "" if result.converged else f": {'; '.join(result.warnings)}"
-        self.outcome = result.converged, line + reasons
-        if result.converged:
+        is_accepted = result.verdict == "accepted"
+        self.outcome = is_accepted, line + ("" if is_accepted else f": {'; '.join(result.warnings)}")
+        if is_accepted:
             self.broadcast(x)
 
     def _tell(self, answer: dict[str, Any], lines: list[str]) -> None:

@@ -74,11 +74,10 @@ class CalibratorNode(Node):
         return self.declare_parameter(name, default).value
 
     def _options(self) -> jcr.SessionOptions:
-        """Return the options of taking images; the number 0 stands for the default."""
-        require = self._parameter("require_mm", 0.0), self._parameter("require_deg", 0.0)
+        """Return the options of taking images; 0 images stand for the default."""
         return jcr.SessionOptions(
             images=self._parameter("images", 0) or None,
-            require=require if all(require) else None,
+            require=(self._parameter("require_mm", 5.0), self._parameter("require_deg", 1.0)),
             until_accurate=self._parameter("until_accurate", False),
         )
 

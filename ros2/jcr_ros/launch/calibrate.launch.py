@@ -25,8 +25,8 @@ def generate_launch_description() -> LaunchDescription:
     arguments = [DeclareLaunchArgument(name, default_value=value) for name, value in TEXT.items()]
     arguments += [
         DeclareLaunchArgument("images", default_value="0"),
-        DeclareLaunchArgument("require_mm", default_value="0.0"),
-        DeclareLaunchArgument("require_deg", default_value="0.0"),
+        DeclareLaunchArgument("require_mm", default_value="5.0"),
+        DeclareLaunchArgument("require_deg", default_value="1.0"),
         DeclareLaunchArgument("until_accurate", default_value="false"),
         DeclareLaunchArgument("at_rest", default_value="true"),
         DeclareLaunchArgument("rviz", default_value="true"),

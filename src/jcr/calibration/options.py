@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf, isfinite, radians
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -11,15 +11,18 @@ from jcr.errors import InputError
 GRASPING = (5.0, 1.0)
 """Default of the required accuracy (mm, degrees): a parallel gripper that opens 10 mm wider than its object has 5 mm to
 either side, and one degree moves the tip of a 100 mm finger by 2 mm."""
+RequiredAccuracy = Annotated[tuple[float, float] | Literal["none"], tyro.conf.arg(metavar="MM DEG|none")]
+"""Option of a required accuracy (mm, degrees), or that none is required."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
     """Required accuracy, checks and priors of a hand-eye calibration."""
 
-    require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Required accuracy of a point at the image centre, at the working distance: 95 % of errors must be below this, else
-    exit status 3. Unset: a calibration worse than 5 mm and 1°, which are enough for grasping, only gives a warning."""
+    require: RequiredAccuracy = GRASPING
+    """Required accuracy of a point at the image centre, at the working distance: 95 % of its errors are smaller, else
+    the verdict is "accepted, but not as exact as needed" and the exit status 3. 5 mm and 1° are enough for grasping.
+    none: every sound calibration is accepted."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
@@ -41,7 +44,8 @@ def check_options(options: CalibrateOptions) -> None:
     """Raise InputError if a number of the options is out of range or the name of the arm is unknown."""
     from jcr.estimation.arms import arm_named
 
-    for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):
+    required = None if options.require == "none" else options.require
+    for flag, pair in (("--require", required), ("--robot-noise", options.robot_noise)):
         if pair is not None and not all(0 < value < inf for value in pair):
             raise InputError(f"{flag} {pair[0]:g} {pair[1]:g}: give two positive numbers, mm and degrees")
     if options.scale is not None and not 0 < options.scale < inf:

@@ -137,13 +137,13 @@ class Outcome:
     @computed_field
     @property
     def verdict(self) -> Verdict:
-        """Result of all checks: accepted, accepted with warnings, or rejected."""
+        """Result of all checks: accepted; accepted, but not as exact as needed; not checked; or rejected."""
         return verdict_of(self.findings)
 
     @computed_field
     @property
     def converged(self) -> bool:
-        """Whether the calibration is accepted, with or without warnings."""
+        """Whether no finding rejects the calibration, which may be less exact than needed."""
         return self.verdict != "rejected"
 
     @computed_field
@@ -190,11 +190,6 @@ class Outcome:
     def short(self) -> Finding | None:
         """Finding that the required accuracy is not reached; None if it is."""
         return next((one for one in self.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH), None)
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether no finding rejects, apart from a missed required accuracy, so that later stages can use the result."""
-        return verdict_of(one for one in self.findings if one is not self.short) != "rejected"
 
     @property
     def remarks(self) -> list[str]:
@@ -248,7 +243,7 @@ class Calibration(Outcome):
     held_out: LeaveOneOut | None = None
     """Leave-one-out error; None where too few images are used."""
     requirement: Requirement | None = None
-    """Required and reached accuracy; None for the result of `solve_hand_eye`."""
+    """Required and reached accuracy; None if none is required, and for the result of `solve_hand_eye`."""
     with_given_intrinsics: GivenIntrinsicsResult | None = None
     """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
     depth_check: DepthCheck | None = None

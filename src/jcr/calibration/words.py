@@ -38,13 +38,14 @@ PARTS = {
 
 
 def verdict_in_words(findings: Iterable[Finding]) -> str:
-    """Return the verdict of the findings in capitals, with the number of warnings."""
+    """Return the verdict of the findings in capitals, with the number of further warnings unless it is a rejection."""
     findings = without_consequences(tuple(findings))
     verdict = verdict_of(findings)
-    warnings = sum(one.severity == "warns" for one in findings)
-    if verdict != "accepted with warnings":
+    told = FindingKind.NOT_EXACT_ENOUGH, FindingKind.NOT_CHECKED
+    warnings = sum(one.severity == "warns" and one.kind not in told for one in findings)
+    if verdict == "rejected" or not warnings:
         return verdict.upper()
-    return f"ACCEPTED with {warnings} warning{'s' * (warnings > 1)}"
+    return f"{verdict.upper()}, with {warnings} warning{'s' * (warnings > 1)}"
 
 
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
@@ -56,10 +57,8 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     if (required := content.requirement) is not None:
         corner = None if content.uncertainty is None else content.uncertainty.corner
         is_less = corner is not None and corner.within_95_mm > required.translation_mm
-        unmet = (
-            "" if required.met and not is_less else " not met in the corners" if required.met else " not met"
-        )
-        limit = f" (limit {required.translation_mm:g} mm, {required.rotation_deg:g}°{unmet})"
+        unmet = ", not met in the corners" if required.met and is_less else ""
+        limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {len(content.images)} images"
     seconds = sum(content.timings_s.values())
@@ -79,10 +78,10 @@ def _result(content: Calibration) -> list[str]:
     uncertainty = content.uncertainty
     offset = " ".join(significant(size) for size in uncertainty.translation_std_mm)
     rotation = " ".join(significant(size) for size in uncertainty.rotation_std_deg)
-    accuracy, required = "unknown", content.requirement
-    if required is not None:
-        bound = f"{significant(required.reached_mm)} mm, {significant(required.reached_deg)}° (95 %)"
-        accuracy = f"a point at {significant(1e-3 * required.distance_mm)} m: {bound}"
+    accuracy = "unknown"
+    if (seen := uncertainty.seen) is not None:
+        bound = f"{significant(seen.within_95_mm)} mm, {significant(seen.rotation_95_deg)}° (95 %)"
+        accuracy = f"a point at {significant(1e-3 * seen.distance_mm)} m: {bound}"
         if (corner := uncertainty.corner) is not None:
             accuracy += f" at the image centre; {significant(corner.within_95_mm)} mm in the corner"
     tested = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
@@ -132,10 +131,10 @@ def actions(findings: Sequence[Finding], most: int) -> list[str]:
         cause, *others = findings
         findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
         lines = labelled("Cause", text(cause)) + labelled("Remedy", *filter(None, [remedy(cause)]))
-    for one in findings:
+    for one in sorted(findings, key=lambda one: one.kind is not FindingKind.NOT_EXACT_ENOUGH):
         if one.kind is FindingKind.NOT_EXACT_ENOUGH:
             # Other lines of the summary state the required and the reached accuracy.
-            lines += labelled("WARNING", f"the limit is not met; {remedy(one)}")
+            lines += labelled("Remedy", remedy(one))
         elif one.severity != "informs":
             lines += labelled("WARNING", sentence(one))
     if len(lines) <= most:

@@ -81,7 +81,7 @@ def refined(
     finding WRONG_MOUNT if the camera turns out to be on the gripper.
     """
     rows = reconstruction.image_index
-    if not found.is_sound:
+    if not found.converged:
         on_gripper = solve_hand_eye(
             capture.base_from_gripper[rows], reconstruction.recon_from_camera, camera_errors="none"
         )

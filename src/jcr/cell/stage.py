@@ -57,7 +57,7 @@ def place_cameras(
     placed is in it with the reason. The others are the joint solution (None if no camera was placed), and for each
     placed camera a function that returns base_from_camera or gripper_from_camera from a state of the solution.
     """
-    if not hand_eye.is_sound or not others:
+    if not hand_eye.converged or not others:
         why = (Finding.of(FindingKind.OWN_REJECTED, "rejects", camera=capture.camera_name),)
         rejected = [CameraPlacement.of(one, why) for one in others]
         return CamerasFile(cameras=rejected, arms=[], version=__version__), None, {}

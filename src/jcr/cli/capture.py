@@ -65,8 +65,8 @@ class CaptureCommand:
         from jcr.live.server import LiveServer
 
         options, out, states = self.session, self.out, states_of(self.poses)
-        if options.until_accurate and options.require is None:
-            raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
+        if options.until_accurate and options.require == "none":
+            raise InputError("--until-accurate: needs the accuracy that is meant, not --require none")
         given = None if self.intrinsics_from is None else read_intrinsics(self.intrinsics_from)
         if states is None and self.poses != "http":
             raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST or http")
@@ -107,28 +107,27 @@ def _conclude(
 ) -> int:
     """Print the result of a capture and the next command; return the exit status.
 
-    The status is 3 if the calibration is rejected or failed, or if `--until-accurate` is given and not met; else 0.
+    The status is 3 if the calibration failed, is rejected or is not as exact as needed, or if `--until-accurate` is
+    given and the leave-one-out error does not confirm the accuracy; else 0.
     `facts` is the content of --json, to which the result is added. `result` None: there is no calibration.
     `requirement_met`: the last live calibration met the requirement, and its leave-one-out error confirms this.
     """
     from jcr.calibration.words import summary
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
-    is_accepted, is_met = False, False
-    facts |= {"result": None, "verdict": None}
+    verdict, is_sound = None, False
     if result is not None:
-        required, is_accepted = result.calibration.requirement, result.converged
-        is_met = is_accepted and required is not None and required.met and requirement_met
+        verdict, is_sound = result.verdict, result.converged
         lines = summary(result.calibration).splitlines()
-        facts |= {"result": str(result.out), "verdict": result.verdict}
-    command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_accepted else f"jcr check {out}"
+    facts |= {"result": None if result is None else str(result.out), "verdict": verdict}
+    command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_sound else f"jcr check {out}"
     if images < LEAST_IMAGES:
         command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
     lines += [*labelled("Capture", f"{images} images in {out}"), *labelled("Next", command)]
     arguments.output.result(lines, facts)
     if arguments.session.until_accurate:
-        return 0 if is_met else 3
-    return 3 if images >= LEAST_IMAGES and not is_accepted else 0
+        return 0 if verdict == "accepted" and requirement_met else 3
+    return 3 if images >= LEAST_IMAGES and verdict != "accepted" else 0
 
 
 def _print(text: str) -> None:

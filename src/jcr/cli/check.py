@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy, check_options
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.findings import sentence, warnings_of
@@ -29,7 +30,8 @@ UNLIKELY = 1e-3
 class CheckCommand:
     """Check a capture: files, units, motion, observability, and pose convention.
 
-    The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
+    The exit status is 3 if its calibration would be rejected or not as exact as needed; the message has the reason and
+    the remedy.
 
     for example:
       jcr check captures/table
@@ -46,17 +48,18 @@ class CheckCommand:
     """Check files, units and motion only; look for no features in the images."""
     thorough: bool = False
     """Register all images at full size. By default 8 are registered, in seconds, and all only if these show a fault."""
+    require: RequiredAccuracy = GRASPING
+    """Required accuracy of a point at the image centre, as of `jcr run`; compared with the expected one."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Noise (1 sigma per axis) of the gripper poses; unset: estimated, or 0.5 mm and 0.1°."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Check the capture and print the result; return the exit status, 3 for the verdict "rejected", else 0."""
-        from jcr.calibration.options import CalibrateOptions, check_options
+        """Check the capture and print the result; return the exit status, 0 for the verdict "accepted", else 3."""
         from jcr.capture.read import read_source
         from jcr.pipeline.check import check_capture
 
-        options = CalibrateOptions(robot_noise=self.robot_noise)
+        options = CalibrateOptions(robot_noise=self.robot_noise, require=self.require)
         check_options(options)
         # Frames of a recording are extracted to a temporary folder.
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
@@ -67,9 +70,10 @@ class CheckCommand:
                 options.robot_noise_m_rad,
                 progress,
                 self.thorough,
+                self.require,
             )
             self.output.result(_check_lines(self, found), _check_facts(found))
-        return 3 if found.verdict == "rejected" else 0
+        return 0 if found.verdict == "accepted" else 3
 
 
 def read_arguments(read: ReadOptions) -> list[str]:
@@ -97,7 +101,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         about = f"{len(capture)} images of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     undecided = isinstance(capture, Capture) and bool(capture.candidates)
-    outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
+    outcome = {"accepted": "good to calibrate", "rejected": "a calibration would be rejected"}.get(
+        found.verdict, "take more images first, or calibrate with another --require"
+    )
     verdict = verdict_in_words(found.findings)
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"

@@ -54,7 +54,7 @@ class CalibrateCommand:
     depth: DepthOptions = field(default_factory=DepthOptions)
 
     def main(self) -> int:
-        """Calibrate and print the result; return the exit status: 3 if calibration or a camera is rejected, else 0."""
+        """Calibrate and print the result; return the exit status of `show`."""
         from jcr.calibration.stage import is_one
         from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
@@ -95,7 +95,7 @@ class RunCommand(CalibrateCommand):
     """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
 
     def main(self) -> int:
-        """Run every stage, print the result and return the exit status: 3 if a calibration is rejected, else 0."""
+        """Run every stage, print the result and return the exit status of `show`."""
         from jcr.capture.read import read_capture
         from jcr.result import CAPTURE
 
@@ -117,7 +117,7 @@ class BatchCommand:
     """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 
     A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
-    exit status is 3 if any capture failed or was rejected.
+    exit status is 3 if any capture failed, was rejected, or is not as exact as needed.
 
     for example:
       jcr batch captures/* out/all
@@ -141,7 +141,7 @@ class BatchCommand:
     map: MapOptions = field(default_factory=MapOptions)
 
     def main(self) -> int:
-        """Run all captures and print a table; raise RejectedError if one failed or is rejected, else return 0."""
+        """Run all captures and print a table; return 0, or raise RejectedError unless all are accepted."""
         from jcr.pipeline.batch import batch
 
         if len(self.paths) < 2:
@@ -154,11 +154,12 @@ class BatchCommand:
             std, used = "", f"{row.used:3d}/{row.images:<3d}"
             if row.offset_std_mm is not None:
                 std = f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
-            line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
+            line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<35} {used} {std}  {row.reason}"
             lines.append(line.rstrip())
         self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})
         if doubtful := sum(not row.is_accepted for row in rows):
-            raise RejectedError(f"{doubtful} of {len(rows)} captures failed or are rejected; see {summary}")
+            why = "failed, are rejected, or are not as exact as needed"
+            raise RejectedError(f"{doubtful} of {len(rows)} captures {why}; see {summary}")
         return 0
 
 
@@ -252,12 +253,14 @@ def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: 
 
 
 def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
-    """Print the rest of a run's result; return the exit status: 3 if the calibration or a camera is rejected, else 0.
+    """Print the rest of a run's result; return the exit status.
+
+    The status is 3 if the calibration is rejected or not as exact as needed, or a camera is rejected; else 0.
 
     Printed are other cameras, the lines `more`, the path of the report, the next command, and with --verbose the
     details. With --json the whole result is printed as one object.
     """
-    from jcr.calibration.words import details
+    from jcr.calibration.words import details, verdict_in_words
 
     content, cameras, out = result.calibration, result.cameras, result.out
     placed = [] if cameras is None else cameras.cameras
@@ -272,11 +275,12 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
         about = f"REJECTED: {camera.doubt}"
         if camera.doubt is None and (found := camera.uncertainty) is not None:
             mm, deg = (significant(max(std)) for std in (found.translation_std_mm, found.rotation_std_deg))
-            about = f"{camera.verdict.upper()}, {camera.mount}_from_camera ±{mm} mm, {deg}°"
+            about = f"{verdict_in_words(camera.findings)}, {camera.mount}_from_camera ±{mm} mm, {deg}°"
             about += " (1σ, worst axis; cameras.json)"
         lines += labelled("Camera", f"{camera.name}: {about}")
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
         lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
     output.result(lines, facts)
-    return 0 if content.converged and all(camera.converged for camera in placed) else 3
+    is_reached = content.converged and content.short is None
+    return 0 if is_reached and all(camera.converged for camera in placed) else 3

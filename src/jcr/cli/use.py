@@ -17,6 +17,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
 from jcr.files import write_text
+from jcr.findings import sentence
 from jcr.progress import progress_bars
 from jcr.rounding import decimals_of
 from jcr.scene.options import CloudOptions, MapOptions
@@ -108,6 +109,8 @@ class ExportCommand:
         self.output.result(lines, facts)
         if run.doubt is not None:
             warn(f"the calibration is rejected, as the file says too: {run.doubt}")
+        elif (short := run.calibration.short) is not None:
+            warn(sentence(short))
         return 0
 
 

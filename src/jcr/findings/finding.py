@@ -20,7 +20,9 @@ Severity = Literal["rejects", "warns", "informs"]
 Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
 """Subject of a finding's remedy, in this order: another reconstruction of the same images, other motions, more or
 other images, other intrinsics, corrected gripper poses, a firm mount, the arm's name or joint angles, nothing."""
-Verdict = Literal["accepted", "accepted with warnings", "rejected"]
+Verdict = Literal["accepted", "accepted, but not as exact as needed", "not checked", "rejected"]
+"""Verdicts from best to worst: nothing contradicts the calibration and the required accuracy is reached, or none is
+required; nothing contradicts it and the accuracy is missed; no check was made; a check contradicts it."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
@@ -248,8 +250,11 @@ def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict on a calibration with these findings, which the most severe one decides."""
-    severities = {finding.severity for finding in findings}
-    if "rejects" in severities:
+    """Return the verdict on a calibration with these findings; of the warnings, only a missed accuracy changes it."""
+    found = tuple(findings)
+    if any(one.severity == "rejects" for one in found):
         return "rejected"
-    return "accepted with warnings" if "warns" in severities else "accepted"
+    kinds = {one.kind for one in found}
+    if FindingKind.NOT_CHECKED in kinds:
+        return "not checked"
+    return "accepted, but not as exact as needed" if FindingKind.NOT_EXACT_ENOUGH in kinds else "accepted"

@@ -11,8 +11,6 @@ class Requirement:
     """Required bound on the translation error."""
     rotation_deg: float
     """Required bound on the rotation error."""
-    asked: bool
-    """Whether the user gave the required accuracy; otherwise it is the default, enough for grasping."""
     distance_mm: float
     """Distance from the camera to the point at the image centre to which the bounds refer."""
     reached_mm: float

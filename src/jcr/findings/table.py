@@ -26,7 +26,7 @@ ONE_PART = (
 REACHED = (
     "a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's base frame "
     "(95 % of errors); "
-    "{translation_mm:g} mm and {rotation_deg:g}° are {asked:required|needed to grasp}"
+    "{translation_mm:g} mm and {rotation_deg:g}° are required"
 )
 """Template of the sentence with the reached and the required bound on 95 % of the errors."""
 NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
@@ -164,7 +164,7 @@ class FindingKind(StrEnum):
         f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of it comes from systematic robot "
         "errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; move "
         "closer to the scene, or use a better camera or robot}",
-        means="not as exact as `--require` asks, which rejects, or as grasping needs, which warns",
+        means="the calibration is sound, and not as exact as `--require` states; the default is 5 mm and 1°",
         help="more images; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
         "the focal length {value:grows|shrinks} by {percent:!.1f} ± {std_percent:~} % from the nearest "

@@ -192,7 +192,7 @@ class LiveCalibration:
                 few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)
             return replace(state, findings=strongest_first([*findings, few]))
         hand_eye, tracks = case.hand_eye, case.reconstruction.tracks
-        for one in hand_eye.images if hand_eye.is_sound else ():
+        for one in hand_eye.images if hand_eye.converged else ():
             metres = 1e-3 * (one.translation_residual_mm or 0.0)
             radians = float(np.radians(one.rotation_residual_deg or 0.0))
             if not one.used and (metres > SAME[0] or radians > SAME[1]):

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.calibration.options import GRASPING
+from jcr.calibration.options import RequiredAccuracy
 from jcr.capture.images import encode_jpeg, read_image
 from jcr.findings import reached_in_words, sentence
-from jcr.live.progress import accuracy_line, advice, faults, finding_lines
+from jcr.live.progress import accuracy_line, advice, faults, finding_lines, reached_accuracy
 from jcr.live.session import LiveSession, SessionState
 from jcr.records import Intrinsics
 from jcr.report.render import render
@@ -55,7 +55,7 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
     kind, *lines = verdict_lines(state)
     headline, *below = (line[:1].upper() + line[1:] for line in lines)
     content = {"state": state, "has_report": has_report, "kind": kind, "headline": headline, "lines": below}
-    content |= {"cards": _cards(state)[::-1], "tiles": _tiles(state, session.options.require or GRASPING)}
+    content |= {"cards": _cards(state)[::-1], "tiles": _tiles(state, session.options.require)}
     return {
         "version": state.version,
         "is_over": state.is_over,
@@ -90,7 +90,7 @@ def verdict_lines(state: SessionState) -> list[str]:
     wrong = faults(progress)
     if result is not None:
         required = result.calibration.requirement
-        found = [] if required is None else [reached_in_words(required)]
+        found = [] if required is None or not required.met else [reached_in_words(required)]
         found += [sentence(one) for one in result.calibration.findings if one.severity != "informs"]
         kind = {"accepted": "good", "rejected": "bad"}.get(result.verdict, "fair")
         where = f"The calibration of all {count} images is in {result.out}."
@@ -114,7 +114,7 @@ def verdict_lines(state: SessionState) -> list[str]:
     return ["", f"{count} images", accuracy_line(progress), advice(progress)]
 
 
-def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
+def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     """Return tiles of reached and required accuracy, number of registered images, and leave-one-out error.
 
     Accuracy and error are those of the final calibration if there is one. `required` are bounds (mm, degrees) on 95 %
@@ -125,11 +125,11 @@ def _tiles(state: SessionState, required: tuple[float, float]) -> list[Tile]:
     tiles, reached, error = list[Tile](), state.progress.reached or (), state.progress.leave_one_out
     if state.result is not None:
         error = state.result.calibration.held_out
-        if (found := state.result.calibration.requirement) is not None:
-            reached = found.reached_mm, found.reached_deg
+        reached = reached_accuracy(state.result.calibration) or ()
     names = ("Point uncertainty", " mm"), ("Direction", "°")
-    for (name, unit), value, limit in zip(names, reached, required, strict=False):
-        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", f"required {limit:g}{unit}", True))
+    for k, ((name, unit), value) in enumerate(zip(names, reached, strict=False)):
+        limit = "" if required == "none" else f"required {required[k]:g}{unit}"
+        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", limit, True))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
     if error is not None:

@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.record import Calibration
+from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.words import leave_one_out_text
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
 from jcr.records import LeaveOneOut
@@ -37,12 +37,8 @@ class Progress:
 
     @property
     def reached(self) -> tuple[float, float] | None:
-        """Reached accuracy: bounds (mm, degrees) on 95 % of the errors of a point at the working distance.
-
-        None without a calibration, or if the calibration has no requirement.
-        """
-        required = None if self.hand_eye is None else self.hand_eye.requirement
-        return None if required is None else (float(required.reached_mm), float(required.reached_deg))
+        """Accuracy of the calibration (`reached_accuracy`); None without a calibration."""
+        return None if self.hand_eye is None else reached_accuracy(self.hand_eye)
 
     @property
     def leave_one_out(self) -> LeaveOneOut | None:
@@ -89,6 +85,12 @@ class Progress:
         }
 
 
+def reached_accuracy(hand_eye: AnyCalibration) -> tuple[float, float] | None:
+    """Return the bounds (mm, degrees) on 95 % of the errors of a point at the working distance; None if unknown."""
+    seen = None if hand_eye.uncertainty is None else hand_eye.uncertainty.seen
+    return None if seen is None else (float(seen.within_95_mm), float(seen.rotation_95_deg))
+
+
 def faults(state: Progress) -> list[Finding]:
     """Return the findings that reject the calibration or warn, first those about the image added last.
 
@@ -113,16 +115,11 @@ def finding_lines(state: Progress) -> list[str]:
 
 
 def advice(state: Progress) -> str:
-    """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist.
-
-    With fewer than eight used images, a forecast that more images will not help is left out: it is too uncertain.
-    """
+    """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist."""
     if state.requirement_met:
         return REQUIREMENT_MET
-    few = state.hand_eye is not None and state.hand_eye.images_used < CONFIRMING_IMAGES
     missed = (one for one in state.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH)
-    short = [remedy(one) for one in missed if one.concerns == "images" or not few]
-    return short[0] if short else FIRST_ADVICE
+    return next(map(remedy, missed), FIRST_ADVICE)
 
 
 def progress_lines(state: Progress) -> list[str]:
@@ -142,7 +139,7 @@ def accuracy_line(state: Progress) -> str:
         return f"{images}: no calibration yet"
     mm, deg = map(significant, state.reached)
     line = f"{images}: ± {mm} mm and {deg}° (95 % of errors of a point at the working distance)"
-    line += "" if state.hand_eye.is_sound else ", rejected"
+    line += "" if state.hand_eye.converged else ", rejected"
     if (required := state.hand_eye.requirement) is not None:
         met = "met" if state.requirement_met else "not met"
         if required.met and not state.requirement_met:

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.options import GRASPING, RequiredAccuracy
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame, frame_at_rest
 from jcr.live.progress import Progress, progress_lines
@@ -46,8 +46,8 @@ class SessionOptions:
     """Stop with this many images; unset: 12, and with --until-accurate 40."""
     patience: float = 5.0
     """Seconds to wait for an image at rest."""
-    require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Required accuracy: 95 % of errors of a point seen at the distance of the scene. Unset: 5 mm and 1°."""
+    require: RequiredAccuracy = GRASPING
+    """Required accuracy: 95 % of errors of a point seen at the distance of the scene are smaller."""
     until_accurate: bool = False
     """End, with exit status 0, as soon as the requirement is met and the leave-one-out error confirms it; with
     status 3 where it is not met with the last image."""
@@ -284,8 +284,7 @@ class LiveSession:
                 self._report(progress)
                 if self.options.until_accurate and progress.requirement_met:
                     result = self.calibration.finish()
-                    required = result.calibration.requirement
-                    if result.converged and required is not None and required.met:
+                    if result.verdict == "accepted":
                         self._show(is_over=True, result=result)
         except (InputError, RejectedError) as error:
             self._refuse(f"no calibration: {error}")

@@ -31,7 +31,7 @@ from jcr.report.render import render
 from jcr.result import CAPTURE, RunOptions, load_run
 
 MIN_EPISODES = 3
-"""Smallest number of accepted episodes of a data set whose cameras are compared with each other."""
+"""Smallest number of sound episodes of a data set whose cameras are compared with each other."""
 THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 """Environment variables from which numerical libraries read their number of threads when a process starts."""
 
@@ -74,8 +74,13 @@ class BatchRow:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether the calibration is accepted, with or without warnings."""
-        return self.status in ("accepted", "accepted with warnings")
+        """Whether the calibration is accepted and as exact as required, or by the published method."""
+        return self.status in ("accepted", "not checked")
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether no check contradicts the calibration, which may be less exact than needed."""
+        return self.status not in ("rejected", "failed")
 
 
 def batch(
@@ -155,13 +160,13 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
 def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
     """Return the rows with the camera's motion between episodes, and a reason where the motion is significant.
 
-    `moved_mm` and `moved_deg` are relative to the accepted episode of the same capture with the smallest median χ² to
-    all its accepted episodes. χ² is the squared difference of two hand-eye transforms, weighted by its inverse
-    covariance. Significant is a p-value below 0.001. Captures with fewer than three accepted episodes are unchanged.
+    `moved_mm` and `moved_deg` are relative to the sound episode of the same capture with the smallest median χ² to
+    all its sound episodes. χ² is the squared difference of two hand-eye transforms, weighted by its inverse
+    covariance. Significant is a p-value below 0.001. Captures with fewer than three sound episodes are unchanged.
     """
     found = list(rows)
     for capture in {row.capture for row in rows}:
-        members = [k for k, row in enumerate(rows) if row.capture == capture and row.is_accepted]
+        members = [k for k, row in enumerate(rows) if row.capture == capture and row.is_sound]
         if len(members) < MIN_EPISODES:
             continue
         results = [load_run(Path(rows[k].out)).calibration for k in members]

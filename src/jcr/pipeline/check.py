@@ -11,11 +11,11 @@ from jcr.boards.proposal import proposed
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.calibration.hand_eye import SCALE_STD
-from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration
+from jcr.calibration.requirement import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
-from jcr.calibration.stage import calibrate_pose_pairs, checked_case, is_one
+from jcr.calibration.stage import calibrate_pose_pairs, checked_case
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
@@ -61,7 +61,8 @@ class Examination:
     """Largest angle between two gripper poses."""
     observability: Observability
     expected: Uncertainty | None
-    """Predicted uncertainty of a calibration from the `counted` images; None for fewer than three of them."""
+    """Predicted uncertainty of a calibration from the `counted` images, None for fewer than three of them; of PosePairs
+    the uncertainty of their calibration."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did or, if not all were tried, the clear ones."""
     hand_eye: Calibration | None
@@ -97,13 +98,15 @@ def check_capture(
     robot_noise: tuple[float, float] | None = None,
     progress: Progress | None = None,
     thorough: bool = False,
+    require: RequiredAccuracy = GRASPING,
 ) -> Examination:
     """Examine a capture, or the capture at a path: its motion, images, and expected uncertainty.
 
     `look`: reconstruct the images from sparse features and compare the camera poses with the gripper poses. A few images
     of reduced size are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have
-    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad). Raises
-    InputError if gripper poses and joint angles contradict each other.
+    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad). `require`
+    is the required accuracy (mm, degrees); a finding states if the one that is expected from the images misses it.
+    Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture, progress=progress)
@@ -114,7 +117,8 @@ def check_capture(
     if move_m < 5e-3 and rotation_rad > np.radians(5):
         moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
         notes.append(f"the gripper moves {moved}: the positions may have been divided by 1000")
-    options = CalibrateOptions(robot_noise=robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1])))
+    noise = robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1]))
+    options = CalibrateOptions(robot_noise=noise, require=require)
     camera, views, shown = None, (), _Comparison()
     if isinstance(capture, PosePairs):
         robot, clear = errors_of(given), np.arange(len(capture))
@@ -136,9 +140,15 @@ def check_capture(
     found = [*shown.findings, *of_motion, *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
     expected = None
-    if len(counted) >= FEWEST:
+    if isinstance(capture, PosePairs):
+        # This is the calibration itself, which needs no prediction.
+        expected = shown.hand_eye and shown.hand_eye.uncertainty
+    elif len(counted) >= FEWEST:
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
+        if assumptions is not None:
+            x = assumptions.gripper_from_camera
+            found += requirement_of(x, expected, found, len(counted), options)[1]
     return Examination(
         capture=capture,
         largest_move_m=move_m,
@@ -181,13 +191,9 @@ def _compare(
     of all images if `thorough` is set, or if the first comparison fails, is rejected, or does not use all QUICK images.
     """
     if isinstance(capture, PosePairs):
-        hand_eye, assumptions = calibrate_pose_pairs(capture, options), None
-        used, findings = hand_eye.inliers, hand_eye.findings
-        if hand_eye.converged:
-            scale_std = SCALE_STD if capture.is_metric and is_one(hand_eye) else None
-            assumptions = assumptions_of_poses(hand_eye, capture.base_from_gripper[used], scale_std)
-        rows = np.flatnonzero(used)
-        return _Comparison(hand_eye=hand_eye, findings=findings, registered=rows, assumptions=assumptions)
+        hand_eye = calibrate_pose_pairs(capture, options)
+        rows = np.flatnonzero(hand_eye.inliers)
+        return _Comparison(hand_eye=hand_eye, findings=hand_eye.findings, registered=rows)
     is_quick = not thorough and len(capture) > QUICK
     tried, of_tried, size_px = capture, robot, WORKING_SIZE_PX
     if is_quick:
@@ -220,25 +226,15 @@ def assumptions_of(case: Case) -> Assumptions:
 
     If the case's images were not adjusted, camera poses are assumed to be given and exact (`Assumptions.camera` None).
     """
-    used, metric_std = case.base_from_gripper[case.used], case.reconstruction.metric_std
-    assumptions = assumptions_of_poses(case.hand_eye, used, metric_std)
-    if case.adjusted is None or (distance := case.scene_distance_m) is None:
-        return assumptions
-    return replace(assumptions, distance_m=distance, camera=PredictedCamera.of(case.adjusted))
-
-
-def assumptions_of_poses(
-    hand_eye: Calibration, used: Float[ndarray, "n 4 4"], scale_std: float | None
-) -> Assumptions:
-    """Return the assumptions of predictions for a calibration from camera poses; `used` are its used gripper poses.
-
-    `scale_std` is the relative standard deviation of a known scale; None: the scale is estimated.
-    """
+    x, used, distance_m = case.hand_eye.gripper_from_camera, case.base_from_gripper[case.used], None
+    if case.adjusted is not None:
+        distance_m = case.scene_distance_m
     return Assumptions(
-        gripper_from_camera=hand_eye.gripper_from_camera,
-        distance_m=median_distance(used @ hand_eye.gripper_from_camera),
-        noise=hand_eye.robot_noise,
-        scale_std=scale_std,
+        gripper_from_camera=x,
+        distance_m=median_distance(used @ x) if distance_m is None else distance_m,
+        noise=case.hand_eye.robot_noise,
+        scale_std=case.reconstruction.metric_std,
+        camera=None if case.adjusted is None or distance_m is None else PredictedCamera.of(case.adjusted),
     )
 
 

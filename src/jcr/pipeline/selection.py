@@ -72,8 +72,8 @@ class Trial:
 
     @property
     def rejection(self) -> Finding | None:
-        """First finding that rejects the calibration; None without one, or if only the required accuracy is missed."""
-        if self.hand_eye is None or self.hand_eye.is_sound:
+        """First finding that rejects the calibration; None without one."""
+        if self.hand_eye is None or self.hand_eye.converged:
             return None
         return next(finding for finding in self.hand_eye.findings if finding.severity == "rejects")
 
@@ -98,7 +98,7 @@ class Trial:
         """
         if self.hand_eye is None:
             return not isinstance(self.failure, InputError)
-        return self.hand_eye.verdict != "accepted" or not all(one.used for one in self.hand_eye.images)
+        return bool(self.hand_eye.warnings) or not all(one.used for one in self.hand_eye.images)
 
     def in_words(self, is_kept: bool = False) -> str:
         """Return the back end, its features and its leave-one-out error, and the reason why it failed or is rejected.
@@ -290,7 +290,7 @@ def _select(
             why = f"is rejected, too, and was used: {reason}"
         texts = [*(one.in_words() for one in others), f"{kept.in_words(is_kept=True)} {why}"]
         notes.insert(0, f"back end {'; '.join(texts)}")
-    found = of_images if hand_eye.is_sound else as_causes(of_images)
+    found = of_images if hand_eye.converged else as_causes(of_images)
     attempts = tuple(replace(one.account, why_not=None) if one is kept else one.account for one in trials)
     hand_eye = replace(hand_eye, attempts=attempts, timings_s=timings_of(attempts))
     reconstruction = replace(reconstruction, notes=(*notes, *reconstruction.notes))

@@ -339,7 +339,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
         x, base_from_recon = hand_eye.gripper_from_camera, hand_eye.base_from_recon
         made = extend(made, x, base_from_recon, len(capture), added, progress)
     made, remarks = with_measured_depth(
-        capture, made, hand_eye.depth_check if hand_eye.is_sound else None, hand_eye.scale
+        capture, made, hand_eye.depth_check if hand_eye.converged else None, hand_eye.scale
     )
     given = image_labels(capture, made, hand_eye, options.segment, progress)
     labels, names = given or (None, ("none",))

@@ -47,10 +47,8 @@ class Verification(Drift):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the old calibration: rejected if the camera moved, accepted with warnings if there are notes."""
-        if self.moved:
-            return "rejected"
-        return "accepted with warnings" if self.notes else "accepted"
+        """Verdict on the old calibration: rejected if the camera moved."""
+        return "rejected" if self.moved else "accepted"
 
     @property
     def finding(self) -> str:

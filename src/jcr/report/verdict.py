@@ -82,12 +82,11 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     A tile is (name, number as text, remark, whether it is a main number). Tiles whose numbers the calibration does not
     have are left out; without the corner, the rotation uncertainty of the camera is given.
     """
-    uncertainty, required = calibration.uncertainty, calibration.requirement
-    if required is not None:
-        far, turned = significant(1e-3 * required.distance_mm), significant(required.reached_deg)
-        bound = f"{significant(required.reached_mm)} mm"
-        yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", True
+    uncertainty = calibration.uncertainty
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
+        far, turned = significant(1e-3 * seen.distance_mm), significant(seen.rotation_95_deg)
+        bound = f"{significant(seen.within_95_mm)} mm"
+        yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", True
         degrees = significant(seen.corners.rotation_95_deg)
         yield (
             "Point in the image corner",
