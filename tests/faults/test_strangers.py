@@ -124,11 +124,21 @@ def test_a_link_to_poses_elsewhere_is_refused_and_no_linked_folder_is_searched(t
     for k in range(40):
         (capture / f"here{k}").symlink_to(".")
     (capture / "all").symlink_to("/")
-    assert len(jcr.read_capture(capture)) == 5
+    (capture / "log").mkdir()
+    (capture / "log/deep").symlink_to(tmp_path)
+    read = jcr.read_capture(capture)
+    assert len(read) == 5 and "linked folders are left out: all, here0, here1" in "".join(read.notes)
+    for link in capture.glob("[ah]*"):
+        link.unlink()
+    assert "linked folders are left out: log/deep;" in "".join(jcr.read_capture(capture).notes)
     (capture / "poses.csv").rename(tmp_path / "private")
     (capture / "poses.csv").symlink_to(tmp_path / "private")
     with pytest.raises(InputError, match="leads out of"):
         jcr.read_capture(capture)
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked/rgb").symlink_to(capture)
+    with pytest.raises(InputError, match="holds no images .*; linked folders are left out: rgb: copy them"):
+        jcr.read_capture(tmp_path / "linked")
 
 
 @pytest.mark.parametrize("name", ["\ud800{}", "字" * 200 + "{}", "loop{}", "../poses{}", "images"])
@@ -625,6 +635,11 @@ def changed_map(
     save_file(tensors, file, metadata=metadata)
 
 
+def finer(cell: float, shape: Any) -> list[Any]:
+    """Return a lattice that spans the workspace with ten nodes a cell."""
+    return [cell / 10, [10 * count + 1 for count in shape]]
+
+
 MAP_CHANGES: dict[str, Callable[[dict[str, Any], dict[str, Any]], object]] = {
     "cells ten times as large": lambda about, _: about.update(cell=10 * about["cell"]),
     "cells of NaN": lambda about, _: about.update(cell=math.nan),
@@ -636,6 +651,11 @@ MAP_CHANGES: dict[str, Callable[[dict[str, Any], dict[str, Any]], object]] = {
     "a corner at infinity": lambda _, tensors: tensors["lower"].fill_(math.inf),
     "states of no meaning": lambda _, tensors: tensors["seen"].fill_(255),
     "a network of NaN": lambda _, tensors: tensors["fields.of.0.hidden.bias"].fill_(math.nan),
+    "nodes 1000 times as many as cells": lambda about, tensors: about["lattices"].__setitem__(
+        0, finer(about["cell"], tensors["seen"].shape)
+    ),
+    "a thousand networks": lambda about, _: about.update(networks=about["networks"][:1] * 1000),
+    "no seen space": lambda _, tensors: tensors.update(seen=tensors["seen"][:0]),
     "nodes that are not there": lambda _, tensors: tensors["fields.lattices.0.nodes"].fill_(10**9),
 }
 
@@ -648,7 +668,7 @@ def test_a_map_that_was_changed_answers_nothing(tmp_path: Path, map_file: Path, 
     changed_map(map_file, file, lambda *_: None, seals)
     assert jcr.load_map(file).check_spheres(np.zeros((1, 3)), 0.01).shape == (1,)
     changed_map(map_file, file, MAP_CHANGES[what], seals)
-    with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged|grid of seen space"):
+    with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged"):
         jcr.load_map(file)
 
 
@@ -684,6 +704,10 @@ CLOUD_CHANGES: dict[str, Callable[[bytes], bytes]] = {
         b"float x\nproperty float y", b"float y\nproperty float x"
     ),
     "a camera that is not counted": lambda data: data.replace(b"comment camera 0", b"comment camera 1"),
+    "many cameras": lambda data: data.replace(
+        b"element", b"".join(b"comment camera %d 0 0 0\n" % k for k in range(1, 10**5)) + b"element", 1
+    ),
+    "margins below 0": cell_of("margin", -1),
     "points twice": lambda data: data + data.partition(b"end_header\n")[2],
 }
 

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -85,7 +85,8 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     folder, or beside it if there are none. Raises InputError if the folder has no images.
     """
     images, notes = find_images(folder)
-    files, large = _limited(_walk(folder))
+    listed, linked = _files_of(folder)
+    files, large = _limited(listed)
     documents, outside = ([poses], []) if poses is not None else _own(folder, files)
     tables, refused, others = _tables_of(documents, images)
     refused += outside
@@ -99,10 +100,8 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
         notes += (
             f"not searched for poses, over {MOST_BYTES // 1_000_000} MB in all: {names}; name one with --poses",
         )
-    if linked := [one.name for one in sorted(folder.iterdir()) if _is_left_link(one)]:
-        notes += (
-            f"linked folders are left out: {first_few(linked)}; copy them, or name their poses with --poses",
-        )
+    if linked:
+        notes += (f"{_names_of(linked, folder)}; copy them, or name their poses with --poses",)
     return Discovery(
         images=images, tables=tuple(tables), documents=tuple(documents), refused=tuple(refused), notes=notes
     )
@@ -127,7 +126,8 @@ def find_images(folder: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     if there are none.
     """
     found, others = dict[Path, list[Path]](), Counter[str]()
-    for file in _walk(folder):
+    files, linked = _files_of(folder)
+    for file in files:
         if (suffix := file.suffix.lower()) in OTHER_IMAGES:
             others[OTHER_IMAGES[suffix]] += 1
         relative = file.relative_to(folder)
@@ -135,12 +135,12 @@ def find_images(folder: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if suffix in IMAGE_SUFFIXES and not words & NOT_SCENE:
             found.setdefault(file.parent, []).append(file)
     if not found:
-        what = (
-            f"; it holds {first_few(sorted(others))} pictures: convert them to PNG or JPEG" if others else ""
-        )
-        raise InputError(
-            f"{folder}: holds no images ({', '.join(IMAGE_SUFFIXES)}){what or '; put them there'}"
-        )
+        what = "put them there"
+        if others:
+            what = f"it holds {first_few(sorted(others))} pictures: convert them to PNG or JPEG"
+        elif linked:
+            what = f"{_names_of(linked, folder)}: copy them, or call the link {IMAGES}"
+        raise InputError(f"{folder}: holds no images ({', '.join(IMAGE_SUFFIXES)}); {what}")
     if max(map(len, found.values())) == 1 and len(found) > 2:  # a folder for each image
         taken, chosen, notes = [one for files in found.values() for one in files], folder, list[str]()
     else:
@@ -178,21 +178,23 @@ def _size(file: Path) -> tuple[int, int] | None:
         return None
 
 
-def _walk(folder: Path, depth: int = 0) -> Iterator[Path]:
-    """Yield the files of a folder and its subfolders, without hidden ones and linked folders, nearest first."""
-    entries = sorted(one for one in folder.iterdir() if not one.name.startswith((".", "__")))
-    yield from (one for one in entries if one.is_file())
-    for one in entries if depth < DEEPEST else ():
-        if one.is_dir() and not (one.is_symlink() if depth else _is_left_link(one)):
-            yield from _walk(one, depth + 1)
+def _files_of(folder: Path, depth: int = 0) -> tuple[list[Path], list[Path]]:
+    """Return the files of a folder and its subfolders, nearest first, and the linked folders that are left out.
 
-
-def _is_left_link(one: Path) -> bool:
-    """Test whether an entry of the capture's folder is a link to a folder other than that of the images.
-
-    Such links may lead out, or back to where they are; a link to the images may be the user's.
+    Hidden entries are not listed. A link may lead out of the folder or back into it; only one called images is followed.
     """
-    return one.is_symlink() and one.is_dir() and one.name != IMAGES and not one.name.startswith(".")
+    entries = sorted(one for one in folder.iterdir() if not one.name.startswith((".", "__")))
+    files, linked = [one for one in entries if one.is_file()], list[Path]()
+    for one in (entry for entry in entries if entry.is_dir()) if depth < DEEPEST else ():
+        is_left = one.is_symlink() and (depth > 0 or one.name != IMAGES)
+        more, left = ([], [one]) if is_left else _files_of(one, depth + 1)
+        files, linked = files + more, linked + left
+    return files, linked
+
+
+def _names_of(linked: Sequence[Path], folder: Path) -> str:
+    """Return words for linked folders that were left out."""
+    return f"linked folders are left out: {first_few([str(one.relative_to(folder)) for one in linked])}"
 
 
 def _limited(files: Iterable[Path]) -> tuple[list[Path], list[Path]]:

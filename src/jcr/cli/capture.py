@@ -10,7 +10,7 @@ import tyro
 
 from jcr.capture.formats.capture_json import read_intrinsics
 from jcr.cli.output import Output
-from jcr.errors import InputError
+from jcr.errors import InputError, printable
 from jcr.estimation.arms import CHOICES, RobotName
 from jcr.files import locked
 from jcr.live.cameras import open_camera
@@ -132,5 +132,5 @@ def _conclude(
 
 def _print(text: str) -> None:
     """Print progress on stderr."""
-    sys.stderr.write(text + "\n")
+    sys.stderr.write(f"{printable(text)}\n")
     sys.stderr.flush()

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from jcr.errors import printable
+
 
 @dataclass(frozen=True)
 class Output:
@@ -19,7 +21,8 @@ class Output:
 
     def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
         """Print the result: with --json `facts` as one JSON object (arrays as lists), otherwise the `lines`."""
-        shown = [json.dumps(facts, default=lambda array: array.tolist())] if self.json else lines
+        as_json = [json.dumps(facts, default=lambda array: array.tolist())] if self.json else []
+        shown = as_json or map(printable, lines)  # names in files must not command the terminal
         sys.stdout.writelines(f"{line}\n" for line in shown)
         sys.stdout.flush()
 
@@ -43,7 +46,7 @@ class Quiet(io.TextIOWrapper):
 def warn(text: str) -> None:
     """Print a warning that the user must act on, on stderr, also with --quiet."""
     stream = sys.stderr.before if isinstance(sys.stderr, Quiet) else sys.stderr
-    stream.write(f"warning: {text}\n")
+    stream.write(f"warning: {printable(text)}\n")
 
 
 def numbers(values: Iterable[float], digits: int, sign: str = "") -> str:

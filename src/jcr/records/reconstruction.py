@@ -244,6 +244,9 @@ class PointCloud:
         require_fields(self)
         numbers = "points_in_base", "confidence", "margin", "depth_std", "camera_centers_in_base"
         require_finite("PointCloud", **{name: getattr(self, name) for name in numbers})
+        for name in ("margin", "depth_std"):
+            if (sizes := getattr(self, name)) is not None and (sizes < 0).any():
+                raise InputError(f"PointCloud: {name} below 0; make the cloud again")
         require_rows("PointCloud", "label", self.label, len(self.label_names))
         require_rows("PointCloud", "image", self.image, len(self.camera_centers_in_base))
 

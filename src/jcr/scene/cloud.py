@@ -28,6 +28,8 @@ _AS_READ = {"f4": np.float64, "u1": np.uint8, "i4": int}
 """Type in a PointCloud of each type in the file."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 """PLY's name of each type in the file."""
+_MOST_NAMED = 10_000
+"""Largest number of cameras and of labels of a cloud; each camera is compared with planes, and a map has 1024 labels."""
 _LAYOUT = "format binary_little_endian 1.0"
 """Line of the header that states the layout of the points."""
 _FIRST = "comment jcr cloud in the base frame, metres"
@@ -185,8 +187,9 @@ def read_cloud(path: Path) -> PointCloud:
         cameras, labels = (
             [word[2:] for word in words if word[:2] == ["comment", of]] for of in ("camera", "label")
         )
-        if any([int(number) for number, _ in one] != list(range(len(one))) for one in (cameras, labels)):
-            raise ValueError
+        for one in (cameras, labels):
+            if len(one) > _MOST_NAMED or [int(number) for number, _ in one] != list(range(len(one))):
+                raise ValueError
         centers = [[float(x) for x in text.split()] for _, text in cameras]
         return PointCloud(
             points_in_base=np.stack([columns.pop(name) for name in "xyz"], 1),

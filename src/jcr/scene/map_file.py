@@ -34,14 +34,19 @@ Nodes = Annotated[int, Field(ge=2, le=100_000)]
 """Number of nodes of a grid along an axis."""
 
 
+MOST = 8
+"""Largest number of networks, of their grids, and of all grids; maps of jcr have up to four. It bounds the memory that a
+header of few bytes takes."""
+
+
 class NetworkHeader(BaseModel):
     """Arguments of one network of the map (scene.fields.Field)."""
 
     model_config = ConfigDict(extra="forbid")
-    heads: dict[str, Units]
+    heads: Annotated[dict[str, Units], Field(max_length=MOST)]
     hidden: Units
     frequencies: Annotated[int, Field(ge=0, le=64)]
-    grids: list[tuple[Annotated[int, Field(ge=0)], Features]]
+    grids: Annotated[list[tuple[Annotated[int, Field(ge=0)], Features]], Field(max_length=MOST)]
 
     @model_validator(mode="after")
     def _has_one_input(self) -> "NetworkHeader":
@@ -65,8 +70,8 @@ class MapHeader(BaseModel):
     """Header of a map file, in JSON: its networks and grids, label names, cell size (m), and how it was made."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    networks: list[NetworkHeader]
-    lattices: list[tuple[Positive, tuple[Nodes, Nodes, Nodes]]]
+    networks: Annotated[list[NetworkHeader], Field(max_length=MOST)]
+    lattices: Annotated[list[tuple[Positive, tuple[Nodes, Nodes, Nodes]]], Field(max_length=MOST)]
     """Spacing (m) and number of nodes along z, y and x of each grid of features."""
     label_names: tuple[str, ...]
     cell: Positive
@@ -101,7 +106,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     except ValidationError as error:
         raise InputError(f"{path}: the map file is damaged (about: {first_fault(error)}); {again}") from None
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        if isinstance(error, InputError):
+        if isinstance(error, InputError) and str(error).startswith(str(path)):
             raise
         reason = " ".join(str(error).split())[:REASON]
         raise InputError(f"{path}: the map file is damaged ({reason}); {again}") from None
@@ -154,6 +159,8 @@ def _lattices_of(about: "MapHeader", seen: "SeenGrid", tensors: "dict[str, Tenso
     lattices = []
     for k, (cell, shape) in enumerate(about.lattices):
         # There is a node at each corner of the cells, the last of which may extend beyond the box.
+        if cell < (1 - SLACK) * seen.cell:
+            raise ValueError(f"lattice {k} has more nodes than the workspace has cells")
         for count, side in zip(shape[::-1], seen.size.tolist(), strict=True):
             if not (1 - SLACK) * side <= cell * (count - 1) <= (1 + SLACK) * (side + cell):
                 raise ValueError(f"lattice {k} does not span the workspace")
