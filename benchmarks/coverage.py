@@ -16,13 +16,13 @@ from numpy import ndarray
 from benchmarks.page import number, squared_distance, table
 from benchmarks.peers import opencv
 from benchmarks.references import nine_pixels, placed
-from jcr.calibration.adjust import with_adjusted_images
+from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate_reconstruction, fit_poses
+from jcr.calibration.stage import calibrate_reconstruction, fitted_case
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
@@ -219,9 +219,9 @@ def predicted(draws: int) -> Float[ndarray, "k 3"]:
         capture, reconstruction = _made(seed)
         options = CalibrateOptions()
         robot, rows = robot_errors(capture, options), spread_rows(len(capture))
-        case = with_adjusted_images(fit_poses(capture, _only(reconstruction, rows), options, robot.of(rows)))
+        case = adjusted(fitted_case(capture, _only(reconstruction, rows), options, robot.of(rows)))
         hand_eye = calibrate_reconstruction(capture, reconstruction, options)
-        if not (hand_eye.converged and case.hand_eye.converged):
+        if not (hand_eye.converged and case.calibration.converged):
             continue
         prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
         foretold, reported = map(_bounds, (prediction, hand_eye.uncertainty))

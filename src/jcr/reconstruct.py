@@ -17,6 +17,7 @@ import tyro
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
+from jcr.geometry import inverse
 from jcr.hub import HUB_ID, Weights, cached_files
 from jcr.progress import Progress
 from jcr.records import CameraEvidence, Capture, Reconstruction
@@ -268,6 +269,12 @@ def reconstruct(
     InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
     """
     options = options or ReconstructOptions()
+    if (
+        capture.mount == "base"
+    ):  # in the frame of the carried object, a fixed camera moves as a wrist camera does
+        capture = replace(
+            capture, mount="gripper", base_from_gripper=inverse(capture.base_from_gripper), joints=None
+        )
     row = ready_backend(options, candidates(options)[0])
     # Matching, RANSAC and the initial pair depend on the order of the images: with other names, calibrations differed by
     # up to 1.7 standard deviations. Images are therefore sorted by their poses: position, x first, then rotation. Adding

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.faults import calibrated, outcome
-from jcr.calibration.adjust import with_adjusted_images
-from jcr.calibration.checks.effects import as_remark, check_effects, of_case
+from jcr.calibration.adjust import adjusted
+from jcr.calibration.checks.effects import as_remark, check_effects, tested_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fit_poses
-from jcr.cell.carried import eye_to_hand, refined
+from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
 from jcr.estimation.arms import arm_named
-from jcr.estimation.hypotheses import camera_rows
+from jcr.estimation.hypotheses import camera_effects
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
@@ -159,15 +158,14 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     found = faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0])
     seen, reconstruction = reconstructed(found, estimated=False)
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
-    assert np.allclose(eye_to_hand(capture).base_from_gripper, seen.base_from_gripper)
-    found = calibrate_reconstruction(eye_to_hand(capture), reconstruction)
-    hand_eye = refined(capture, reconstruction, found, CalibrateOptions())
+    moving = calibrate_reconstruction(seen, reconstruction)
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     assert hand_eye.converged and hand_eye.uncertainty.budget is not None
     parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # The zoom is part of the calibration, and adds no uncertainty of a fault.
     assert hand_eye.findings[0].kind is FindingKind.ZOOM and np.trace(hand_eye.uncertainty.budget.faults) == 0
-    error = step_between(hand_eye.base_from_camera, found.gripper_from_camera)
+    error = step_between(hand_eye.base_from_camera, moving.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 
@@ -178,21 +176,20 @@ def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_a
         faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0]), estimated=False
     )
     robot, options = errors_of(capture.base_from_gripper), CalibrateOptions()
-    case = with_adjusted_images(fit_poses(capture, reconstruction, options, robot))
-    case = case.after((Finding.of(FindingKind.FEW_USED, "warns", "reconstruction", value=12.0, of=20.0),))
-    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    start = fitted_case(capture, reconstruction, options, robot)
+    case = adjusted(start)
+    case = case.found(Finding.of(FindingKind.FEW_USED, "warns", "reconstruction", value=12.0, of=20.0))
+    kinds = {one.kind for one in check_effects(case).calibration.findings}
     assert kinds >= {FindingKind.FEW_USED, FindingKind.ZOOM} and FindingKind.NOT_SETTLED not in kinds
     monkeypatch.setattr("jcr.estimation.solve.ROUNDS", 1)
-    case = replace(case, adjusted=None)
-    case = with_adjusted_images(replace(case, hand_eye=case.pose_fit, fit=None))
-    kinds = {one.kind for one in check_effects(case).hand_eye.findings}
+    kinds = {one.kind for one in check_effects(adjusted(start)).calibration.findings}
     assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
 
 
 def test_points_behind_a_camera_give_no_numpy_warning():
     capture, reconstruction = reconstructed(faulty_capture(np.random.default_rng(3), 6, Faults()), False)
     options, robot = CalibrateOptions(), errors_of(capture.base_from_gripper)
-    model = of_case(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)))
+    model = tested_case(adjusted(fitted_case(capture, reconstruction, options, robot)))
     images, observations = model.solution.images, model.solution.problem.observations
     assert observations is not None
     x_in_camera = images.view.in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
@@ -200,7 +197,7 @@ def test_points_behind_a_camera_give_no_numpy_warning():
     model = replace(model, solution=replace(model.solution, evidence=behind))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert all(np.isfinite(row.columns).all() for row in camera_rows(model, 6))
+        assert all(np.isfinite(row.columns).all() for row in camera_effects(model, 6))
 
 
 def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covariance_of_given_cameras():
@@ -257,7 +254,7 @@ def test_a_given_distortion_that_folds_over_is_unknown():
     stds = []
     for intrinsics in (capture.intrinsics, folds):
         capture = replace(capture, intrinsics=intrinsics)
-        prior = fit_poses(capture, reconstruction, CalibrateOptions(), robot).camera
+        prior = fitted_case(capture, reconstruction, CalibrateOptions(), robot).model.camera
         stds.append(prior.parameter_std)
     assert np.array_equal(stds[0][:4], stds[1][:4])
     usual = camera_with_prior(folds, ESTIMATED).parameter_std

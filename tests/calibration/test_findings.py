@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr.calibration.case import with_findings
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.record import read_calibration
+from jcr.calibration.record import Calibration, read_calibration
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
+from jcr.calibration.verdict import appended, judged
 from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
@@ -73,22 +73,26 @@ def test_what_a_kind_explains_are_kinds_and_its_group_has_a_title(kind: FindingK
     assert kind not in kind.row.explains
 
 
+def with_faults(numbers: Calibration, *faults: Finding) -> Calibration:
+    return judged(numbers, (), appended((), faults, lambda findings: judged(numbers, (), findings)))
+
+
 def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences():
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
     solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert solved.verdict == "accepted"
     shift = (0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01)
     fault = replace(example(FindingKind.DELAY), concerns="poses", shift=shift)
-    found = with_findings(solved, (fault,))
+    found = with_faults(solved, fault)
     assert [one.kind for one in found.findings] == [FindingKind.DELAY]  # and not that more images would help
     assert found.verdict == "rejected" and found.findings[0].severity == "rejects" and not found.converged
-    small = with_findings(solved, (replace(fault, shift=(1e-4, *shift[1:6], 0.0)),))
+    small = with_faults(solved, replace(fault, shift=(1e-4, *shift[1:6], 0.0)))
     assert small.verdict == "accepted" and small.warnings == (sentence(fault),)
     severities = ("warns", "rejects", "informs")
     assert verdict_of([replace(fault, severity=one) for one in severities]) == "rejected"
     # What else speaks against it comes after.
     uncertain = replace(example(FindingKind.UNCERTAIN), severity="rejects")
-    found = with_findings(solved.with_findings(uncertain), (fault,))
+    found = with_faults(solved, uncertain, fault)
     assert [one.kind for one in found.findings] == [FindingKind.DELAY, FindingKind.UNCERTAIN]
 
 
@@ -134,9 +138,8 @@ def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
     problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
     pairs = pairs_of(problem.base_from_gripper, problem.recon_from_camera)
     hand_eye = calibrate_pose_pairs(pairs).with_findings(*(example(kind) for kind in FindingKind))
-    hand_eye = with_findings(
-        hand_eye, (replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7),)
-    )
+    slip = replace(example(FindingKind.SLIP), concerns="mount", shift=(1e-3,) * 7)
+    hand_eye = with_faults(hand_eye, *hand_eye.findings, slip)
     content = hand_eye
     file = tmp_path / "calibration.json"
     file.write_text(json.dumps(content.as_json()))

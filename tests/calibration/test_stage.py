@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr.calibration.adjust import with_intrinsics_considered
-from jcr.calibration.case import Case
+from jcr.calibration.adjust import adjusted
+from jcr.calibration.case import Case, Model
 from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
@@ -17,6 +17,7 @@ from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
+from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.problem import scale_prior
 from jcr.geometry import inverse, retract, step_between, transform
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -78,9 +79,11 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
             options=CalibrateOptions(),
             robot=errors_of(problem.base_from_gripper),
             priors=(scale_prior(problem.scale, 1e-3),),
-            hand_eye=solved,
+            fit=solved,
+            numbers=solved,
+            model=Model(tracks=tracks, used=solved.inliers, camera=camera_about(given, True)),
         )
-        whole = with_intrinsics_considered(case)
+        whole = adjusted(case).numbers
         off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
         without.append(np.abs(off / np.sqrt(np.diag(solved.covariance)[:6])).max())
         considered.append(np.abs(off / np.sqrt(np.diag(whole.covariance)[:6])).max())

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,6 @@ from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added import added_camera
-from jcr.cell.carried import eye_to_hand, refined
 from jcr.cell.placement import (
     CameraPlacement,
     CamerasFile,
@@ -25,9 +23,9 @@ from jcr.cell.placement import (
     write_cameras,
 )
 from jcr.cell.rigs import CameraViews, fit_views
-from jcr.cell.stage import _adjusted, _adopted, place_cameras
+from jcr.cell.stage import _adopted, place_cameras
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.hypotheses import Adjustment
+from jcr.estimation.hypotheses import Tested
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import fit_known_scale
@@ -70,8 +68,7 @@ def test_the_stated_accuracy_of_a_fixed_camera_follows_from_its_own_covariance()
     """Of a low-cost arm, 3.9 mm were stated where the covariance of the same record gave 3.5 mm; others, too small."""
     problem = cell_problem("carried", "low-cost", COUNT, seed=1, points=200)
     capture, reconstruction = carried_capture(problem)
-    found = calibrate_reconstruction(eye_to_hand(capture), reconstruction)
-    hand_eye = refined(capture, reconstruction, found, CalibrateOptions())
+    hand_eye = calibrate_reconstruction(capture, reconstruction)
     required, held_out = hand_eye.requirement, hand_eye.held_out
     assert required is not None and held_out is not None and hand_eye.intrinsics is not None
     x, distance_m = hand_eye.base_from_camera, required.distance_mm / 1e3
@@ -131,25 +128,20 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
         points_in_world=cell.points_in_world,
     )
     names = png_names(count)
-    size = FIXED_CAMERA.width, FIXED_CAMERA.height
-    camera = CellCamera(name="other", mount="gripper", arm="second", images=names, image_size=size)
-    views = CameraViews(camera=camera, points=[], used={}, reasons={}, number=1, arm=1)
     alone = solve(*with_observations(problem, start))
-    model, faults = effects(
-        Adjustment(
-            solution=alone,
-            adjust=partial(_adjusted, problem, start, views),
-            arm=1,
-            names=names,
-            is_given=True,
-            std=np.sqrt(np.diag(alone.transform(lambda state: state.x[1])[1])),
-            camera=1,
-            place=lambda state: state.x[1],
-        )
+    tested = Tested(
+        solution=alone,
+        arm=1,
+        names=names,
+        is_given=True,
+        std=np.sqrt(np.diag(alone.transform(lambda state: state.x[1])[1])),
+        camera=1,
+        place=lambda state: state.x[1],
     )
+    confirmed, faults = effects(tested)
     assert [one.kind for one in faults] == [FindingKind.LENGTHS] and faults[0].shift is None
-    with_strain, solution, adopted = _adopted(problem, start, views, model, faults)
-    assert with_strain.arms[0].confirmed_errors is None and adopted[0].shift is not None
+    solution, adopted = _adopted(tested, confirmed, faults)
+    assert not solution.problem.bent[: 6 * count].any() and adopted[0].shift is not None
     cameras = scale_translation(cell.world_from_rig[count : 2 * count], cell.scale)
     best = fit_known_scale(reported, cameras, (x[1], z[1]), (1e-3, 2e-3)).gripper_from_camera
     squared = []

@@ -1,5 +1,6 @@
 """State of a calibration as it passes through fit, bundle adjustment and checks."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -8,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.calibration.hand_eye import judged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import RobotErrorPrior
-from jcr.camera import usable_intrinsics
+from jcr.calibration.verdict import appended, findings_of, judged
+from jcr.camera import usable_intrinsics, with_thin_prism
 from jcr.estimation.intrinsics_prior import (
     ESTIMATED,
     MEASURED,
@@ -21,10 +22,12 @@ from jcr.estimation.intrinsics_prior import (
     camera_about,
     camera_with_prior,
 )
-from jcr.estimation.problem import LinearPrior
+from jcr.estimation.observability import observability
+from jcr.estimation.problem import Effect, LinearPrior
 from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.solve import Solution
-from jcr.findings import Finding, is_explained, verdict_of
+from jcr.findings import Finding, FindingKind, is_explained
+from jcr.geometry import Poses, inverse
 from jcr.records import Capture, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200
@@ -33,14 +36,48 @@ MIN_IMAGES = 3
 """Fewest images that are adjusted."""
 MOST_OBSERVATIONS = 60_000
 """Most observations that are adjusted, as many as 25 images of 640x480 have; more add little to the robot's errors."""
-
+SETTLED_ENOUGH = 0.5
+"""Largest last step, in standard deviations, for which an adjustment that did not converge is a note and no warning:
+effects of that size are not reported either (checks/effects.py)."""
 WELL_SEEN = 3
 """Number of images from which a point is preferred, where only some of the points are adjusted."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """Assumptions of a bundle adjustment: the images and observations that are used, the camera, and effects."""
+
+    tracks: Tracks
+    """Observations in the m registered images, and the boards among the points."""
+    used: Bool[ndarray, " m"]
+    """Mask of the registered images that are used."""
+    camera: CameraPrior
+    """Prior of the intrinsics."""
+    effects: tuple[Effect, ...] = ()
+    """Confirmed effects on camera and arm, which are estimated."""
+    lengths: tuple[LinearPrior, ...] = ()
+    """Known lengths, as priors of the scale."""
+    most: int = MOST_OBSERVATIONS
+    """Most observations that are adjusted."""
+    most_points: int | None = None
+    """Most points that are adjusted, besides board corners; None: no limit."""
+
+    @cached_property
+    def observations(self) -> Tracks:
+        """Observations to adjust, at most `most` of those in the used images; their image indices count these images."""
+        found = of_images(self.tracks, self.used)
+        is_few = len(found.image) <= self.most and self.most_points is None
+        return found if is_few else some_points(found, self.most, self.most_points)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """State of a calibration between its steps; pose arrays have the m registered images in reconstruction order."""
+    """Calibration as it passes through fit, adjustment and checks: inputs, model, solution and findings.
+
+    Checks return another case by `found` (more findings) or `solved` (another model). The calibration follows from
+    these (`calibration`), and nothing is read back from it. Pose arrays have the m registered images in the order of
+    the reconstruction.
+    """
 
     capture: Capture
     reconstruction: Reconstruction
@@ -49,21 +86,37 @@ class Case:
     """Prior covariance of the systematic errors of the registered images' gripper poses."""
     priors: tuple[LinearPrior, ...] = ()
     """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
-    hand_eye: Calibration
-    """Current calibration; its images are the registered ones."""
-    fit: Calibration | None = None
-    """Fit to camera poses that the adjustment started from; None while `hand_eye` is itself that fit."""
-    carries: Literal["camera", "scene"] = "camera"
-    """Object that the gripper carries: "camera", or "scene" if the camera is fixed and observes the carried object."""
-    chosen_tracks: Tracks | None = None
-    """Observations to adjust, a subset of those in the used images; None: the default subset (`tracks`)."""
-    adjusted: Solution | None = None
-    """Last bundle adjustment, even if `hand_eye` is still the fit to poses; None if the images were not adjusted."""
+    fit: Calibration
+    """Fit to camera poses, the initial estimate of the bundle adjustment, with the findings of its motions."""
+    model: Model
+    solution: Solution | None = None
+    """Solution of the model; None if the images are not adjusted."""
+    numbers: Calibration
+    """Numbers of the result, without findings and without their errors: those of the solution, or of the fit."""
+    findings: tuple[Finding, ...] = ()
+    """Findings of the checks, in their order."""
+
+    @property
+    def carries(self) -> Literal["camera", "scene"]:
+        """Object that the gripper carries: "scene" if the camera is fixed and observes what the gripper carries."""
+        return "scene" if self.capture.mount == "base" else "camera"
 
     @property
     def base_from_gripper(self) -> Float[ndarray, "m 4 4"]:
         """Reported gripper poses (m) of the m registered images, in the order of the reconstruction."""
         return self.capture.base_from_gripper[self.reconstruction.image_index]
+
+    @property
+    def moving(self) -> Float[ndarray, "m 4 4"]:
+        """Poses (m) of the body that moves with the camera, in the frame of the scene, up to constant transforms.
+
+        They are base_from_gripper, or gripper_from_base for a fixed camera.
+        """
+        return self.of_arm(self.base_from_gripper)
+
+    def of_arm(self, poses: Poses) -> Poses:
+        """Return the poses of `moving` as base_from_gripper, or the other way round."""
+        return inverse(poses) if self.carries == "scene" else poses
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "m 4 4"]:
@@ -77,12 +130,7 @@ class Case:
     @property
     def used(self) -> Int[ndarray, " u"]:
         """Indices, among the registered images, of the images that the calibration uses."""
-        return np.flatnonzero(self.hand_eye.inliers)
-
-    @property
-    def pose_fit(self) -> Calibration:
-        """Fit to camera poses, the initial estimate of the bundle adjustment."""
-        return self.fit or self.hand_eye
+        return np.flatnonzero(self.model.used)
 
     @property
     def names(self) -> list[str]:
@@ -98,39 +146,53 @@ class Case:
         """
         return of_poses(self.robot.systematic, self.used)
 
-    @property
-    def camera(self) -> CameraPrior:
-        """Prior of the intrinsics before the calibration: mean (the reconstruction's intrinsics) and covariance.
-
-        The standard deviations depend on whether the intrinsics were given, estimated, or predicted by a network.
-        """
-        given, found = self.capture.intrinsics, self.reconstruction.intrinsics
-        if given is None and self.reconstruction.predicted_focal is not None:
-            of_center = {name: ESTIMATED[name] for name in ("aspect", "cx", "cy")}
-            return camera_with_prior(found, {"f": self.reconstruction.predicted_focal[1], **of_center})
-        if found.model == "thin_prism" and (given is None or given.model != found.model):
-            return camera_with_prior(found, {**(ESTIMATED if given is None else MEASURED), **PRISM})
-        # A distortion that folds over is not used, so that nothing is known of it.
-        of_distortion = not usable_intrinsics(given)[1]
-        return camera_about(found, given is not None, self.capture.intrinsics_std, of_distortion)
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Calibration of the case: its numbers, all findings, and the errors that the findings state."""
+        return judged(self.numbers, self.motions, self._with_settled())
 
     @cached_property
-    def tracks(self) -> Tracks:
-        """Observations to adjust: `chosen_tracks`, or those in the used images, at most MOST_OBSERVATIONS.
+    def motions(self) -> tuple[Finding, ...]:
+        """Findings on the directions that the motions of the used images do not determine, and on too few used images.
 
-        Their image indices count the used images, from 0.
+        If only the motions of all images, not those of the used ones, are observable, the remedy is a better
+        reconstruction. If the poses of all registered images would be observable but few of them agree, the used images
+        agree by chance, and nothing is found. Nothing is concluded from gripper poses that contradict the images.
         """
-        if self.chosen_tracks is not None:
-            return self.chosen_tracks
-        found = of_images(self.reconstruction.tracks, self.hand_eye.inliers)
-        return found if len(found.image) <= MOST_OBSERVATIONS else some_points(found, MOST_OBSERVATIONS)
+        unseen, capture = self.fit.findings, self.capture
+        if (
+            len(self.used) == len(capture)
+            or not unseen
+            or observability(self.of_arm(capture.base_from_gripper)).findings
+        ):
+            return unseen
+        of_numbers = findings_of(self.numbers, unseen)
+        kinds = {one.kind for one in of_numbers}
+        if FindingKind.FEW_AGREE in kinds and not observability(self.moving).findings:
+            return ()
+        if FindingKind.POSES_CONTRADICT_IMAGES in kinds:
+            return unseen
+        rejected = any(one.severity == "rejects" for one in (*unseen, *of_numbers))
+        counts = {"value": float(len(self.used)), "of": float(len(capture))}
+        few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)
+        return (*(replace(one, concerns="reconstruction") for one in unseen), few)
+
+    def _with_settled(self) -> tuple[Finding, ...]:
+        """Return the findings, after one that states that the rounds of the solution did not converge, if so."""
+        found = self.solution
+        if found is None or found.settled or self.numbers.source == "poses":
+            return self.findings
+        # The iterations ended before the steps and the estimated sizes of the errors converged.
+        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+        size = {"value": found.last_step, "rounds": float(found.iterations)}
+        return (Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size), *self.findings)
 
     @property
     def scene_distance_m(self) -> float | None:
         """Median depth (m) of the observed points along the optical axis; None where the images were not adjusted."""
-        if self.adjusted is None or self.hand_eye.source == "poses":
+        if self.solution is None or self.numbers.source == "poses":
             return None
-        return float(np.median(self.adjusted.images.view.depth)) * self.adjusted.state.scale
+        return float(np.median(self.solution.images.view.depth)) * self.solution.state.scale
 
     @property
     def is_adjustable(self) -> bool:
@@ -143,7 +205,7 @@ class Case:
         return (
             self.reconstruction.evidence is None
             and not self.priors
-            and len(self.tracks.image) >= MIN_OBSERVATIONS
+            and len(self.model.observations.image) >= MIN_OBSERVATIONS
             and len(self.used) >= MIN_IMAGES
         )
 
@@ -154,9 +216,12 @@ class Case:
         The case must be adjustable (`is_adjustable`), and its motions observable. Tracks from pointmaps are excluded,
         because the network used intrinsics of its own.
         """
-        return (
-            self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
-        )
+        return self.is_adjustable and not self.model.tracks.from_pointmaps and self.observable
+
+    @property
+    def observable(self) -> bool:
+        """Whether the motions of the used images determine every direction, if only weakly."""
+        return self.calibration.observability.observable
 
     @property
     def is_open(self) -> bool:
@@ -164,42 +229,37 @@ class Case:
 
         A known cause is a finding that explains others (`is_explained`).
         """
-        return self.hand_eye.observability.observable and not is_explained(self.hand_eye.findings)
+        return self.observable and not is_explained(self.calibration.findings)
 
-    def after(
-        self,
-        findings: tuple[Finding, ...],
-        hand_eye: Calibration | None = None,
-        adjusted: Solution | None = None,
-    ) -> "Case":
-        """Return the case with the findings of a check added, and with a new calibration or adjustment if given.
+    def found(self, *findings: Finding) -> "Case":
+        """Return the case with more findings; those that explain a rejection reject (verdict.appended)."""
 
-        A finding's shift is also added to the covariance (`with_findings`). None for `hand_eye` or `adjusted` keeps the
-        case's own.
-        """
-        found = with_findings(hand_eye or self.hand_eye, findings)
-        fit = self.pose_fit if found.source == "images" else self.fit
-        return replace(self, hand_eye=found, fit=fit, adjusted=adjusted or self.adjusted)
+        def calibration(these: Sequence[Finding]) -> Calibration:
+            return replace(self, findings=tuple(these)).calibration
+
+        return replace(self, findings=appended(self.findings, findings, calibration)) if findings else self
 
 
-def with_findings(hand_eye: Calibration, findings: tuple[Finding, ...]) -> Calibration:
-    """Return the calibration with `findings` added; the shift s of each finding adds s·sᵀ to the covariance.
+def camera_of(capture: Capture, reconstruction: Reconstruction) -> CameraPrior:
+    """Return the prior of the intrinsics before the calibration: mean (those of the reconstruction) and covariance.
 
-    The shift (`Finding.shift`, in COVARIANCE_ORDER) is the change of the calibration that the finding states. A finding
-    with a shift gets the severity "rejects" if the calibration is rejected, or too uncertain with the shift (MAX_STD).
+    The standard deviations depend on whether the intrinsics were given, estimated, or predicted by a network.
     """
-    named: list[Finding] = []
-    for finding in findings:
-        if finding.shift is None:
-            named.append(finding)
-            continue
-        accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
-        hand_eye = hand_eye.with_finding(finding)
-        # The finding "too uncertain" is not added, because its remedy, more images, does not help against a fault.
-        if not accepted or not judged(hand_eye).converged:
-            finding = replace(finding, severity="rejects")
-        named.append(finding)
-    return hand_eye.with_findings(*named)
+    given, found = capture.intrinsics, reconstruction.intrinsics
+    if given is None and reconstruction.predicted_focal is not None:
+        of_center = {name: ESTIMATED[name] for name in ("aspect", "cx", "cy")}
+        return camera_with_prior(found, {"f": reconstruction.predicted_focal[1], **of_center})
+    # A distortion that folds over is not used, so that nothing is known of it.
+    of_distortion = not usable_intrinsics(given)[1]
+    return camera_about(found, given is not None, capture.intrinsics_std, of_distortion)
+
+
+def with_prism(case: Case) -> CameraPrior:
+    """Return the prior of the case's camera with the coefficients of a thin prism in addition."""
+    given, lens = case.capture.intrinsics, with_thin_prism(case.reconstruction.intrinsics)
+    if given is not None and given.model == lens.model:
+        return case.model.camera
+    return camera_with_prior(lens, {**(ESTIMATED if given is None else MEASURED), **PRISM})
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:

@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 from scipy.special import chndtrinc
 
 from jcr.distributions import chi2
-from jcr.estimation.hypotheses import Row, Test, confirm_in_equations
+from jcr.estimation.hypotheses import Test, confirm_in_equations
 from jcr.estimation.pose_equations import pose_equations
-from jcr.estimation.problem import ROTATION, TRANSLATION, Problem, State, columns_of_arm, pose_problem
+from jcr.estimation.problem import ROTATION, TRANSLATION, Effect, Problem, State, columns_of_arm, pose_problem
 from jcr.estimation.solve import Solution
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, inverse, retract
@@ -120,7 +120,7 @@ def _motion(problem: Problem, state: State, first: int, kind: FindingKind) -> Te
         by_motion = equations.jacobian[:, columns].copy()
         by_motion[: 6 * first] = 0.0
         whole = replace(equations, residual=equations.residual - by_motion @ motion)
-        test = confirm_in_equations(whole, Row(kind=kind, columns=by_motion, place=first), freedom=KNOWN)
+        test = confirm_in_equations(whole, Effect(kind=kind, columns=by_motion, place=first), freedom=KNOWN)
         step, motion, left = test.estimate - motion, test.estimate, left - 1
         if np.abs(step).max() < SETTLED or left == 0:
             return test

@@ -1,8 +1,7 @@
 """Hand-eye calibration from poses: robust fit, uncertainty, observability, leave-one-out error and findings."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,38 +10,24 @@ from numpy.typing import ArrayLike
 
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.verdict import FEW, judged, poses_agree
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import camera_error_covariance
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_equations import paper_residuals, pose_residuals
+from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
 from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
 from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
-from jcr.findings import Finding, FindingKind, strongest_first
-from jcr.findings.table import MISFIT
-from jcr.geometry import Poses, require_rigid
+from jcr.geometry import Poses, Transform, inverse, require_rigid, step_between
 from jcr.least_squares import one_blas_thread
-from jcr.records import ImageVerdict, LeaveOneOut, PaperResiduals, RobotNoise, Uncertainty
+from jcr.records import ImageVerdict, LeaveOneOut, Mount, PaperResiduals, Uncertainty
 
-MAX_NOISE = (0.02, np.radians(3.0))
-"""Largest robot pose noise (m, rad) of an accepted calibration; servo arms have less, so larger noise means that poses
-and images do not belong together."""
-MAX_STD = (0.02, np.radians(3.0), 0.05)
-"""Largest standard deviations (m, rad, relative scale) of an accepted calibration."""
-MIN_SHARE_USED = 0.6
-"""Smallest fraction of the registered images that an accepted calibration uses."""
 SCALE_STD = 0.002
 """Relative standard deviation of the size of a printed marker."""
-FEW = 5
-"""Number of images below which outliers cannot be detected and the robot pose noise is poorly known."""
-WELL_ABOVE = 2e-3
-"""Leave-one-out error (m) up to which no warning is given."""
-SURPRISE = 1.5
-"""Ratio of the residuals to the given robot noise up to which no warning is given."""
 
 
 Offset = tuple[Float[ndarray, "3"], float, float]
@@ -116,11 +101,71 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         systematic = _systematic(gripper, robot, joints)
     if camera_covariance is not None:
         camera_errors = "none"
-    fit, distinct = _fitted(
-        gripper, camera, robot_noise, priors, camera_covariance, systematic, camera_errors
-    )
     named = [f"pose {k}" for k in range(n)] if names is None else names
-    return judged(_with_residuals(gripper, camera, fit, distinct, named))
+    fit = fit_poses(
+        gripper,
+        camera,
+        named,
+        robot_noise,
+        priors,
+        camera_covariance,
+        systematic,
+        camera_errors=camera_errors,
+    )
+    return judged(fit, fit.findings)
+
+
+def fit_poses(
+    gripper: Poses,
+    camera: Poses,
+    names: Sequence[str],
+    noise: tuple[float, float] | None,
+    priors: tuple[LinearPrior, ...],
+    camera_covariance: Float[ndarray, "r r"] | None,
+    systematic: Float[ndarray, "r r"],
+    *,
+    carries: Literal["camera", "scene"] = "camera",
+    camera_errors: Literal["none", "independent", "in sequence"] = "none",
+) -> Calibration:
+    """Return the numbers of a robust fit to n pairs of poses, and as findings what the motions do not determine.
+
+    Arguments are those of `solve_hand_eye`, by other names: base_from_gripper, recon_from_camera, names of the poses,
+    lower bound on the robot noise, priors of X and scale. With `carries` "scene" the camera is fixed and the gripper
+    carries what it sees.
+    """
+    fit, distinct = _fitted(
+        gripper, camera, noise, priors, camera_covariance, systematic, carries, camera_errors
+    )
+    assert fit.problem.used is not None
+    x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
+    used, of_arm = fit.problem.used[distinct], inverse if carries == "scene" else np.asarray
+    predicted = of_arm(predicted_gripper_poses(x, scale, z, camera))
+    metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
+    noise_m, noise_rad = fit.noise.together
+    typical = f"(their noise: {1e3 * noise_m:.1f} mm, {np.degrees(noise_rad):.2f}°)"
+    reasons = [
+        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it {typical}"
+        for m, rad in zip(metres, radians, strict=True)
+    ]
+    left_out, moving = fit.leave_one_out[0][fit.problem.used], of_arm(gripper)
+    return Calibration(
+        **transforms("base" if carries == "scene" else "gripper", x, z),
+        scale=scale,
+        uncertainty=Uncertainty(covariance=fit.covariance[:7, :7], budget=fit.budget),
+        backend="poses given",
+        images=image_verdicts(names, used, reasons, metres, radians),
+        residuals=PaperResiduals(*paper_residuals(moving, camera, x, scale, used)),
+        robot_noise=fit.noise,
+        held_out=leave_one_out(left_out, "each image predicted by the others"),
+        findings=observability(moving[used], x, camera[used], fit.problem.priors).findings,
+    )
+
+
+def transforms(mount: Mount, x: Transform, z: Transform) -> dict[str, Any]:
+    """Return the fields of a Calibration for its transforms: X, the camera's pose, and Z, that of the scaled scene."""
+    if mount == "gripper":
+        return {"mount": mount, "on_gripper": x, "resting": z}
+    return {"mount": mount, "on_base": x, "carried": z}
 
 
 def _fitted(
@@ -130,20 +175,23 @@ def _fitted(
     priors: tuple[LinearPrior, ...],
     camera_covariance: Float[ndarray, "r r"] | None,
     systematic: Float[ndarray, "r r"],
+    carries: Literal["camera", "scene"],
     camera_errors: Literal["none", "independent", "in sequence"],
 ) -> tuple[Solution, Int[ndarray, " n"]]:
     """Return the robust fit to the poses without duplicates, and for each pose its index in that fit.
 
     `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `camera_covariance`
     (6n,6n; None: exact) is that of the camera poses, `systematic` that of the systematic robot errors. Errors of the
-    camera poses of the kinds `camera_errors` are tested, and included if the poses show them.
+    camera poses of the kinds `camera_errors` are tested, and included if the poses show them. The gripper moves what
+    `carries` says.
     """
     n = len(gripper)
     # Poses that occur twice count once, because an error that occurs twice would look like agreement. They are sorted,
     # so that the result does not depend on their order.
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, distinct = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    agreeing = least_trimmed(gripper[order], camera[order])[0] if len(order) >= FEW else None
+    moving = inverse(gripper) if carries == "scene" else gripper
+    agreeing = least_trimmed(moving[order], camera[order])[0] if len(order) >= FEW else None
 
     def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
         """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
@@ -151,7 +199,7 @@ def _fitted(
             None if covariance is None else of_poses(covariance, order),
             of_poses(systematic, order),
         )
-        return robust_fit(gripper[order], camera[order], noise, priors, errors, of_robot, agreeing)
+        return robust_fit(gripper[order], camera[order], noise, priors, errors, of_robot, agreeing, carries)
 
     fit = fitted(camera_covariance)
     if camera_errors != "none":
@@ -165,40 +213,6 @@ def _fitted(
         )
         fit = fit if errors is None else fitted(errors)
     return fit, distinct
-
-
-def _with_residuals(
-    gripper: Poses, camera: Poses, fit: Solution, distinct: Int[ndarray, " n"], names: Sequence[str]
-) -> Calibration:
-    """Return the calibration that `fit` gives, with residuals of all images, before `judged` adds its findings.
-
-    `gripper` (base_from_gripper) and `camera` (recon_from_camera) are the poses of all n images. `distinct` holds the
-    index of each image in the fit, which has no duplicates.
-    """
-    assert fit.problem.used is not None
-    x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
-    used = fit.problem.used[distinct]
-    residual, _ = pose_residuals(x, scale, z, gripper, camera)
-    metres, radians = np.linalg.norm(residual.reshape(-1, 2, 3), axis=2).T
-    noise_m, noise_rad = fit.noise.together
-    typical = f"(their noise: {1e3 * noise_m:.1f} mm, {np.degrees(noise_rad):.2f}°)"
-    reasons = [
-        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it {typical}"
-        for m, rad in zip(metres, radians, strict=True)
-    ]
-    left_out = fit.leave_one_out[0][fit.problem.used]
-    return Calibration(
-        on_gripper=x,
-        scale=scale,
-        resting=z,
-        uncertainty=Uncertainty(covariance=fit.covariance[:7, :7], budget=fit.budget),
-        backend="poses given",
-        images=image_verdicts(names, used, reasons, metres, radians),
-        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, scale, used)),
-        robot_noise=fit.noise,
-        held_out=leave_one_out(left_out, "each image predicted by the others"),
-        findings=observability(gripper[used], x, camera[used], fit.problem.priors).findings,
-    )
 
 
 def image_verdicts(
@@ -227,78 +241,6 @@ def image_verdicts(
         )
         for k, name in enumerate(names)
     )
-
-
-JUDGED = frozenset({*MISFIT, FindingKind.FEW_IMAGES})
-"""Kinds of findings that `judged` derives from the numbers of a calibration alone."""
-
-
-def judged(hand_eye: Calibration) -> Calibration:
-    """Return the calibration with findings on image count, robot noise and uncertainty derived again (kinds JUDGED).
-
-    They replace earlier findings of these kinds and follow from the numbers of the calibration alone; other findings
-    stay.
-    """
-    rejecting = list(_rejecting(hand_eye))
-    # A weakly observed direction explains an uncertainty that rejects, and is therefore named first, unless the poses
-    # are wrong: those of a wrong convention may be near a degenerate motion.
-    uncertain = any(one.kind is FindingKind.UNCERTAIN for one in rejecting)
-    weak = "rejects" if uncertain and poses_agree(hand_eye.robot_noise) else "warns"
-    others = [
-        replace(finding, severity=weak) if "nearly" in finding.details else finding
-        for finding in hand_eye.findings
-        if finding.kind not in JUDGED
-    ]
-    return replace(hand_eye, findings=strongest_first((*others, *rejecting, *_warning(hand_eye))))
-
-
-def poses_agree(noise: RobotNoise) -> bool:
-    """Return whether the estimated robot errors per axis are at most MAX_NOISE, as an accepted calibration needs."""
-    metres, radians = noise.together
-    return metres <= MAX_NOISE[0] and bool(radians <= MAX_NOISE[1])
-
-
-def _rejecting(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield findings that reject a calibration: few images agree, poses contradict images, or it is too uncertain."""
-    used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
-    if used < max(3, MIN_SHARE_USED * n) and n > 2:
-        counts = {"value": float(used), "images": float(n)}
-        yield Finding.of(FindingKind.FEW_AGREE, "rejects", "reconstruction", **counts)
-    if not poses_agree(hand_eye.robot_noise):
-        metres, radians = hand_eye.robot_noise.together
-        kind = FindingKind.POSES_CONTRADICT_IMAGES
-        yield Finding.of(kind, "rejects", "reconstruction", value=metres, rotation=radians)
-    if not hand_eye.observability.observable:
-        return
-    std = hand_eye.uncertainty.std
-    # With few images, half of the uncertainty may be due to the poorly known robot pose noise.
-    unknown = {"noise_unknown": 1.0} if hand_eye.robot_noise.given is None and used < FEW else {}
-    parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
-    for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
-        if value > limit:
-            size = {"value": float(value), **unknown}
-            yield Finding.of(FindingKind.UNCERTAIN, "rejects", "images", part=part, **size)
-
-
-def _warning(hand_eye: Calibration) -> Iterator[Finding]:
-    """Yield findings that warn: residuals larger than the given noise, a large leave-one-out error, or few images."""
-    noise, images = hand_eye.robot_noise, [one for one in hand_eye.images if one.used]
-    residual = np.array([(one.translation_residual_mm, one.rotation_residual_deg) for one in images], float)
-    # The rms residual per axis, corrected for the 13 fitted unknowns.
-    fitted = 6 * len(images) / max(6 * len(images) - 13, 1)
-    mm, deg = np.sqrt(fitted * (residual.reshape(-1, 2) ** 2).mean(0) / 3).tolist()
-    metres, radians = 1e-3 * mm, float(np.radians(deg))
-    if noise.given is not None and (
-        metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
-    ):
-        details = {"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]}
-        yield Finding.of(FindingKind.NOISE_ABOVE_GIVEN, "warns", "none", value=metres, **details)
-    if (held_out := hand_eye.held_out) is not None:
-        left_out_m, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
-        if left_out_m > max(3 * typical, WELL_ABOVE):
-            yield Finding.of(FindingKind.LEAVE_ONE_OUT, "warns", "images", value=left_out_m, residual=typical)
-    if len(hand_eye.inliers) < FEW:
-        yield Finding.of(FindingKind.FEW_IMAGES, "warns", "images", value=float(len(hand_eye.inliers)))
 
 
 def leave_one_out(

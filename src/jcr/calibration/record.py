@@ -286,6 +286,11 @@ class Calibration(Outcome):
         return Similarity(self._require(self.resting, "gripper"), self.scale)
 
     @property
+    def body_from_recon(self) -> Similarity:
+        """Similarity from recon coordinates to the body that holds the scene: base_from_recon or gripper_from_object."""
+        return self.base_from_recon if self.mount == "gripper" else self.gripper_from_object
+
+    @property
     def gripper_from_object(self) -> Similarity:
         """Similarity from recon coordinates (any unit) of the carried object to the gripper frame (m).
 
@@ -306,38 +311,6 @@ class Calibration(Outcome):
         """Mask of the used images among the registered ones, in the order of the reconstruction."""
         registered = (one for one in self.images if one.translation_residual_mm is not None)
         return np.array([image.used for image in registered], bool)
-
-    def with_used(self, used: Bool[ndarray, " m"]) -> "Calibration":
-        """Return the calibration with `used` as mask of the m images; all images must be registered ones."""
-        images = tuple(replace(one, used=bool(own)) for one, own in zip(self.images, used, strict=True))
-        return replace(self, images=images)
-
-    def on_fixed_camera(self) -> "Calibration":
-        """Return the calibration of a fixed camera, with base_from_camera and gripper_from_object.
-
-        `self` must be calibrated from gripper_from_base in place of base_from_gripper; its gripper_from_camera is then
-        base_from_camera, and its base_from_recon is gripper_from_object.
-        """
-        own = {"on_gripper": None, "on_base": self.on_gripper, "resting": None, "carried": self.resting}
-        return replace(self, mount="base", with_given_intrinsics=None, **own)
-
-    def with_uncertainty(self, uncertainty: Uncertainty) -> "Calibration":
-        """Return the calibration with another uncertainty, also as standard deviations of its intrinsics."""
-        intrinsics, std = self.intrinsics, uncertainty.intrinsics_std
-        intrinsics = None if intrinsics is None else intrinsics.with_std(std)
-        return replace(self, uncertainty=uncertainty, intrinsics=intrinsics)
-
-    def with_finding(self, finding: Finding) -> "Calibration":
-        """Return the calibration with s·sᵀ added to its covariance, s being the shift that `finding` states.
-
-        The shift (COVARIANCE_ORDER) changes transform and scale and, if they were estimated, the intrinsics. The
-        finding is not added. Without a shift, the calibration is returned unchanged.
-        """
-        if finding.shift is None:
-            return self
-        moved, joint = finding.intrinsics_shift, self.uncertainty.joint
-        shift = np.r_[finding.shift, () if moved is None or joint is None else moved]
-        return self.with_uncertainty(self.uncertainty.with_error(np.outer(shift, shift)))
 
     def of_capture(
         self, capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs

@@ -32,11 +32,12 @@ def advised(
 ) -> Calibration:
     """Return the calibration with its point uncertainty and, unless none is required, the required accuracy.
 
-    A missed accuracy is also added as a finding. `gripper` (base_from_gripper) are the poses of the registered images.
+    A missed accuracy is also added as a finding. `gripper` are the gripper poses of the registered images
+    (base_from_gripper; gripper_from_base for a fixed camera).
     `distance_m` is the distance of the scene; None: that of the point nearest to all optical axes. `scene` is None for
     a calibration from camera poses.
     """
-    x, uncertainty = hand_eye.gripper_from_camera, hand_eye.uncertainty
+    x, uncertainty = hand_eye.parent_from_camera, hand_eye.uncertainty
     if distance_m is None:
         distance_m = median_distance(gripper[hand_eye.inliers] @ x)
     seen = seen_points(x, uncertainty, hand_eye.intrinsics, distance_m)

@@ -1,6 +1,6 @@
 """Stage calibrate, for a reconstructed capture or given camera poses: fit, bundle adjustment, checks, requirement."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -8,33 +8,33 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import with_adjusted_images
-from jcr.calibration.case import Case, with_findings
+from jcr.calibration.adjust import adjusted
+from jcr.calibration.case import Case, Model, camera_of
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
-from jcr.calibration.checks.capture import check_pieces, check_registered, check_remarks
+from jcr.calibration.checks.capture import check_mount, check_pieces, check_remarks
 from jcr.calibration.checks.convention import better_reading, check_convention, inverted_pair
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot
-from jcr.calibration.hand_eye import SCALE_STD, solve_hand_eye
+from jcr.calibration.hand_eye import fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
+from jcr.calibration.verdict import appended, judged, with_shifts, with_uncertainty
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import ONE_AXIS
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
 from jcr.estimation.pose_misfit import pose_misfit
-from jcr.estimation.problem import offset_prior, scale_prior
+from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, rotation_angle
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, PosePairs, Reconstruction
 
 CHECKS = (
-    check_registered,
     check_convention,
     check_pairing,
     check_board_shapes,
@@ -44,6 +44,7 @@ CHECKS = (
     check_boards,
     check_lengths,
     check_robot,
+    check_mount,
     check_remarks,
 )
 """Checks in the order in which they run, causes before consequences.
@@ -51,15 +52,6 @@ CHECKS = (
 The pose convention of a rejected calibration is tested early, because poses of another convention make all later checks
 meaningless. Rejected calibrations are also tested for effects on camera and robot, which may explain the rejection.
 """
-OF_ADJUSTMENT = (
-    check_board_shapes,
-    check_effects,
-    check_predicted_focal,
-    check_boards,
-    check_lengths,
-    check_robot,
-)
-"""Checks of CHECKS that test the adjustment; the others test the images, and poses that are not adjusted."""
 HEIGHT_STD = 1e-3
 """Standard deviation (m) of a height measured with a ruler."""
 CONTRADICTED = (4.0, 0.02)
@@ -81,32 +73,22 @@ def calibrate_reconstruction(
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
-    case = calibrate_case(capture, reconstruction, options, robot)
-    hand_eye = case.hand_eye
-    if capture.intrinsics is not None and (distance_m := case.scene_distance_m) is not None:
-        x, uncertainty, camera = hand_eye.gripper_from_camera, hand_eye.uncertainty, hand_eye.intrinsics
-        pair = with_given_intrinsics(x, uncertainty, camera, reconstruction.intrinsics, distance_m)
-        hand_eye = replace(hand_eye, with_given_intrinsics=pair)
-    return hand_eye.of_capture(capture, reconstruction)
+    return calibration_of(checked_case(capture, reconstruction, options, robot)).of_capture(
+        capture, reconstruction
+    )
 
 
-def calibrate_case(
-    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
-) -> Case:
-    """Return the case after fit, adjustment and checks, with required accuracy.
-
-    `robot` is the error prior of the registered images' gripper poses.
-    """
-    return with_requirement(checked_case(capture, reconstruction, options, robot))
-
-
-def with_requirement(case: Case) -> Case:
-    """Return the case with the uncertainty of points at the working distance and of the scene, and its requirement."""
-    gripper, distance_m, scene = case.base_from_gripper, case.scene_distance_m, None
-    if distance_m is not None and case.adjusted is not None:
-        scene = scene_uncertainty(scene_points(case.adjusted))
-    found = advised(case.hand_eye, gripper, case.options, distance_m, scene)
-    return replace(case, hand_eye=found)
+def calibration_of(case: Case) -> Calibration:
+    """Return the calibration of a case with its required accuracy, and with the pair for the given intrinsics."""
+    found, distance_m, scene = case.calibration, case.scene_distance_m, None
+    if distance_m is not None and case.solution is not None:
+        scene = scene_uncertainty(scene_points(case.solution))
+    found = advised(found, case.moving, case.options, distance_m, scene)
+    if case.capture.intrinsics is None or distance_m is None or case.carries == "scene":
+        return found
+    x, uncertainty, camera = found.gripper_from_camera, found.uncertainty, found.intrinsics
+    pair = with_given_intrinsics(x, uncertainty, camera, case.reconstruction.intrinsics, distance_m)
+    return replace(found, with_given_intrinsics=pair)
 
 
 @one_blas_thread
@@ -118,25 +100,21 @@ def checked_case(
     A rejected calibration is returned with its findings, not raised; a check that its geometry makes impossible is
     skipped. `robot` is the error prior of the registered images' gripper poses.
     """
-    return with_checks(with_adjusted_images(fit_poses(capture, reconstruction, options, robot)), CHECKS)
-
-
-def with_checks(case: Case, checks: Sequence[Callable[[Case], Case]]) -> Case:
-    """Return the case after the checks in their order; with a rejected calibration, impossible checks are skipped."""
-    for check in checks:
+    case = adjusted(fitted_case(capture, reconstruction, options, robot))
+    for check in CHECKS:
         try:
             case = check(case)
         except np.linalg.LinAlgError:
             # With a rejected calibration, points may lie behind the cameras; a check that fails then is skipped.
-            if case.hand_eye.converged:
+            if case.calibration.converged:
                 raise
     return case
 
 
-def fit_poses(
+def fitted_case(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrorPrior
 ) -> Case:
-    """Fit the hand-eye transform to camera poses; known scale and height are priors of the fit.
+    """Return the case with the fit to camera poses; known scale and height are priors of the fit.
 
     `robot` is the error prior of the registered images' gripper poses. Raises RejectedError with fewer than two
     registered images.
@@ -148,36 +126,47 @@ def fit_poses(
             "overlap the views more",
             also=(*reconstruction.warnings, *reconstruction.notes),
         )
-    gripper, metric_std = capture.base_from_gripper[rows], reconstruction.metric_std
-    height, scale, found = options.known_height, None, list[Finding]()
-    offset = None if height is None else height_cue(gripper, height / 1e3)
-    solve = partial(
-        solve_hand_eye,
-        gripper,
-        reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
-        robot_noise=options.robot_noise_m_rad,
-        camera_covariance=None if evidence is None else evidence.covariance,
-        systematic=robot.systematic,
-        camera_errors="none",
-        names=[capture.images[row] for row in rows],
-    )
-    if metric_std is not None:
-        free, scale = solve(offset=offset), (1.0, metric_std)
+    gripper, metric_std, found = capture.base_from_gripper[rows], reconstruction.metric_std, list[Finding]()
+    height = options.known_height
+    priors = () if height is None else (offset_prior(*height_cue(gripper, height / 1e3)),)
+
+    def fitted(*more: LinearPrior) -> Calibration:
+        """Return the fit with the known height and further priors."""
+        return fit_poses(
+            gripper,
+            reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
+            [capture.images[row] for row in rows],
+            options.robot_noise_m_rad,
+            (*priors, *more),
+            None if evidence is None else evidence.covariance,
+            robot.systematic,
+            carries="scene" if capture.mount == "base" else "camera",
+        )
+
+    if metric_std is None:
+        fit = fitted()
+    else:
+        free = fitted()
         off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
         sigmas, share = CONTRADICTED
-        if free.converged and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
+        is_accepted = judged(free, free.findings).converged
+        if is_accepted and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
             size = {"value": float(np.expm1(off)), "std": std}
             found.append(Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", **size))
-    known, known_std = scale or (None, SCALE_STD)
-    hand_eye = solve(scale=known, scale_std=known_std, offset=offset).with_findings(*found)
-    priors = () if known is None else (scale_prior(known, known_std),)
+        fit = fitted(scale_prior(1.0, metric_std))
+        priors = (scale_prior(1.0, metric_std), *priors)
+    fit = replace(fit, intrinsics=reconstruction.intrinsics.with_std(None))
+    model = Model(tracks=reconstruction.tracks, used=fit.inliers, camera=camera_of(capture, reconstruction))
     return Case(
         capture=capture,
         reconstruction=reconstruction,
         options=options,
         robot=robot,
-        priors=priors if offset is None else (*priors, offset_prior(*offset)),
-        hand_eye=replace(hand_eye, intrinsics=reconstruction.intrinsics.with_std(None)),
+        priors=priors,
+        fit=fit,
+        model=model,
+        numbers=fit,
+        findings=tuple(found),
     )
 
 
@@ -216,7 +205,12 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
     if hand_eye.observability.observable and not is_explained(hand_eye.findings):
         known = {"error_covariance": robot.systematic, "noise_floor": options.robot_noise_m_rad}
         found = effects_of_fit(gripper, pairs.recon_from_camera, hand_eye, pairs.images, **known)
-        hand_eye = with_findings(hand_eye, found)
+
+        def calibration(findings: Sequence[Finding]) -> Calibration:
+            shifted = with_uncertainty(hand_eye, with_shifts(hand_eye.uncertainty, findings))
+            return shifted.with_findings(*findings)
+
+        hand_eye = calibration(appended((), found, calibration))
     return advised(hand_eye, gripper, options).of_capture(pairs, pairs)
 
 

@@ -1,8 +1,4 @@
-"""Eye-to-hand calibration: a fixed camera observes an object in the gripper.
-
-In the frame of the object the camera moves like a wrist camera moves in the base frame. With inverse gripper poses, a
-fixed camera is therefore calibrated like a wrist camera. Robot errors are errors of the gripper poses, not of their
-inverses, so the result and its covariance are estimated again with the actual poses (estimation/pose_equations.py).
+"""Images of a fixed camera that observes an object in the gripper, without their static background.
 
 The static background is removed from the images, because the background often has more features than the object. A
 pixel's background is the colour that many images share. Each image keeps the pixels that differ from the background and
@@ -18,23 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.calibration.adjust import with_adjusted_images
-from jcr.calibration.case import MIN_OBSERVATIONS, Case
-from jcr.calibration.hand_eye import JUDGED, solve_hand_eye
-from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import OF_ADJUSTMENT, with_checks, with_requirement
 from jcr.capture.images import encode_png, read_image
 from jcr.files import write_bytes
-from jcr.findings import Finding, FindingKind, kinds_of
-from jcr.geometry import inverse
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture
 
-AGAIN = kinds_of("camera", "order", "strain", "lengths").union(
-    JUDGED, {FindingKind.NOT_SETTLED, FindingKind.JOINT_OFFSETS}
-)
-"""Kinds of findings of an adjustment, which are derived again for the gripper poses as reported."""
 LEVELS = 14.0
 """Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
 REDUCED = 320
@@ -47,65 +30,12 @@ GROWN, SOFT = 0.012, 0.008
 """Dilation of the moving part, and sigma of the blur of its border, as shares of the image width."""
 
 
-def eye_to_hand(capture: Capture, moving: Path | None = None) -> Capture:
-    """Return the capture of a fixed camera as a capture of a camera that moves around the carried object.
-
-    Gripper poses are inverted. Robot name, URDF and joints are removed, since they belong to the original poses. Images
-    without the static background are written to the folder `moving` and used; None: the original images are used.
-    """
-    if moving is not None:
-        images = moving_parts([read_image(capture.folder / name) for name in capture.images])
-        for name, image in zip(capture.images, images, strict=True):
-            write_bytes(moving / name, encode_png(image))  # PNG whatever the name
-    return replace(
-        capture,
-        folder=moving or capture.folder,
-        base_from_gripper=inverse(capture.base_from_gripper),
-        mount="gripper",
-        others=(),
-        joints=None,
-        robot=None,
-        urdf=None,
-    )
-
-
-def refined(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    found: Calibration,
-    options: CalibrateOptions,
-) -> Calibration:
-    """Return the calibration of a fixed camera, refined from `found`, with the gripper poses as reported.
-
-    `found` was computed with inverse gripper poses (`eye_to_hand`). A rejected calibration is not refined; it gets the
-    finding WRONG_MOUNT if the camera turns out to be on the gripper.
-    """
-    rows = reconstruction.image_index
-    if not found.converged:
-        on_gripper = solve_hand_eye(
-            capture.base_from_gripper[rows], reconstruction.recon_from_camera, camera_errors="none"
-        )
-        why = Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
-        return (found.with_findings(why) if on_gripper.converged else found).on_fixed_camera()
-    # Findings on images and motions stay. Those of the adjustment are derived again with the poses as reported.
-    kept = tuple(one for one in found.findings if one.kind not in AGAIN)
-    registered = tuple(found.images[row] for row in rows)
-    case = Case(
-        capture=capture,
-        reconstruction=reconstruction,
-        options=options,
-        robot=robot_errors(capture, options).of(rows),
-        hand_eye=replace(
-            found, images=registered, source="poses", findings=kept, lengths=(), depth_check=None
-        ),
-        carries="scene",
-    )
-    if found.source == "poses" or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
-        return found.on_fixed_camera()
-    case = with_requirement(with_checks(with_adjusted_images(case), OF_ADJUSTMENT))
-    images = dict(zip(rows.tolist(), case.hand_eye.images, strict=True))
-    every = tuple(images.get(row, one) for row, one in enumerate(found.images))
-    return replace(case.hand_eye, images=every).on_fixed_camera()
+def with_moving_parts(capture: Capture, moving: Path) -> Capture:
+    """Return the capture of a fixed camera with images without the static background, written to the folder `moving`."""
+    images = moving_parts([read_image(capture.folder / name) for name in capture.images])
+    for name, image in zip(capture.images, images, strict=True):
+        write_bytes(moving / name, encode_png(image))  # PNG whatever the name
+    return replace(capture, folder=moving)
 
 
 def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:

@@ -24,8 +24,8 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
 
     Camera 0 is the capture's own camera. The world is its recon frame, in metres.
     """
-    case, hand_eye = rigs.case, rigs.case.hand_eye
-    tracks, prior = case.tracks, None
+    case, hand_eye = rigs.case, rigs.case.numbers
+    tracks, prior = case.model.observations, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
     if hand_eye.source == "poses" or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
         prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
@@ -55,7 +55,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
         # A mount is estimated only for a camera that shares its rig with another camera.
         cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
         mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
-    arms, starts = rigs.arm_poses()
+    arms, starts, effects = rigs.arm_poses()
     problem = Problem(
         arms=tuple(arms),
         n_rigs=len(rigs.poses),
@@ -69,6 +69,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
             std_px=np.concatenate(std_px),
         ),
         known_rigs=prior,
+        effects=effects,
         robot_noise_floor=case.options.robot_noise_m_rad,
     )
     state = State(
@@ -90,6 +91,6 @@ def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6
     rows = rigs.case.used
     covariance = EXACT**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:
-        unit = np.tile(np.repeat([rigs.case.hand_eye.scale, 1.0], 3), len(rows))
+        unit = np.tile(np.repeat([rigs.case.numbers.scale, 1.0], 3), len(rows))
         covariance += unit[:, None] * of_poses(evidence.covariance, rows) * unit
     return rigs.known.recon_from_camera, covariance

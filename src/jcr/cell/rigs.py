@@ -20,8 +20,8 @@ from jcr.camera import guessed_intrinsics, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
-from jcr.estimation.hypotheses import arm_rows
-from jcr.estimation.problem import ReportedPoses, State, scale_prior, wrist_arm
+from jcr.estimation.hypotheses import arm_effects
+from jcr.estimation.problem import Effect, ReportedPoses, State, scale_prior, wrist_arm
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
@@ -133,7 +133,7 @@ class Rigs:
         self.case, self.rows, found = case, case.reconstruction.image_index[case.used], case.reconstruction
         if known is None:
             images = (read_image(case.capture.folder / case.capture.images[row]) for row in self.rows)
-            places = scale_translation(found.recon_from_camera[case.used], case.hand_eye.scale)
+            places = scale_translation(found.recon_from_camera[case.used], case.numbers.scale)
             own = tuple(features(image, found.intrinsics) for image in images)
             known = KnownImages(found.intrinsics, places, own)
         self.known = known
@@ -223,7 +223,7 @@ class Rigs:
             counts = {"value": float(len(seen.used)), "needed": float(LEAST_POSES)}
             return seen.refused(Finding.of(FindingKind.FEW_LOCALISED, "rejects", "images", **counts))
         gripper = seen.camera.base_from_gripper[seen.rows]
-        std = max(float(np.sqrt(self.case.hand_eye.covariance[6, 6])), 1e-4)
+        std = max(float(np.sqrt(self.case.numbers.covariance[6, 6])), 1e-4)
         found, effects = fit_views(seen, gripper, std)
         if not found.converged:
             explained = [replace(one, severity="rejects") for one in effects]
@@ -235,17 +235,27 @@ class Rigs:
         self.arms[arm] = rig, gripper[used], found
         return replace(kept, rig=rig, arm=len(self.arms))
 
-    def arm_poses(self) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]]]:
-        """Return the reported poses and initial (gripper_from_camera, base_from_world) of each arm, own arm first."""
+    def arm_poses(
+        self,
+    ) -> tuple[list[ReportedPoses], list[tuple[Transform, Transform]], tuple[Effect, ...]]:
+        """Return the reported poses and initial (gripper_from_camera, base_from_world) of each arm, own arm first.
+
+        The third result is the effects that the calibration of the own camera found on its arm.
+        """
         case = self.case
         poses = case.capture.base_from_gripper[self.rows]
-        kinds = {one.kind for one in case.hand_eye.findings if one.kind.row.group == "strain"}
-        bent = [row.unit * row.columns for row in arm_rows(poses) if row.kind in kinds]
-        confirmed = np.concatenate(bent, axis=1) if bent else None
-        arms = [replace(wrist_arm(poses, case.systematic), confirmed_errors=confirmed)]
+        arms = [wrist_arm(poses, case.systematic)]
         arms += [replace(wrist_arm(gripper), rigs=rigs) for rigs, gripper, _ in self.arms.values()]
-        found = [case.hand_eye, *(one for _, _, one in self.arms.values())]
-        return arms, [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
+        found = [case.numbers, *(one for _, _, one in self.arms.values())]
+        starts = [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
+        kinds = {one.kind for one in case.numbers.findings if one.kind.row.group == "strain"}
+        others = 6 * sum(len(rigs) for rigs, _, _ in self.arms.values())
+        effects = (
+            replace(one, columns=np.pad(one.columns, ((0, others), (0, 0))))
+            for one in arm_effects(poses)
+            if one.kind in kinds
+        )
+        return arms, starts, tuple(effects)
 
 
 def fit_views(

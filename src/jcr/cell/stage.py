@@ -6,7 +6,6 @@ the arms' poses (estimation/). The calibration of the capture's own camera is no
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -14,21 +13,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr import __version__
-from jcr.calibration.case import Case
+from jcr.calibration.case import Case, Model, camera_of
 from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects, straight_shift
-from jcr.calibration.hand_eye import MAX_STD
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.verdict import MAX_STD
 from jcr.capture.images import read_image
 from jcr.cell.images import cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
-from jcr.estimation.hypotheses import Adjustment
+from jcr.estimation.hypotheses import Tested
 from jcr.estimation.image_equations import median_reprojection_px
-from jcr.estimation.problem import Problem, State, columns_of_arm, freed, with_observations
-from jcr.estimation.solve import Solution, solve
+from jcr.estimation.problem import Effect, Problem, State, columns_of_arm, with_observations
+from jcr.estimation.solve import Solution, solve, solve_again
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, apply, inverse, step_between
 from jcr.least_squares import one_blas_thread
@@ -67,7 +66,13 @@ def place_cameras(
         reconstruction=reconstruction,
         options=options,
         robot=robot_errors(capture, options).of(reconstruction.image_index),
-        hand_eye=hand_eye,
+        fit=hand_eye,
+        numbers=hand_eye,
+        model=Model(
+            tracks=reconstruction.tracks,
+            used=hand_eye.inliers,
+            camera=camera_of(capture, reconstruction),
+        ),
     )
     rigs = Rigs(case)
     found = {camera.name: list[tuple[Registration | None, int]]() for camera in others}
@@ -152,71 +157,45 @@ def _examined(
             continue
         placed = _placement(one, solution, hand_eye)
         assert placed.covariance is not None
-        state, faults = effects(
-            Adjustment(
-                solution=solution,
-                adjust=partial(_adjusted, problem, start, one),
-                arm=one.arm or None,
-                names=one.names,
-                is_given=one.camera.intrinsics is not None,
-                std=np.sqrt(np.diag(placed.covariance)) * placed.converged,
-                camera=one.number,
-                place=one.parent_from_camera,
-            )
+        tested = Tested(
+            solution=solution,
+            arm=one.arm or None,
+            names=one.names,
+            is_given=one.camera.intrinsics is not None,
+            std=np.sqrt(np.diag(placed.covariance)) * placed.converged,
+            camera=one.number,
+            place=one.parent_from_camera,
         )
-        problem, solution, faults = _adopted(problem, start, one, state, faults)
+        solution, faults = _adopted(tested, *effects(tested))
         found.append(faults)
     return solution, found
 
 
 def _adopted(
-    problem: Problem, start: State, views: CameraViews, model: Adjustment, faults: tuple[Finding, ...]
-) -> tuple[Problem, Solution, tuple[Finding, ...]]:
-    """Return problem and solution with the effects of `model` on a camera and its arm, and the findings on them.
+    tested: Tested, confirmed: Sequence[Effect], faults: Sequence[Finding]
+) -> tuple[Solution, tuple[Finding, ...]]:
+    """Return the solution with the effects on a camera and its arm, and the findings on them.
 
     Findings on the camera lose their shifts. The first finding on the arm's lengths or angles (a strain) gets the shift
-    of the camera's pose from reported to true gripper poses.
+    of the camera's pose from reported to true gripper poses. Effects of the image order are not adopted.
     """
-    free = model.combinations
-    strains = [row for row in model.rows if row.kind.row.group == "strain"]
-    if free is None and not strains:
-        return problem, model.solution, faults
-    if free is not None:
-        problem = freed(problem, free, views.number)
-    bent = np.concatenate([row.unit * row.columns for row in strains], axis=1) if strains else None
-    if bent is not None and views.arm is not None:
-        own, arms = model.poses[1], list(problem.arms)
-        arms[views.arm] = replace(arms[views.arm], confirmed_errors=bent[own])
-        problem = replace(problem, arms=tuple(arms))
-    solution, adopted = solve(*with_observations(problem, start)), list[Finding]()
+    kept = [one for one in confirmed if one.of_camera or one.kind.row.group == "strain"]
+    if not kept:
+        return tested.solution, tuple(faults)
+    solution, adopted = (
+        solve_again(tested.solution, effects=(*tested.solution.problem.effects, *kept)),
+        list[Finding](),
+    )
+    strains = [one for one in kept if not one.of_camera]
     for one in faults:
         if one.kind.row.group == "camera":
             one = as_adopted(one)
-        elif bent is not None and views.arm is not None and one.kind is strains[0].kind:
-            shift = straight_shift(solution, bent)[columns_of_arm(views.arm)[:6]]
+        elif strains and one.kind is strains[0].kind:
+            bent = np.concatenate([each.unit * each.columns for each in strains], axis=1)
+            shift = straight_shift(solution, bent)[columns_of_arm(strains[0].part)[:6]]
             one = replace(one, shift=(*shift.tolist(), 0.0))
         adopted.append(one)
-    return problem, solution, tuple(adopted)
-
-
-def _adjusted(
-    problem: Problem,
-    start: State,
-    views: CameraViews,
-    combinations: Float[ndarray, "e p"] | None = None,
-    errors: Float[ndarray, "s b"] | None = None,
-) -> Solution:
-    """Return the joint solution with free directions of one camera, and errors of its arm's poses (Adjustment.adjust).
-
-    `problem` has all observations of the cell, `start` is its initial state.
-    """
-    if combinations is not None:
-        problem = freed(problem, combinations, views.number)
-    if views.arm is not None and errors is not None:
-        arms = list(problem.arms)
-        arms[views.arm] = replace(arms[views.arm], confirmed_errors=errors)
-        problem = replace(problem, arms=tuple(arms))
-    return solve(*with_observations(problem, start))
+    return solution, tuple(adopted)
 
 
 def _placement(

@@ -7,7 +7,7 @@ effect. The confirmation estimates the sizes again together with the effect (Seb
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Float
@@ -24,13 +24,14 @@ from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
     UNKNOWNS,
+    Effect,
     State,
     columns_of_arm,
     rows_of,
     with_free,
 )
 from jcr.estimation.robot_noise import Equations, most_likely, over_sizes, solve_equations
-from jcr.estimation.solve import Solution
+from jcr.estimation.solve import Solution, solve_again
 from jcr.findings import FindingKind
 from jcr.geometry import Poses, Transform, skew, step_between
 from jcr.records import Intrinsics, JointOffsets, RobotNoise
@@ -53,49 +54,8 @@ for _k, (_a, _b) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
-    """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
-
-    The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
-    intrinsics in the units of problem.rows_of; then focal lengths and shears of its images; then s1 to s4 of the
-    thin prism.
-    """
-
-    kind: FindingKind
-    columns: Float[ndarray, "c d"]
-    """Derivative of the c coordinates by the d parameters."""
-    nuisance: Float[ndarray, "c q"] | None = None
-    """Directions that are free with and without the effect; None: none."""
-    motion: Float[ndarray, "c 6"] | None = None
-    """Derivative of the residuals by a motion that acts on all images alike; None for other effects."""
-    share: Float[ndarray, " n"] | None = None
-    """Factor of `motion` at each of n poses, so that `columns` is their product."""
-    place: int = 0
-    """First image after the change; 0 for an effect that is not a change at one image."""
-    places: int = 1
-    """Number of alternative rows with this and other places, by which p-values are multiplied."""
-    unit: float = 1.0
-    """Prior standard deviation of the parameters of adopted errors of poses; for a camera, factor of the stated size."""
-
-    @property
-    def of_camera(self) -> bool:
-        """Whether the effect is on a camera; otherwise it is on the reported poses."""
-        return self.kind.row.group == "camera"
-
-    @property
-    def beside(self) -> Float[ndarray, "c q"]:
-        """Directions (columns) in the c coordinates that are free with and without the effect; q = 0 for none."""
-        return self.columns[:, :0] if self.nuisance is None else self.nuisance
-
-    @property
-    def both(self) -> Float[ndarray, "c r"]:
-        """Directions (columns) in the c coordinates that are free with the effect: `beside`, then `columns`."""
-        return np.concatenate([self.beside, self.columns], axis=1)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Quadratic cost of c coordinates, of which a row frees some directions, with all adjusted unknowns eliminated."""
+    """Quadratic cost of c coordinates, of which effects free some directions; all adjusted unknowns are eliminated."""
 
     information: Float[ndarray, "c c"]
     gradient: Float[ndarray, " c"]
@@ -113,23 +73,23 @@ class Scores:
         """
         return squared_length(free.T @ self.gradient, free.T @ self.information @ free)
 
-    def log_p(self, row: Row) -> float:
+    def log_p(self, effect: Effect) -> float:
         """Return the natural log p-value of the score test of an effect: the chance of its gain without the effect.
 
-        The gain of `Row.both` minus that of `Row.beside`, over `dispersion` and the number of parameters, is tested by
-        an F distribution. The p-value is multiplied by `row.places`.
+        The gain of `Effect.both` minus that of `Effect.beside`, over `dispersion` and the number of parameters, is
+        tested by an F distribution. The p-value is multiplied by `effect.places`.
         """
-        (without, fewer), (gain, more) = self.gain(row.beside), self.gain(row.both)
+        (without, fewer), (gain, more) = self.gain(effect.beside), self.gain(effect.both)
         d = max(more - fewer, 1)
         ratio = max(gain - without, 0.0) / self.dispersion / d
-        return float(f_distribution.logsf(ratio, d, self.freedom) + np.log(row.places))
+        return float(f_distribution.logsf(ratio, d, self.freedom) + np.log(effect.places))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Test:
     """Result of Wald's test of one effect."""
 
-    row: Row
+    effect: Effect
     estimate: Float[ndarray, " d"]
     """Estimate of the d parameters of the effect."""
     covariance: Float[ndarray, "d d"]
@@ -141,19 +101,17 @@ class Test:
     numbers; of all p unknowns in the result of `confirm_in_equations`."""
     noise: RobotNoise
     """Robot pose noise estimated together with the effect."""
-    after: "Adjustment | None" = None
-    """Adjustment with the effect; None for an effect on the poses."""
+    solution: Solution | None = None
+    """Solution with the effect; None for an effect on the poses."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adjustment:
-    """Adjustment of images and reported poses with the confirmed effects; one camera and one arm are tested."""
+class Tested:
+    """Solution of a problem, and the camera and the arm of it whose effects are tested."""
 
     solution: Solution
-    adjust: Callable[[Float[ndarray, "e p"] | None, Float[ndarray, "s b"] | None], Solution]
-    """Function that adjusts again with p free directions of the camera and b errors (1σ) of the arm's poses."""
     names: Sequence[str]
-    """Names of the images."""
+    """Names of the camera's images."""
     std: Float[ndarray, "6"]
     """Standard deviations of the camera's pose (m, rad) without effects; 0 for a rejected calibration."""
     is_given: bool = False
@@ -164,14 +122,20 @@ class Adjustment:
     """Function that returns the camera's pose, in the gripper or base frame, from the state."""
     arm: int | None = 0
     """Index of the arm whose poses are tested; None if another camera's tests include them."""
-    rows: tuple[Row, ...] = ()
-    """Confirmed effects, whose parameters are estimated."""
 
     @property
-    def combinations(self) -> Float[ndarray, "e p"] | None:
-        """Free directions (columns) of the camera's e parameters (`Row`) for confirmed effects; None without."""
-        each = [row.both for row in self.rows if row.of_camera]
-        return np.concatenate(each, axis=1) if each else None
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects on the tested camera and arm that the solution includes."""
+        every = self.solution.problem.effects
+        return tuple(one for one in every if one.part == (self.camera if one.of_camera else self.arm))
+
+    def with_effects(self, *effects: Effect) -> "Tested":
+        """Return the solution that includes, of the tested camera and arm, exactly these effects.
+
+        The sizes of all errors are estimated anew. Raises LinAlgError if the problem becomes singular.
+        """
+        others = (one for one in self.solution.problem.effects if one not in self.effects)
+        return replace(self, solution=solve_again(self.solution, effects=(*others, *effects)))
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -203,7 +167,7 @@ class Adjustment:
 
     @cached_property
     def camera_scores(self) -> Scores:
-        """Quadratic cost of changes of the tested camera's e parameters (`Row`) from their values in `solution`.
+        """Quadratic cost of changes of the tested camera's e parameters (`Effect`) from their values in `solution`.
 
         Units and weak prior are those of problem.rows_of. All other unknowns, and the freed directions, are eliminated.
         """
@@ -214,9 +178,8 @@ class Adjustment:
         first = problem.columns.cameras.stop
         each = np.zeros((len(problem.directions), len(rows)))
         each[rows] = np.diag(units)
-        freed = np.concatenate([problem.directions[:, first - len(problem.freed_std) :], each], axis=1)
         wider = image_evidence(
-            with_free(problem, freed=freed, freed_std=np.r_[problem.freed_std, weak]),
+            with_free(problem, freed=each, freed_std=weak),
             replace(state, camera_steps=np.insert(state.camera_steps, first, np.zeros(len(rows)))),
         )
         # The arms are at the most likely state, the images at the state of the evidence.
@@ -236,42 +199,33 @@ class Adjustment:
             dispersion=_dispersion(solution.images),
         )
 
-    def with_rows(self, rows: Sequence[Row]) -> "Adjustment":
-        """Return the adjustment that estimates exactly the effects `rows`; the sizes of all errors are estimated anew.
 
-        An effect on the camera frees its directions. An effect on the poses adds errors whose parameters have the prior
-        standard deviation `Row.unit`. Raises LinAlgError if the problem becomes singular.
-        """
-        free, own = replace(self, rows=tuple(rows)), self.poses[1]
-        errors = [row.unit * row.columns[own] for row in rows if not row.of_camera]
-        bent = np.concatenate(errors, axis=1) if errors else None
-        return replace(free, solution=self.adjust(free.combinations, bent))
+def rank(model: Tested, effects: Sequence[Effect]) -> list[tuple[Effect, float]]:
+    """Return `effects` with the natural log p-values of their score tests (`Scores.log_p`), the smallest first."""
+    each = [
+        (model.camera_scores if effect.of_camera else model.pose_scores).log_p(effect) for effect in effects
+    ]
+    return sorted(zip(effects, each, strict=True), key=lambda one: one[1])
 
 
-def rank(model: Adjustment, rows: Sequence[Row]) -> list[tuple[Row, float]]:
-    """Return `rows` with the natural log p-values of their score tests (`Scores.log_p`), the smallest first."""
-    each = [(model.camera_scores if row.of_camera else model.pose_scores).log_p(row) for row in rows]
-    return sorted(zip(rows, each, strict=True), key=lambda one: one[1])
-
-
-def confirm(model: Adjustment, row: Row) -> Test:
-    """Return Wald's test of one possible effect `row`: whether its estimate differs significantly from 0.
+def confirm(model: Tested, effect: Effect) -> Test:
+    """Return Wald's test of one possible effect: whether its estimate differs significantly from 0.
 
     The error sizes are estimated anew together with the effect. An effect on the poses is estimated in the linearised
     equations of `model`. An effect on the camera is estimated by a new adjustment with all confirmed effects of
     `model`, which raises LinAlgError if it is singular.
     """
-    if not row.of_camera:
-        test = confirm_in_equations(model.solution.equations, row, arm=model.arm or 0)
+    if not effect.of_camera:
+        test = confirm_in_equations(model.solution.equations, effect, arm=model.arm or 0)
         own = test.shift[columns_of_arm(model.arm or 0)[:6]]
         return replace(test, shift=np.r_[own, 0.0])
-    after = model.with_rows((*model.rows, row))
+    after = model.with_effects(*model.effects, effect)
     assert model.camera is not None
-    problem, solution, d = after.solution.problem, after.solution, row.columns.shape[1]
+    problem, solution, d = after.solution.problem, after.solution, effect.columns.shape[1]
     # The effect is the part of the freed directions along its columns, which no nuisance direction shares.
     rows, units, _ = rows_of(problem, model.camera)
-    freed = slice(problem.columns.cameras.stop - len(problem.freed_std), problem.columns.cameras.stop)
-    along = np.linalg.pinv(row.both)[-d:] @ (problem.directions[rows, freed] / units[:, None])
+    freed = slice(problem.columns.cameras.stop - len(problem.of_effects[1]), problem.columns.cameras.stop)
+    along = np.linalg.pinv(effect.both)[-d:] @ (problem.directions[rows, freed] / units[:, None])
     unknowns = solution.camera_unknowns(freed)
     estimate = along @ solution.images.state.camera_steps[freed]
     covariance = along @ solution.covariance[unknowns, unknowns] @ along.T
@@ -281,13 +235,13 @@ def confirm(model: Adjustment, row: Row) -> Test:
     step = step_between(model.place(model.solution.state), model.place(solution.state))
     growth = np.log(solution.state.scale / model.solution.state.scale)
     return Test(
-        row=row,
+        effect=effect,
         estimate=estimate,
         covariance=_dispersion(solution.images) * covariance,
-        log_p=float(f_distribution.logsf(ratio, d, scores.freedom) + np.log(row.places)),
+        log_p=float(f_distribution.logsf(ratio, d, scores.freedom) + np.log(effect.places)),
         shift=np.r_[step, growth],
         noise=solution.equations.noise(solution.log_sizes, model.arm or 0),
-        after=after,
+        solution=solution,
     )
 
 
@@ -300,18 +254,20 @@ def squared_length(vector: Float[ndarray, " d"], covariance: Float[ndarray, "d d
     return float(whitened @ whitened), int(kept.sum())
 
 
-def confirm_in_equations(equations: Equations, row: Row, freedom: float | None = None, arm: int = 0) -> Test:
+def confirm_in_equations(
+    equations: Equations, effect: Effect, freedom: float | None = None, arm: int = 0
+) -> Test:
     """Return Wald's test of an effect on the poses: an F test of its parameters, averaged over the error sizes.
 
-    The rows of `row.columns` are those of `equations.residual`. The average weighs each choice of the sizes by its
+    The rows of `effect.columns` are those of `equations.residual`. The average weighs each choice of the sizes by its
     posterior (`over_sizes`). `Test.shift` is the change of all p unknowns, in the order of `equations`. `freedom` is
     the denominator's degrees of freedom of each F test; None: those of all residuals, which is conservative. `arm` is
     the arm whose noise the result has.
     """
-    count, d = equations.jacobian.shape[1], row.columns.shape[1]
+    count, d = equations.jacobian.shape[1], effect.columns.shape[1]
     free = replace(
         equations,
-        jacobian=np.concatenate([equations.jacobian, row.columns], axis=1),
+        jacobian=np.concatenate([equations.jacobian, effect.columns], axis=1),
         prior_information=np.pad(equations.prior_information, (0, d)),
         prior_gradient=np.pad(equations.prior_gradient, (0, d)),
     )
@@ -327,49 +283,49 @@ def confirm_in_equations(equations: Equations, row: Row, freedom: float | None =
         log_tail = np.array([f_distribution.logsf(float(one), d, under) for one in ratio])
         log_shares.append(np.log(np.maximum(weight, 1e-300)) + log_tail)
     return Test(
-        row=row,
+        effect=effect,
         estimate=found.step[count:],
         covariance=found.covariance[count:, count:],
-        log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(row.places)),
+        log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(effect.places)),
         shift=found.step[:count] - without.step,
         noise=free.noise(likeliest, arm),
     )
 
 
-def explains_by_order(scores: Scores, row: Row) -> bool:
+def explains_by_order(scores: Scores, effect: Effect) -> bool:
     """Return whether at most the share BY_CHANCE of random orders of the images reach the score gain of a motion.
 
-    `row` must have `motion` and `share`. ORDERS permutations of the share among the poses that move are compared by
+    `effect` must have `motion` and `share`. ORDERS permutations of the share among the poses that move are compared by
     `Scores.gain` of motion times share. This permutation test allows for errors with heavy tails and single wrong
     poses.
     """
-    assert row.motion is not None and row.share is not None
-    rng, own = np.random.default_rng(0), row.motion[::6].any(axis=1)
-    centred, shares = row.share[own] - row.share[own].mean(), [row.share]
+    assert effect.motion is not None and effect.share is not None
+    rng, own = np.random.default_rng(0), effect.motion[::6].any(axis=1)
+    centred, shares = effect.share[own] - effect.share[own].mean(), [effect.share]
     for _ in range(ORDERS):
         order = rng.permutation(centred)
         # A constant is absorbed by the hand-eye transform and the sign is arbitrary: such orders are equivalent.
         if not (np.allclose(order, centred) or np.allclose(order, -centred)):
-            shares.append(row.share.copy())
+            shares.append(effect.share.copy())
             shares[-1][own] = order
-    found, *others = (scores.gain(row.motion * np.repeat(share, 6)[:, None])[0] for share in shares)
+    found, *others = (scores.gain(effect.motion * np.repeat(share, 6)[:, None])[0] for share in shares)
     return sum(one >= found - 1e-9 for one in others) <= BY_CHANCE * len(others)
 
 
-def pose_rows(model: Adjustment) -> Iterator[Row]:
+def pose_effects(model: Tested) -> Iterator[Effect]:
     """Yield the effects on the poses of the tested arm: those of the image order, then those of the gripper pose.
 
-    They are drift, slip of the camera, base moved and delayed poses; then those of `arm_rows`. Slip and moved base have
-    one row for each of at most MANY_PLACES images at which they may happen. Parameters are steps (m, rad) of X for
-    drift and slip, of Z for a moved base, and a number of images for the delay. The arm needs six poses or more.
+    They are drift, slip of the camera, base moved and delayed poses; then those of `arm_effects`. Slip and moved base
+    have one effect for each of at most MANY_PLACES images at which they may happen. Parameters are steps (m, rad) of X
+    for drift and slip, of Z for a moved base, and a number of images for the delay. The arm needs six poses or more.
     """
     # These imports are slow and rarely needed.
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 
-    gripper, own = model.poses
+    (gripper, own), part = model.poses, model.arm or 0
     n, jacobian = len(gripper), model.solution.equations.jacobian
-    by_x, by_z = np.split(jacobian[:, columns_of_arm(model.arm or 0)], 2, axis=1)
+    by_x, by_z = np.split(jacobian[:, columns_of_arm(part)], 2, axis=1)
 
     count = min(n - 2 * LEAST_PART + 1, MANY_PLACES)
     places = np.unique(np.linspace(LEAST_PART, n - LEAST_PART, count).astype(int)).tolist()
@@ -382,7 +338,7 @@ def pose_rows(model: Adjustment) -> Iterator[Row]:
         share[own.start // 6 : own.stop // 6] = factor
         columns = motion * np.repeat(share, 6)[:, None]
         count = len(places) if k else 1
-        yield Row(kind=kind, columns=columns, motion=motion, share=share, place=k, places=count)
+        yield Effect(kind=kind, part=part, columns=columns, motion=motion, share=share, place=k, places=count)
     # The velocity (m, rad per image) at each pose, by splines through all poses.
     moment, little = np.arange(n, dtype=float), 1e-3
     rotation = RotationSpline(moment, Rotation.from_matrix(gripper[:, :3, :3]))
@@ -390,12 +346,14 @@ def pose_rows(model: Adjustment) -> Iterator[Row]:
     velocity = np.concatenate(
         [CubicSpline(moment, gripper[:, :3, 3])(moment, 1), turned / (2 * little)], axis=1
     )
-    late = Row(kind=FindingKind.DELAY, columns=velocity.reshape(-1, 1))
-    for one in (late, *arm_rows(gripper)):
-        yield replace(one, columns=np.pad(one.columns, ((own.start, len(jacobian) - own.stop), (0, 0))))
+    late = Effect(kind=FindingKind.DELAY, columns=velocity.reshape(-1, 1))
+    for one in (late, *arm_effects(gripper)):
+        yield replace(
+            one, part=part, columns=np.pad(one.columns, ((own.start, len(jacobian) - own.stop), (0, 0)))
+        )
 
 
-def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
+def arm_effects(base_from_gripper: Poses) -> Iterator[Effect]:
     """Yield the effects that depend on the gripper pose: strain of all lengths, leaning base, sagging tool.
 
     Columns are errors of n poses (6n rows: m, then rad, pose by pose; base axes, z up). Parameters of the strain are
@@ -406,15 +364,15 @@ def arm_rows(base_from_gripper: Poses) -> Iterator[Row]:
     n = len(position)
     strain = np.zeros((n, 6, len(STRAINS)))
     strain[:, :3] = np.einsum("kab,nb->nak", STRAINS, position)
-    yield Row(kind=FindingKind.LENGTHS, columns=strain.reshape(6 * n, -1), unit=0.1)
+    yield Effect(kind=FindingKind.LENGTHS, columns=strain.reshape(6 * n, -1), unit=0.1)
     # The base leans towards the gripper by 1 rad per metre of horizontal distance.
     lean = np.cross(position, UP)
     columns = np.concatenate([np.cross(lean, position), lean], axis=1).reshape(6 * n, 1)
-    yield Row(kind=FindingKind.BASE_LEANS, columns=columns, unit=0.2)
+    yield Effect(kind=FindingKind.BASE_LEANS, columns=columns, unit=0.2)
     # The gripper rotates under a weight on a lever along each of its axes, by 1 rad for a horizontal lever.
     sag = np.zeros((n, 6, 3))
     sag[:, 3:] = -rotation @ skew(rotation[:, 2])
-    yield Row(kind=FindingKind.TOOL_SAGS, columns=sag.reshape(6 * n, -1), unit=0.1)
+    yield Effect(kind=FindingKind.TOOL_SAGS, columns=sag.reshape(6 * n, -1), unit=0.1)
 
 
 def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffsets:
@@ -441,7 +399,7 @@ TESTED_IF_ESTIMATED = ("fx", "p1", "p2")
 """Intrinsics that are tested of estimated ones, for which fx = fy and p1 = p2 = 0 was assumed."""
 
 
-def tested_intrinsics(model: Adjustment) -> list[str]:
+def tested_intrinsics(model: Tested) -> list[str]:
     """Return the names of the camera's parameters that the test of FindingKind.INTRINSICS frees.
 
     They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, as far as the camera has them. A given distortion coefficient is
@@ -457,10 +415,10 @@ def tested_intrinsics(model: Adjustment) -> list[str]:
     return [name for name in tested if name in names and name not in loose]
 
 
-def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
+def camera_effects(model: Tested, min_images: int) -> Iterator[Effect]:
     """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
-    Effects on images are focal lengths and shears (rolling shutter). They include a zoom, with one row for each image
+    Effects on images are focal lengths and shears (rolling shutter). They include a zoom, with one effect for each image
     at which it may happen. Each has the common error of the focal length as nuisance; the prism also has the principal
     point. With fewer than `min_images` images, wrong intrinsics are the only effect. The
     prism is tested only if there is one camera.
@@ -474,8 +432,9 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     every = np.eye(len(names) + OF_IMAGE * m + PRISM)
     # Directions of the focal length and of the shear of each image.
     focal, shear = np.split(every[:, len(names) : -PRISM], OF_IMAGE, axis=1)
+    effect = partial(Effect, part=model.camera)
     tested = every[:, [names.index(name) for name in tested_intrinsics(model)]]
-    yield Row(kind=FindingKind.INTRINSICS, columns=tested)
+    yield effect(kind=FindingKind.INTRINSICS, columns=tested)
     if m < min_images:
         return
     common = every[:, :2].sum(1, keepdims=True)
@@ -488,19 +447,19 @@ def camera_rows(model: Adjustment, min_images: int) -> Iterator[Row]:
     by_distance, unit = focal @ (far - far.mean())[:, None], float(np.ptp(far))
     # An orthonormal basis of the vectors whose sum is 0.
     each = focal @ np.linalg.svd(np.eye(m) - 1 / m)[0][:, : m - 1]
-    yield Row(kind=FindingKind.FOCUS_BY_DISTANCE, columns=by_distance, nuisance=common, unit=unit)
-    yield Row(kind=FindingKind.FOCUS_BY_IMAGE, columns=each, nuisance=common)
+    yield effect(kind=FindingKind.FOCUS_BY_DISTANCE, columns=by_distance, nuisance=common, unit=unit)
+    yield effect(kind=FindingKind.FOCUS_BY_IMAGE, columns=each, nuisance=common)
     for kind, shares in (
         (FindingKind.ROLLING_SHUTTER, np.ones((m, 1))),
         (FindingKind.ROLLING_SHUTTER_BY_IMAGE, np.eye(m)),
     ):
-        yield Row(kind=kind, columns=shear @ shares, nuisance=common, unit=camera.fx)
+        yield effect(kind=kind, columns=shear @ shares, nuisance=common, unit=camera.fx)
     places = range(LEAST_ZOOMED, m - LEAST_ZOOMED + 1)
     for k in places:
         after = focal @ ((np.arange(m) >= k) - (m - k) / m)[:, None]
-        yield Row(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
+        yield effect(kind=FindingKind.ZOOM, columns=after, nuisance=common, place=k, places=len(places))
     if len(problem.cameras) == 1:  # all images have the same lens
-        yield Row(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
+        yield effect(kind=FindingKind.THIN_PRISM, columns=every[:, -PRISM:], nuisance=of_centre)
 
 
 def _dispersion(images: ImageEvidence) -> float:

@@ -307,11 +307,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     everywhere = Region(by_unknown, fit, problem.unknowns)
     region = replace(everywhere, by_unknown=by_unknown[rows], fit=fit[:, rows])
     systematic = np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms)))
-    confirmed = (
-        np.zeros((6 * len(arm.rigs), 0)) if arm.confirmed_errors is None else arm.confirmed_errors
-        for arm in problem.arms
-    )
-    columns = np.asarray(block_diag(*confirmed))
+    bent = problem.bent
     every = Equations(
         residual=residual.ravel(),
         jacobian=jacobian,
@@ -320,7 +316,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         known=shared,
         systematic=everywhere.left(systematic),
         given=problem.robot_noise_floor,
-        confirmed=everywhere.left(columns @ columns.T) if columns.size else None,
+        confirmed=everywhere.left(bent @ bent.T) if bent.size else None,
         arm=np.repeat(np.arange(len(problem.arms)), [len(one.rigs) for one in problem.arms])
         if len(problem.arms) > 1
         else None,

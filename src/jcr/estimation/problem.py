@@ -24,6 +24,7 @@ from jcr.estimation.elimination import Sightings
 from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, unmodelled
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
+from jcr.findings import FindingKind
 from jcr.geometry import Poses, Transform, by_similarity, retract, scale_translation, step_between
 from jcr.records import Intrinsics, Tracks
 
@@ -76,6 +77,55 @@ shutter). s1 to s4 are those of OpenCV."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Effect:
+    """Possible effect with d parameters, on the reported poses or on one camera, that the model lacks.
+
+    The c coordinates are the residuals of the reported poses (m, rad; base axes), or the camera's e parameters: its
+    intrinsics in the units of `rows_of`; then focal lengths and shears of its images; then s1 to s4 of the thin prism.
+    """
+
+    kind: FindingKind
+    part: int = 0
+    """Index of the camera or the arm that has the effect."""
+    columns: Float[ndarray, "c d"]
+    """Derivative of the c coordinates by the d parameters."""
+    nuisance: Float[ndarray, "c q"] | None = None
+    """Directions that are free with and without the effect; None: none."""
+    motion: Float[ndarray, "c 6"] | None = None
+    """Derivative of the residuals by a motion that acts on all images alike; None for other effects."""
+    share: Float[ndarray, " n"] | None = None
+    """Factor of `motion` at each of n poses, so that `columns` is their product."""
+    place: int = 0
+    """First image after the change; 0 for an effect that is not a change at one image."""
+    places: int = 1
+    """Number of alternative rows with this and other places, by which p-values are multiplied."""
+    unit: float = 1.0
+    """Prior standard deviation of the parameters of adopted errors of poses; for a camera, factor of the stated size."""
+
+    @property
+    def of_camera(self) -> bool:
+        """Whether the effect is on a camera; otherwise it is on the reported poses."""
+        return self.kind.row.group == "camera"
+
+    @property
+    def beside(self) -> Float[ndarray, "c q"]:
+        """Directions (columns) in the c coordinates that are free with and without the effect; q = 0 for none."""
+        return self.columns[:, :0] if self.nuisance is None else self.nuisance
+
+    @property
+    def both(self) -> Float[ndarray, "c r"]:
+        """Directions (columns) in the c coordinates that are free with the effect: `beside`, then `columns`."""
+        return np.concatenate([self.beside, self.columns], axis=1)
+
+    def with_parameters(self, first: int, more: int) -> "Effect":
+        """Return an effect on a camera for a camera model with `more` coefficients after the `first` parameters."""
+        if not self.of_camera:
+            return self
+        own, beside = (np.insert(one, [first] * more, 0.0, axis=0) for one in (self.columns, self.beside))
+        return replace(self, columns=own, nuisance=beside)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReportedPoses:
     """Reported gripper poses of one arm, and the rigs (camera poses) that it moves."""
 
@@ -87,8 +137,6 @@ class ReportedPoses:
     """Covariance (s,s), s = 6n, of the systematic errors of the n poses for a size σ_s of 1 rad."""
     carries: Literal["camera", "scene"] = "camera"
     """Object that moves with the gripper."""
-    confirmed_errors: Float[ndarray, "s b"] | None = None
-    """Errors of the poses (s = 6n rows) by each of b confirmed effects of one standard deviation; None: no effects."""
 
 
 class LinearPrior(NamedTuple):
@@ -175,8 +223,10 @@ class Problem:
     """Observations sorted by point and rig, at least two for each point; None: `known_rigs` has the camera poses."""
     boards: BoardShapes | None = None
     """Shape prior of board corners among the points; None: no boards."""
+    effects: tuple[Effect, ...] = ()
+    """Effects that are estimated: on cameras as free directions, on reported poses as errors of the poses."""
     freed: Float[ndarray, "r e"] = field(default_factory=lambda: np.zeros((0, 0)))
-    """Additional free directions of cameras and images, one column each; rows are those of `directions`."""
+    """Further free directions of cameras and images for a score test, one column each; rows as in `directions`."""
     freed_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
     """Prior standard deviation along each column of `freed`."""
     known_rigs: tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6*m 6*m"] | None] | None = None
@@ -211,11 +261,43 @@ class Problem:
         """Directions (columns) in which the parameters of cameras and images may differ from the means of their priors.
 
         Rows: intrinsics of each camera (camera.parameters); focal lengths of all images, then shears
-        (OF_IMAGE); s1 to s4 of the thin prism. Columns: directions of each camera's prior, then `freed`.
+        (OF_IMAGE); s1 to s4 of the thin prism. Columns: directions of each camera's prior, those of `effects`, `freed`.
         """
         own = np.asarray(block_diag(*(camera.directions for camera in self.cameras)))
         own = np.pad(own, ((0, OF_IMAGE * self.n_images + PRISM), (0, 0)))
-        return np.concatenate([own, self.freed], axis=1) if self.freed.size else own
+        more = (part for part in (self.of_effects[0], self.freed) if part.size)
+        return np.concatenate([own, *more], axis=1)
+
+    @cached_property
+    def of_effects(self) -> tuple[Float[ndarray, "r e"], Float[ndarray, " e"]]:
+        """Free directions of the effects on cameras, rows as in `directions`, and prior standard deviation of each.
+
+        Directions of intrinsics, and those of the rest, are independent, with the weak prior of `rows_of`.
+        """
+        count = sum(len(camera.directions) for camera in self.cameras) + OF_IMAGE * self.n_images + PRISM
+        columns, std = [np.zeros((count, 0))], [np.zeros(0)]
+        for c, camera in enumerate(self.cameras):
+            both = [effect.both for effect in self.effects if effect.of_camera and effect.part == c]
+            if both:
+                (rows, units, weak), every, q = (
+                    rows_of(self, c),
+                    np.concatenate(both, axis=1),
+                    len(camera.directions),
+                )
+                free = np.asarray(block_diag(*(orth(part, rcond=1e-9) for part in (every[:q], every[q:]))))
+                columns.append(np.zeros((count, free.shape[1])))
+                columns[-1][rows] = units[:, None] * free
+                std.append(1 / np.sqrt(((free / weak[:, None]) ** 2).sum(0)))
+        return np.concatenate(columns, axis=1), np.concatenate(std)
+
+    @cached_property
+    def bent(self) -> Float[ndarray, "s b"]:
+        """Errors of all reported poses (s = 6n rows) by one standard deviation of each parameter of `effects` on them.
+
+        The parameters' prior standard deviation is `Effect.unit`.
+        """
+        each = (effect.unit * effect.columns for effect in self.effects if not effect.of_camera)
+        return np.concatenate([np.zeros((6 * sum(len(arm.rigs) for arm in self.arms), 0)), *each], axis=1)
 
     @cached_property
     def model_error_counts(self) -> list[int]:
@@ -345,7 +427,8 @@ class Problem:
         each = [np.full(c.stop - c.start, size)
                 for c, size in zip(self.columns.model_error, state.model_error_std, strict=True)]  # fmt: skip
         boards = np.zeros(0) if self.boards is None else self.boards.shape_std
-        return np.concatenate([*(camera.std for camera in self.cameras), self.freed_std, *each, boards])
+        freed = self.of_effects[1], self.freed_std
+        return np.concatenate([*(camera.std for camera in self.cameras), *freed, *each, boards])
 
     def displacement(self, state: State) -> Float[ndarray, " r"]:
         """Return parameters of cameras and images minus their prior means, in the order of the rows of `directions`."""
@@ -441,31 +524,12 @@ def rows_of(
     return rows, units, np.r_[WEAK, np.full(more, WEAK_DISTORTION), of_each, np.full(PRISM, WEAK_PRISM)]
 
 
-def freed(problem: Problem, combinations: Float[ndarray, "e p"], camera: int = 0) -> Problem:
-    """Return the problem with additional free directions, in the parameters of one camera and of its images.
-
-    `combinations` (e,p) has one direction per column, in the e parameters and units of `rows_of`. The intrinsics part
-    and the rest of the columns are freed independently, with the weak prior of `rows_of`.
-    """
-    rows, units, weak = rows_of(problem, camera)
-    q = len(problem.cameras[camera].directions)
-    free = np.asarray(block_diag(*(orth(part, rcond=1e-9) for part in (combinations[:q], combinations[q:]))))
-    directions = np.zeros((len(problem.directions), free.shape[1]))
-    directions[rows] = units[:, None] * free
-    before = problem.freed if problem.freed.size else directions[:, :0]
-    return replace(
-        problem,
-        freed=np.concatenate([before, directions], axis=1),
-        freed_std=np.r_[problem.freed_std, 1 / np.sqrt(((free / weak[:, None]) ** 2).sum(0))],
-    )
-
-
 OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacements", "camera_rows", "prism")
 """Cached properties of a problem that depend on its observations."""
 
 
 def with_free(problem: Problem, **changes: Any) -> Problem:
-    """Return the problem with `changes` of its fields: `priors`, or free directions of cameras (`freed`, `freed_std`).
+    """Return the problem with `changes` of its fields: `priors`, `effects`, or free directions (`freed`, `freed_std`).
 
     The cached properties OF_OBSERVATIONS are kept, although `displacements` would change a little with the directions.
     """
@@ -601,16 +665,18 @@ def pose_problem(
     error_covariance: Float[ndarray, "s s"] | None = None,
     noise_floor: tuple[float, float] | None = None,
     priors: tuple[LinearPrior, ...] = (),
+    carries: Literal["camera", "scene"] = "camera",
 ) -> tuple[Problem, State]:
     """Return the problem of reported gripper poses and given camera poses, without images, and its initial state.
 
     `start` is the initial (gripper_from_camera, scale, base_from_recon). `camera_covariance` (6n,6n) is of the steps of
     the camera poses (geometry.retract; recon axes and unit, rad); None: exact. `error_covariance` is that of
     `wrist_arm`, `noise_floor` a lower bound (m, rad) on the random errors. `priors` are linear priors on X and scale.
+    The gripper moves what `carries` says (ReportedPoses).
     """
     x, scale, z = start
     problem = Problem(
-        arms=(wrist_arm(base_from_gripper, error_covariance),),
+        arms=(replace(wrist_arm(base_from_gripper, error_covariance), carries=carries),),
         n_rigs=len(base_from_gripper),
         known_rigs=(recon_from_camera, camera_covariance),
         priors=priors,
@@ -627,14 +693,14 @@ def wrist_problem(
     tracks: Tracks,
     *,
     noise: tuple[float, float] | None = None,
-    combinations: Float[ndarray, "e p"] | None = None,
+    effects: tuple[Effect, ...] = (),
 ) -> tuple[Problem, State]:
     """Return the problem of images and reported poses together, and its initial state; the world is in metres.
 
     The world is the frame of the reconstruction, scaled by the initial scale. `arm` has one pose per image. `start` is
     the initial (gripper_from_camera, scale, base_from_recon). `tracks` has points and observations in the images of
-    `recon_from_camera`. `noise` is a lower bound on the random errors of the poses (m, rad). `combinations` are
-    additional free parameters of the camera, as in `freed`.
+    `recon_from_camera`. `noise` is a lower bound on the random errors of the poses (m, rad). `effects` are those
+    that are estimated.
     """
     (x, scale, z), n = start, len(recon_from_camera)
     points_in_world = scale * tracks.points_in_recon.astype(float)
@@ -654,6 +720,7 @@ def wrist_problem(
             std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
         ),
         boards=boards,
+        effects=effects,
         robot_noise_floor=noise,
     )
     state = State(
@@ -663,4 +730,4 @@ def wrist_problem(
         world_from_rig=np.concatenate([scale_translation(recon_from_camera, scale), world_from_board]),
         points_in_world=points_in_world,
     )
-    return with_observations(problem if combinations is None else freed(problem, combinations), state)
+    return with_observations(problem, state)

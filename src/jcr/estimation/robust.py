@@ -9,6 +9,7 @@ therefore give a larger estimated noise rather than many rejected poses.
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,7 +27,7 @@ from jcr.estimation.problem import (
 )
 from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
-from jcr.geometry import ARM, Poses, rotation_angle, skew, transform
+from jcr.geometry import ARM, Poses, inverse, rotation_angle, skew, transform
 
 Images = Bool[ndarray, " n"]
 """Mask of the used images."""
@@ -55,6 +56,7 @@ def robust_fit(
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
     agreeing: Images | None = None,
+    carries: Literal["camera", "scene"] = "camera",
 ) -> Solution:
     """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
@@ -84,13 +86,15 @@ def robust_fit(
         error_covariance=systematic,
         noise_floor=noise,
         priors=priors,
+        carries=carries,
     )
+    moving = inverse(base_from_gripper) if carries == "scene" else base_from_gripper
     fits: dict[bytes, Solution] = {}
 
     def fitted(used: Images) -> Solution:
         """Return the solution with the used images, without averaging over error sizes."""
         if used.tobytes() not in fits:
-            x, scale, z = initial_estimate(base_from_gripper[used], recon_from_camera[used])
+            x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
             start = replace(state, x=x[None], scale=scale, z=z[None])
             fits[used.tobytes()] = solve(replace(every, used=used), start, averaged=False)
         return fits[used.tobytes()]
@@ -98,7 +102,7 @@ def robust_fit(
     used = np.ones(n, dtype=bool)
     if n >= 5:
         if agreeing is None:
-            agreeing = least_trimmed(base_from_gripper, recon_from_camera)[0]
+            agreeing = least_trimmed(moving, recon_from_camera)[0]
         used, evidence = _improved(fitted, agreeing, adding=True)
         if n <= MANY:
             fewer, other = _improved(fitted, np.ones(n, dtype=bool), adding=False)

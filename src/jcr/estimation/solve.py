@@ -9,6 +9,7 @@ averaged over the sizes of the robot's errors (covariance.py).
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -46,6 +47,8 @@ from jcr.estimation.problem import (
     similarities_of_rigs,
     step_to,
     stepped,
+    transferred,
+    with_free,
 )
 from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import (
@@ -235,6 +238,16 @@ def solve(
     state, images, settled, rounds, last_step = _rounds(problem, start)
     found = with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
+
+
+def solve_again(found: Solution, **changes: Any) -> Solution:
+    """Return the solution of the problem of `found` after `changes` of its fields, starting from `found`.
+
+    The observations stay. Raises LinAlgError if the problem becomes singular.
+    """
+    problem = with_free(found.problem, **changes)
+    vars(problem).pop("displacements", None)
+    return solve(problem, transferred(found.problem, found.state, problem))
 
 
 def uncertainty_of(found: Solution) -> Uncertainty:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate_case
+from jcr.calibration.stage import calibration_of, checked_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.prediction import FEWEST
@@ -181,7 +181,7 @@ class LiveCalibration:
             most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
             some = replace(made, tracks=_longest(made.tracks, most))
             with suppress(RejectedError):
-                case = calibrate_case(capture, some, self._options, robot.of(rows))
+                case = checked_case(capture, some, self._options, robot.of(rows))
         state = replace(state, registered=tuple(names[row] for row in rows))
         if case is None:
             findings += [] if robot.unused is None else [robot.unused]
@@ -191,7 +191,7 @@ class LiveCalibration:
                 kind = FindingKind.NO_RECONSTRUCTION
                 few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)
             return replace(state, findings=strongest_first([*findings, few]))
-        hand_eye, tracks = case.hand_eye, case.reconstruction.tracks
+        hand_eye, tracks = calibration_of(case), case.reconstruction.tracks
         for one in hand_eye.images if hand_eye.converged else ():
             metres = 1e-3 * (one.translation_residual_mm or 0.0)
             radians = float(np.radians(one.rotation_residual_deg or 0.0))

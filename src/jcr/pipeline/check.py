@@ -206,7 +206,7 @@ def _compare(
             return _compare(capture, robot, options, progress, thorough=True)
         return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
-    hand_eye, assumptions, registered = case.hand_eye, None, made.image_index[case.hand_eye.inliers]
+    hand_eye, assumptions, registered = case.calibration, None, made.image_index[case.model.used]
     if hand_eye.converged:
         assumptions = assumptions_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
@@ -226,8 +226,8 @@ def assumptions_of(case: Case) -> Assumptions:
 
     If the case's images were not adjusted, camera poses are assumed to be given and exact (`Assumptions.camera` None).
     """
-    x, used, distance_m = case.hand_eye.gripper_from_camera, case.base_from_gripper[case.used], None
-    if case.adjusted is not None:
+    x, used, distance_m = case.calibration.gripper_from_camera, case.base_from_gripper[case.used], None
+    if case.solution is not None:
         distance_m = case.scene_distance_m
     return Assumptions(
         gripper_from_camera=x,

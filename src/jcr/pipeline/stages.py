@@ -21,7 +21,7 @@ from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibratio
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
-from jcr.cell.carried import eye_to_hand, refined
+from jcr.cell.carried import with_moving_parts
 from jcr.cell.placement import FILE as CAMERAS
 from jcr.cell.placement import CamerasFile, write_cameras
 from jcr.depth.densify import densify
@@ -180,11 +180,7 @@ def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
     if the images show a board.
     """
     capture, out, options = result.capture, result.out, result.state.options
-    seen = capture
-    if capture.mount == "base":
-        # Gripper poses are inverted for a fixed camera, and the arm's kinematics do not apply to inverted poses.
-        seen, own = eye_to_hand(capture, out / MOVING), replace(options.calibrate, robot=None)
-        options = replace(options, calibrate=own)
+    seen = with_moving_parts(capture, out / MOVING) if capture.mount == "base" else capture
 
     def is_same(folder: Path) -> bool:
         """Test whether a folder has a reconstruction of the same inputs; False if its run.json cannot be read."""
@@ -256,8 +252,6 @@ def forget_reconstruction(out: Path) -> None:
 def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     """Add attempts, notes and a proposed board to the calibration; write calibration.json and log.txt."""
     capture, reconstruction, content = result.capture, result.reconstruction, result.solved
-    if capture.mount == "base":
-        content = refined(capture, reconstruction, result.found, result.state.options.calibrate)
     notes = (*capture.notes, *reconstruction.notes)
     content = replace(content, attempts=result.state.attempts, notes=notes)
     if content.verdict == "rejected" or content.short is not None:

@@ -6,16 +6,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.adjust import with_adjusted_images
+from jcr.calibration.adjust import solved
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import judged
 from jcr.distributions import f as f_distribution
 from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD, STRETCHED_STD
 from jcr.estimation.projection import by_points
 from jcr.estimation.solve import Solution, size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import skew
-from jcr.records import Tracks
 
 LIKELY, STRETCHED = 2.0, 4.0
 """Stretch of a board, in standard deviations of a printer's stretch, from which it is estimated without a prior; and the
@@ -36,7 +34,7 @@ def check_boards(case: Case) -> Case:
 
     A case without the option --board is unchanged.
     """
-    boards = case.reconstruction.tracks.boards
+    boards = case.model.tracks.boards
     if boards is None:
         return case
     findings = list[Finding]()
@@ -46,10 +44,9 @@ def check_boards(case: Case) -> Case:
     if boards.elsewhere:
         elsewhere = [case.names[row] for row in boards.elsewhere]
         findings.append(Finding.of(FindingKind.BOARD_MOVED, "warns", "images", *elsewhere, board=boards.spec))
-    hand_eye = case.hand_eye
-    if case.adjusted is None or case.adjusted.problem.boards is None:
-        return case.after(tuple(findings))
-    adjusted, shapes = case.adjusted, case.adjusted.problem.boards
+    if case.solution is None or case.solution.problem.boards is None:
+        return case.found(*findings)
+    adjusted, shapes = case.solution, case.solution.problem.boards
     if boards.is_stretched:
         stretch, std = stretch_of(adjusted)
         size = {"value": abs(stretch), "std": std, "board": boards.spec}
@@ -59,13 +56,13 @@ def check_boards(case: Case) -> Case:
     bend = max(float(np.ptp(height[shapes.body == k])) for k in np.unique(shapes.body))
     if bend > BENT_M:
         findings.append(Finding.of(FindingKind.BOARD_BENT, "informs", "none", value=bend, board=boards.spec))
-    if boards.size_std is None and hand_eye.source == "images":
+    if boards.size_std is None and case.numbers.source == "images":
         size, by_unknown = size_of_boards(adjusted)
         side = boards.side * float(np.exp(size))
         std = side * float(np.sqrt(by_unknown @ adjusted.covariance @ by_unknown))
         sides = {"value": side, "std": std, "board": boards.spec}
         findings.append(Finding.of(FindingKind.BOARD_SIDE, "informs", "none", **sides))
-    return case.after(tuple(findings))
+    return case.found(*findings)
 
 
 def check_board_shapes(case: Case) -> Case:
@@ -76,7 +73,7 @@ def check_board_shapes(case: Case) -> Case:
     scales along its two sides. The images are then adjusted again. `check_boards` reports both errors.
     """
     for _ in range(MOST_MOTIONS):
-        tracks, adjusted = case.reconstruction.tracks, case.adjusted
+        tracks, adjusted = case.model.tracks, case.solution
         if adjusted is None or adjusted.problem.boards is None or tracks.boards is None:
             return case
         away = case.used[images_of_motion(adjusted)]
@@ -84,28 +81,16 @@ def check_board_shapes(case: Case) -> Case:
             break
         rest = tracks.only(~(tracks.on_board[tracks.point] & np.isin(tracks.image, away)))
         elsewhere = tuple(sorted({*tracks.boards.elsewhere, *away.tolist()}))
-        case = _adjusted_again(case, replace(rest, boards=replace(tracks.boards, elsewhere=elsewhere)))
-    tracks, adjusted = case.reconstruction.tracks, case.adjusted
+        rest = replace(rest, boards=replace(tracks.boards, elsewhere=elsewhere))
+        case = solved(case, replace(case.model, tracks=rest))
+    tracks, adjusted = case.model.tracks, case.solution
     if tracks.boards is None or adjusted is None or abs(stretch_of(adjusted)[0]) < LIKELY * STRETCH_STD:
         return case
-    free = _adjusted_again(case, replace(tracks, boards=replace(tracks.boards, is_stretched=True)))
-    if free.adjusted is None:
-        return case
-    stretch, std = stretch_of(free.adjusted)
+    stretched = replace(tracks, boards=replace(tracks.boards, is_stretched=True))
+    free = solved(case, replace(case.model, tracks=stretched))
+    assert free.solution is not None
+    stretch, std = stretch_of(free.solution)
     return free if abs(stretch) > STRETCHED * float(np.hypot(std, STRETCH_STD)) else case
-
-
-def _adjusted_again(case: Case, tracks: Tracks) -> Case:
-    """Return the case after bundle adjustment with other tracks, starting from the fit to camera poses.
-
-    `tracks` replace those of the reconstruction; their image indices count the registered images. Findings of earlier
-    checks are kept.
-    """
-    made = replace(case.reconstruction, tracks=tracks)
-    kept = tuple(one for one in case.hand_eye.findings if one.kind is not FindingKind.NOT_SETTLED)
-    fit = judged(replace(case.pose_fit, findings=kept))
-    changed = replace(case, reconstruction=made, hand_eye=fit, fit=None, chosen_tracks=None, adjusted=None)
-    return with_adjusted_images(changed)
 
 
 def images_of_motion(adjusted: Solution) -> Int[ndarray, " a"]:

@@ -8,13 +8,13 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.estimation.closed_form import initial_estimate
-from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.estimation.robust import least_trimmed
 from jcr.features.sift import FARTHEST, detect, grey_of
-from jcr.findings import Finding, FindingKind
+from jcr.findings import Finding, FindingKind, verdict_of
 from jcr.geometry import inverse, largest_motion, scale_translation, step_between
 from jcr.records import Capture
 
@@ -37,31 +37,17 @@ MANY = 1 / 4
 """Fraction of blurred images above which blur counts as the cause of a rejection."""
 
 
-def check_registered(case: Case) -> Case:
-    """Return the case with a finding if only the motions of all images, not those of the used ones, are observable.
-
-    The remedy is then a better reconstruction and not other motions. If the poses of all registered images would be
-    observable but few of them agree, the used images agree by chance. The findings on their unobservable directions are
-    then removed instead. Nothing is concluded from gripper poses that contradict the images.
-    """
-    hand_eye, capture = case.hand_eye, case.capture
-    unseen = hand_eye.observability.findings
-    if len(case.used) == len(capture) or not unseen or observability(capture.base_from_gripper).findings:
+def check_mount(case: Case) -> Case:
+    """Return the case with a finding if the poses of a rejected fixed camera fit a camera on the gripper."""
+    if case.carries == "camera" or verdict_of(case.calibration.findings) != "rejected":
         return case
-    kinds = {one.kind for one in hand_eye.findings}
-    contradicted = FindingKind.FEW_AGREE in kinds
-    if contradicted and not observability(case.base_from_gripper).findings:
-        rest = tuple(one for one in hand_eye.findings if one not in unseen)
-        return case.after((), replace(hand_eye, findings=rest))
-    if FindingKind.POSES_CONTRADICT_IMAGES in kinds:
-        return case
-    rejected = any(one.severity == "rejects" for one in hand_eye.findings)
-    counts = {"value": float(len(case.used)), "of": float(len(capture))}
-    few = Finding.of(FindingKind.FEW_USED, "rejects" if rejected else "warns", "reconstruction", **counts)
-    findings = tuple(
-        replace(one, concerns="reconstruction") if one in unseen else one for one in hand_eye.findings
+    on_gripper = solve_hand_eye(case.base_from_gripper, case.recon_from_camera, camera_errors="none")
+    camera = {"camera": case.capture.camera_name}
+    return (
+        case.found(Finding.of(FindingKind.WRONG_MOUNT, "rejects", "mount", **camera))
+        if on_gripper.converged
+        else case
     )
-    return case.after((few,), replace(hand_eye, findings=findings))
 
 
 def check_pieces(case: Case) -> Case:
@@ -71,8 +57,8 @@ def check_pieces(case: Case) -> Case:
     within a piece; wrong gripper poses give scattered values instead. Values agree if the gripper poses that they
     predict differ by at most SAME. Accepted calibrations are not tested.
     """
-    gripper, camera = case.base_from_gripper, case.recon_from_camera
-    if case.hand_eye.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
+    gripper, camera = case.moving, case.recon_from_camera
+    if case.calibration.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
         return case
     agree, _ = least_trimmed(gripper, camera)
     for _ in range(CONCENTRATED):
@@ -93,7 +79,7 @@ def check_pieces(case: Case) -> Case:
         return case
     names = [case.names[row] for row in others[in_pieces]]
     counts = {"value": float(len(names)), "of": float(len(gripper))}
-    return case.after((Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts),))
+    return case.found(Finding.of(FindingKind.PIECES, "rejects", "reconstruction", *names, **counts))
 
 
 def check_remarks(case: Case) -> Case:
@@ -103,7 +89,7 @@ def check_remarks(case: Case) -> Case:
     """
     texts = case.reconstruction.warnings
     warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
-    return case.after((*filter(None, [case.robot.unused]), *warnings))
+    return case.found(*filter(None, [case.robot.unused]), *warnings)
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.case import Case
+from jcr.calibration.verdict import judged
 from jcr.capture.notations import EULERS, NUMBERS, in_words, rotations_of
 from jcr.capture.notations import numbers_of as written_in
 from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, other_orders
@@ -48,16 +49,17 @@ def check_convention(case: Case) -> Case:
     Another reading is looked for if the calibration is rejected and no wrong size of a board explains that.
     """
     capture, camera, rows = case.capture, case.recon_from_camera, case.reconstruction.image_index
+    found = case.calibration
     if capture.reading is not None:
-        found = of_camera(case.hand_eye.gripper_from_camera, capture.reading.inverted)
-        if found is not None:
-            return case.after((found,))
-    by_board = any(one.kind is FindingKind.BOARD_SIZE for one in case.hand_eye.findings)
-    if case.hand_eye.converged or case.pose_fit.converged or by_board:
+        own = of_camera(found.parent_from_camera, capture.reading.inverted)
+        if own is not None:
+            return case.found(own)
+    by_board = any(one.kind is FindingKind.BOARD_SIZE for one in found.findings)
+    if found.converged or judged(case.fit, case.fit.findings).converged or by_board:
         return case
-    observable = case.hand_eye.observability.observable
-    poses = capture.base_from_gripper
-    return case.after(better_reading(poses, camera, observable, capture.images, rows, capture.untaken))
+    poses = case.of_arm(capture.base_from_gripper)
+    untaken = [(reading, case.of_arm(other)) for reading, other in capture.untaken]
+    return case.found(*better_reading(poses, camera, case.observable, capture.images, rows, untaken))
 
 
 def of_camera(gripper_from_camera: Transform, is_inverted: bool) -> Finding | None:

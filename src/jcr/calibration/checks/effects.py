@@ -14,28 +14,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjust_case, readjusted
-from jcr.calibration.case import Case, some_points
-from jcr.calibration.hand_eye import poses_agree
+from jcr.calibration.adjust import solution_of, solved
+from jcr.calibration.case import Case, with_prism
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
-from jcr.camera import parameter_names, parameters, with_thin_prism
+from jcr.calibration.verdict import poses_agree
+from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import (
     STRAINS,
     TESTED_IF_GIVEN,
-    Adjustment,
-    Row,
     Test,
-    camera_rows,
+    Tested,
+    camera_effects,
     confirm,
     explains_by_order,
-    pose_rows,
+    pose_effects,
     rank,
     squared_length,
     tested_intrinsics,
 )
-from jcr.estimation.problem import OF_IMAGE, SCALE, pose_problem
+from jcr.estimation.problem import OF_IMAGE, SCALE, Effect, pose_problem
 from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
@@ -130,50 +129,52 @@ def check_effects(case: Case) -> Case:
     """
     if not case.is_open:
         return case
-    longer, in_order = case, with_rejected_runs(case.hand_eye.inliers)
-    if (in_order != case.hand_eye.inliers).any():
+    longer, in_order = case, with_rejected_runs(case.model.used)
+    if (in_order != case.model.used).any():
         # A slip of the camera may reject consecutive images, which are then used again.
-        longer = replace(case, hand_eye=case.hand_eye.with_used(in_order), chosen_tracks=None, adjusted=None)
-        try:
-            longer = longer if case.adjusted is None else replace(longer, adjusted=adjust_case(longer))
-        except np.linalg.LinAlgError:
-            longer = case
-    if case.adjusted is None or longer.adjusted is None or not case.shows_camera:
+        longer = replace(case, model=replace(case.model, used=in_order))
+        with suppress(np.linalg.LinAlgError):
+            if case.solution is not None:
+                longer = replace(longer, solution=solution_of(case, longer.model))
+    if longer.solution is None or not case.shows_camera:
         evidence = case.reconstruction.evidence
         found = effects_of_fit(
             case.base_from_gripper,
             case.recon_from_camera,
-            case.hand_eye,
+            case.calibration,
             case.names,
             camera_covariance=None if evidence is None else evidence.covariance,
             error_covariance=case.robot.systematic,
             noise_floor=case.options.robot_noise_m_rad,
             priors=case.priors,
+            carries=case.carries,
         )
-        return case.after(found)
-    model, findings = effects(of_case(longer))
-    return case.after(findings) if longer is not case else _adopted(case, model, findings)
+        return case.found(*found)
+    confirmed, findings = effects(tested_case(longer))
+    return case.found(*findings) if longer is not case else _adopted(case, confirmed, findings)
 
 
-def of_case(case: Case) -> Adjustment:
-    """Return the case's adjustment in the form that the tests of effects need (hypotheses.Adjustment).
+def tested_case(case: Case) -> Tested:
+    """Return the solution of a case in the form that the tests of effects need (hypotheses.Tested).
 
     A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
     a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
     """
-    tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
+    tracks, most, solution = (
+        case.model.observations,
+        MOST_BYTES // (BYTES_PER_IMAGE * len(case.used)),
+        case.solution,
+    )
     is_many = len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
     if len(case.used) >= MIN_IMAGES and is_many:
-        case = replace(case, chosen_tracks=some_points(tracks, most, MOST_POINTS))
-        case = replace(case, adjusted=adjust_case(case))
-    assert case.adjusted is not None
-    return Adjustment(
-        solution=case.adjusted,
-        adjust=lambda combinations, errors: adjust_case(
-            case, combinations=combinations, confirmed_errors=errors
-        ),
+        fewer = min(most, case.model.most)
+        solution = solution_of(case, replace(case.model, most=fewer, most_points=MOST_POINTS))
+    assert solution is not None
+    found = case.calibration
+    return Tested(
+        solution=solution,
         names=[case.names[row] for row in case.used],
-        std=np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged,
+        std=np.sqrt(np.diag(found.covariance)[:6]) * found.converged,
         is_given=case.capture.intrinsics is not None,
     )
 
@@ -189,15 +190,14 @@ def effects_of_fit(
 
     Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
     `known` are further keyword arguments of `pose_problem`: `camera_covariance`, `error_covariance`, `noise_floor`,
-    `priors`.
+    `priors`, `carries`.
     """
-    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid
+    start = hand_eye.parent_from_camera, hand_eye.scale, hand_eye.body_from_recon.rigid
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
     used = with_rejected_runs(hand_eye.inliers)
     solution = solve(replace(problem, used=used), state, averaged=False)
-    model = Adjustment(
+    model = Tested(
         solution=solution,
-        adjust=lambda _, __: solution,
         names=[names[k] for k in np.flatnonzero(used).tolist()],
         std=np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged,
         camera=None,
@@ -213,15 +213,16 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 
 
 def effects(
-    model: Adjustment, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
-) -> tuple[Adjustment, tuple[Finding, ...]]:
-    """Return the adjustment with the confirmed effects on its camera and arm, and one finding for each effect.
+    model: Tested, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
+) -> tuple[tuple[Effect, ...], tuple[Finding, ...]]:
+    """Return the confirmed effects on the tested camera and arm, and one finding for each.
 
     Each round adds the most significant effect on the camera or on the poses; of two, the one that explains the other.
     The rounds end if no effect is significant or `at_most` are found. Effects of the kinds `passed`, and of kinds that
     `model` includes already, are not tested.
     """
-    findings, passed = list[Finding](), {*passed, *(row.kind for row in model.rows)}
+    findings, confirmed = list[Finding](), model.effects
+    passed = {*passed, *(one.kind for one in confirmed)}
     while len(findings) < at_most:
         of_camera, of_poses = (_best(model, passed, camera) for camera in (True, False))
         best = of_camera or of_poses
@@ -231,23 +232,25 @@ def effects(
             # Each is tested again with the other one estimated. The cause is the effect that stays significant; if both
             # or neither does, it is the one with the smaller p-value.
             (camera, _), (pose, _) = of_camera, of_poses
-            assert camera.after is not None
-            left = _best(camera.after, passed, False)
-            poses_remain = left is not None and left[0].row.kind is pose.row.kind
-            ((_, log_p),) = rank(model.with_rows((*model.rows, pose.row)), [camera.row])
-            camera_remains = log_p <= np.log(POLICIES[camera.row.kind].alpha)
+            assert camera.solution is not None
+            left = _best(replace(model, solution=camera.solution), passed, False)
+            poses_remain = left is not None and left[0].effect.kind is pose.effect.kind
+            ((_, log_p),) = rank(model.with_effects(*model.effects, pose.effect), [camera.effect])
+            camera_remains = log_p <= np.log(POLICIES[camera.effect.kind].alpha)
             is_pose = pose.log_p < camera.log_p if poses_remain == camera_remains else poses_remain
             best = of_poses if is_pose else of_camera
         test, found = best
         findings.append(found)
-        passed.add(test.row.kind)
-        rows = (*model.rows, test.row)
-        is_last = len(findings) == at_most
-        model = test.after or (replace(model, rows=rows) if is_last else model.with_rows(rows))
-    return model, tuple(findings)
+        passed.add(test.effect.kind)
+        confirmed = (*model.effects, test.effect)
+        if len(findings) == at_most:
+            break
+        found_with = test.solution
+        model = model.with_effects(*confirmed) if found_with is None else replace(model, solution=found_with)
+    return confirmed, tuple(findings)
 
 
-def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
+def _best(model: Tested, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
     """Return Wald's test of the most significant effect that is confirmed, and its finding; None without one.
 
     `of_camera` True tests effects on the camera, False effects on the reported poses. Kinds in `passed` are not tested.
@@ -256,33 +259,33 @@ def _best(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -
     it is more significant in the true order of the images than in nearly all random orders.
     """
     tests = list[Test]()
-    for row in _promising(model, passed, of_camera):
+    for one in _promising(model, passed, of_camera):
         with suppress(np.linalg.LinAlgError):
-            tests.append(confirm(model, row))
+            tests.append(confirm(model, one))
     for test in sorted(tests, key=lambda one: one.log_p):
-        kind, log_p = test.row.kind, test.log_p
+        kind, log_p = test.effect.kind, test.log_p
         if kind is FindingKind.INTRINSICS:
             test = replace(test, log_p=(log_p := min(log_p, log_p_of_given(model))))
         if log_p > _log_alpha(kind, model):
             continue
         if kind is FindingKind.FOCUS_BY_IMAGE:
             # A focal length that follows the distance or changes once replaces one that explains hardly more.
-            focal = test.row.columns @ test.estimate
-            simple = [one.row.columns[:, 0] for one in tests if one.row.kind in FOCUS - {kind}]
+            focal = test.effect.columns @ test.estimate
+            simple = [one.effect.columns[:, 0] for one in tests if one.effect.kind in FOCUS - {kind}]
             if any((one @ focal) ** 2 > NEARLY_ALL * (one @ one) * (focal @ focal) for one in simple):
                 continue
-        is_motion = test.row.motion is not None
+        is_motion = test.effect.motion is not None
         sizes = np.linalg.norm(test.estimate.reshape(1 + is_motion, -1), axis=1)
         if (sizes > POLICIES[kind].largest).any() or not poses_agree(test.noise):
             return None
-        if is_motion and not explains_by_order(model.pose_scores, test.row):
+        if is_motion and not explains_by_order(model.pose_scores, test.effect):
             continue
         if (found := finding_of(test, model)) is not None:
             return test, found
     return None
 
 
-def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bool) -> list[Row]:
+def _promising(model: Tested, passed: Collection[FindingKind], of_camera: bool) -> list[Effect]:
     """Return the possible effects to confirm, the smallest p-value of the score test first; one per kind of effect.
 
     `of_camera` True selects effects on the camera, False effects on the reported poses. At most CONFIRMED_AT_MOST are
@@ -293,23 +296,25 @@ def _promising(model: Adjustment, passed: Collection[FindingKind], of_camera: bo
     """
     if of_camera and model.camera is not None:
         passed = {*passed, *(FOCUS if FOCUS & {*passed} else ())}
-        ranked = rank(model, [row for row in camera_rows(model, MIN_IMAGES) if row.kind not in passed])
-        rows = [row for row, log_p in ranked if log_p <= _log_alpha(row.kind, model)]
-        if not rows and not any(row.of_camera for row in model.rows):
+        ranked = rank(model, [one for one in camera_effects(model, MIN_IMAGES) if one.kind not in passed])
+        likely = [one for one, log_p in ranked if log_p <= _log_alpha(one.kind, model)]
+        if not likely and not any(one.of_camera for one in model.effects):
             limit = _log_alpha(FindingKind.INTRINSICS, model)
             is_off = log_p_of_given(model) <= limit
-            rows = [row for row, _ in ranked if row.kind is FindingKind.INTRINSICS and is_off]
+            likely = [one for one, _ in ranked if one.kind is FindingKind.INTRINSICS and is_off]
     elif not of_camera and model.arm is not None and len(model.poses[0]) >= MIN_IMAGES:
-        rows = [row for row, _ in rank(model, [one for one in pose_rows(model) if one.kind not in passed])]
+        likely = [
+            one for one, _ in rank(model, [one for one in pose_effects(model) if one.kind not in passed])
+        ]
     else:
         return []
-    best: dict[FindingKind, Row] = {}
-    for row in rows:
-        best.setdefault(row.kind, row)
+    best: dict[FindingKind, Effect] = {}
+    for one in likely:
+        best.setdefault(one.kind, one)
     return list(best.values())[: CONFIRMED_AT_MOST[of_camera]]
 
 
-def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
+def _log_alpha(kind: FindingKind, model: Tested) -> float:
     """Return the natural logarithm of the largest p-value at which an effect of this kind is significant.
 
     The p-value is `Policy.alpha` of the kind, or ALPHA_IF_GIVEN for wrong intrinsics that were given.
@@ -318,7 +323,7 @@ def _log_alpha(kind: FindingKind, model: Adjustment) -> float:
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
 
 
-def log_p_of_given(model: Adjustment) -> float:
+def log_p_of_given(model: Tested) -> float:
     """Return the natural log of the p-value of Wald's test that the given focal lengths and principal point are exact.
 
     The statistic is compared with an F distribution. The result is 0 (p = 1) without given intrinsics. It is also 0 if
@@ -333,14 +338,15 @@ def log_p_of_given(model: Adjustment) -> float:
     return float(f_distribution.logsf(ratio, 4, model.pose_scores.freedom))
 
 
-def finding_of(test: Test, model: Adjustment) -> Finding | None:
+def finding_of(test: Test, model: Tested) -> Finding | None:
     """Return the finding of a significant effect, which `test` found in `model`; None if it is small.
 
     A small effect changes the camera's pose by less than half a standard deviation (MATERIAL) along each axis. An
     effect on the images is also small below `Policy.least_px`, or below SURE standard deviations if each image has a
     parameter. Given intrinsics that Wald's test rejects are always reported, because the user may use them elsewhere.
     """
-    row, kind, after, std, estimate = test.row, test.row.kind, test.after, model.std, test.estimate
+    effect, kind, std, estimate = test.effect, test.effect.kind, model.std, test.estimate
+    after = None if test.solution is None else replace(model, solution=test.solution)
     policy, severity, images = POLICIES[kind], "warns", ()
     known, shift, moves = dict[str, Any](), test.shift, [test.shift]
     if after is not None:
@@ -356,23 +362,23 @@ def finding_of(test: Test, model: Adjustment) -> Finding | None:
         elif not std.any():
             # The effect may be why the calibration is rejected, so the uncertainty after its adjustment is the measure.
             std = np.sqrt(np.diag(after.solution.transform(after.place)[1]))
-        images = after.names[row.place - 1 : row.place + 1] if row.place else ()
-    elif row.motion is not None:
+        images = after.names[effect.place - 1 : effect.place + 1] if effect.place else ()
+    elif effect.motion is not None:
         # The shift of the finding is the effect on gripper_from_camera; for a motion of the base, that on the fit.
         moves = [estimate]
         shift = np.r_[{FindingKind.SLIP: estimate, FindingKind.DRIFT: estimate / 2}.get(kind, shift[:6]), 0.0]
         metres, radians = np.linalg.norm(estimate.reshape(2, 3), axis=1).tolist()
         known = {"value": metres, "rotation": radians}
-        if row.place:
-            images = model.names[row.place - 1 : row.place + 1]
+        if effect.place:
+            images = model.names[effect.place - 1 : effect.place + 1]
             if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1]:
                 severity = "rejects"
-            count, longer = max((row.place, "before"), (len(model.names) - row.place, "after"))
+            count, longer = max((effect.place, "before"), (len(model.names) - effect.place, "after"))
             known |= {"longer": longer, "count": float(count)}
     elif kind is FindingKind.DELAY:
         known = {"value": float(estimate[0]), "std": float(np.sqrt(test.covariance[0, 0]))}
     else:
-        moves = [shift, straight_shift(model.solution, row.unit * row.columns)]
+        moves = [shift, straight_shift(model.solution, effect.unit * effect.columns)]
         known, shift = _size_of_strain(test), None
     if not any((np.abs(one[:6]) > MATERIAL * std).any() for one in moves):
         return None
@@ -389,9 +395,9 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     "gripper".
     """
     estimate, covariance = test.estimate, test.covariance
-    if test.row.kind is FindingKind.BASE_LEANS:
+    if test.effect.kind is FindingKind.BASE_LEANS:
         return {"value": float(estimate[0]), "std": float(np.sqrt(covariance[0, 0]))}
-    if test.row.kind is FindingKind.TOOL_SAGS:
+    if test.effect.kind is FindingKind.TOOL_SAGS:
         value = float(np.linalg.norm(estimate))
         axis, frame = estimate / value, "gripper"
         std = float(np.sqrt(axis @ covariance @ axis))
@@ -405,31 +411,31 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     return {"value": value, "std": std, "frame": frame, **dict(zip("xyz", axis.tolist(), strict=True))}
 
 
-def _size_of_camera_effect(test: Test, after: Adjustment) -> dict[str, Any]:
+def _size_of_camera_effect(test: Test, after: Tested) -> dict[str, Any]:
     """Return the keyword arguments of `Finding.of` for the size of an effect on the camera, and its standard deviation.
 
     The size `value` is the rms of the effect's parameters: px, or a relative change of the focal length. A single
     focal-length parameter keeps its sign. For a thin prism the size is the largest displacement of a point (px). For
     wrong intrinsics each parameter is stated instead. `after` is the adjustment with the effect.
     """
-    row, value, std = test.row, test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0.0))
+    effect, value, std = test.effect, test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0.0))
     problem = after.solution.problem
-    if row.kind is FindingKind.INTRINSICS:
+    if effect.kind is FindingKind.INTRINSICS:
         return _intrinsics(after, std)
-    if row.kind is FindingKind.THIN_PRISM:
+    if effect.kind is FindingKind.THIN_PRISM:
         moved = problem.prism @ value
         k = int(np.linalg.norm(moved, axis=1).argmax())
         size = float(np.linalg.norm(moved[k]))
         along = moved[k] / max(size, 1e-12) @ problem.prism[k]
         return {"value": size, "std": float(np.sqrt(along @ test.covariance @ along))}
-    typical, count = row.unit * float(np.median(std)), len(value)
-    if row.kind in OF_EACH:
-        return {"value": row.unit * float(np.sqrt(value @ value / len(after.names))), "std": typical}
-    size = value[0] if row.kind in FOCUS else np.sqrt(np.mean(value**2))
-    return {"value": row.unit * float(size), "std": typical / float(np.sqrt(count))}
+    typical, count = effect.unit * float(np.median(std)), len(value)
+    if effect.kind in OF_EACH:
+        return {"value": effect.unit * float(np.sqrt(value @ value / len(after.names))), "std": typical}
+    size = value[0] if effect.kind in FOCUS else np.sqrt(np.mean(value**2))
+    return {"value": effect.unit * float(size), "std": typical / float(np.sqrt(count))}
 
 
-def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]:
+def _intrinsics(after: Tested, stds: Float[ndarray, " p"]) -> dict[str, Any]:
     """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
     `after` is the adjustment with the effect. `stds` holds the standard deviation of each tested parameter
@@ -458,33 +464,62 @@ def _intrinsics(after: Adjustment, stds: Float[ndarray, " p"]) -> dict[str, Any]
     return details if after.is_given else details | {"estimated": 1.0}
 
 
-def _adopted(case: Case, model: Adjustment, findings: tuple[Finding, ...]) -> Case:
-    """Return the case with a calibration that includes the effects, or with `findings` alone if that one is rejected.
+def _adopted(case: Case, effects: Sequence[Effect], findings: Sequence[Finding]) -> Case:
+    """Return the case solved with the effects on camera and arm, or with `findings` alone if that one is rejected.
 
-    `model` includes the effects, which were found with a subset of the points. They are now estimated from all points
+    The effects, which `findings` report, were found with a subset of the points. They are now estimated from all points
     that memory permits. Camera effects are dropped if the calibration then changes by at most half a standard deviation
-    (MATERIAL) on each axis.
+    (MATERIAL) on each axis. A thin prism becomes part of the intrinsics. Effects of the image order are not adopted.
     """
-    free = model.combinations
-    most = MOST_BYTES // (16 * (1 if free is None else free.shape[1]))
-    fewer = case
-    if len(case.tracks.image) > most:
-        fewer = replace(case, chosen_tracks=some_points(case.tracks, most), adjusted=None)
-    adjusted, adopted = with_effects(fewer, model, findings)
-    if adjusted is None:
-        return case.after(findings)
-    before, refined = case.hand_eye, readjusted(fewer, adjusted)
-    if not refined.converged:
-        return case.after(findings)
-    of_camera = {one.kind for one in findings if one.kind.row.group == "camera"} - {FindingKind.INTRINSICS}
-    moved = np.abs(step_between(before.gripper_from_camera, refined.gripper_from_camera))
+    kept = [one for one in effects if one.of_camera or one.kind.row.group == "strain"]
+    if not kept:
+        return case.found(*findings)
+    free = sum(one.both.shape[1] for one in kept if one.of_camera)
+    model = replace(
+        case.model, most=min(case.model.most, MOST_BYTES // (16 * max(free, 1))), effects=tuple(kept)
+    )
+    prism = [one for one in kept if one.kind is FindingKind.THIN_PRISM]
+    if prism and case.reconstruction.intrinsics.model != "fisheye":
+        camera, count = with_prism(case), len(parameters(case.reconstruction.intrinsics))
+        more = len(parameters(camera.intrinsics)) - count
+        rest = (one.with_parameters(count, more) for one in kept if one not in prism)
+        model = replace(model, camera=camera, effects=tuple(rest))
+    after, before = solved(case, model), case.calibration
+    if not after.calibration.converged:
+        return case.found(*findings)
+    moved = np.abs(step_between(before.parent_from_camera, after.numbers.parent_from_camera))
     std = np.sqrt(np.diag(before.covariance)[:6]) * before.converged
+    of_camera = {one.kind for one in kept if one.of_camera} - {FindingKind.INTRINSICS}
     if of_camera and not (moved > MATERIAL * std).any():
-        rest = tuple(row for row in model.rows if row.kind not in of_camera)
-        kept = tuple(one for one in findings if one.kind not in of_camera)
-        return _adopted(case, replace(model, rows=rest), kept)
-    adopted = tuple(as_remark(one, moved, case.capture.image_size) for one in adopted)
-    return fewer.after(adopted, refined, adjusted)
+        rest = [one for one in kept if one.kind not in of_camera]
+        return _adopted(case, rest, [one for one in findings if one.kind not in of_camera])
+    size = case.capture.image_size
+    return after.found(*(as_remark(_remaining(one, after), moved, size) for one in findings))
+
+
+def _remaining(found: Finding, after: Case) -> Finding:
+    """Return the finding of an effect with the shift that remains after the case `after` includes the effect.
+
+    The X of the case is the effective hand-eye transform, which predicts best from reported gripper poses. The
+    remaining shift of an effect of the arm is the difference from the transform for the true poses, and the possible
+    error of the scale.
+    """
+    assert after.solution is not None
+    strains, solution = [one for one in after.model.effects if not one.of_camera], after.solution
+    if found.kind.row.group == "camera":
+        return as_adopted(found)
+    if found.kind not in (one.kind for one in strains):
+        return found
+    # The shift due to all effects of the arm together belongs to the first finding.
+    straight = np.zeros(7)
+    if found.kind is strains[0].kind:
+        straight = straight_shift(solution, solution.problem.bent)[:7]
+    if found.kind is FindingKind.LENGTHS and found.value is not None:
+        # One of three axes has another scale; no image shows which scale is the true metre.
+        by_scale = solution.equations.jacobian[:, SCALE]
+        metre = abs(found.value) / 3 * np.r_[-(solution.poses.region.fit @ by_scale)[:6, 0], 1.0]
+        straight = straight + metre * (1 if straight[:6] @ metre[:6] >= 0 else -1)
+    return replace(found, shift=tuple(straight.tolist()))
 
 
 def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int, int]) -> Finding:
@@ -498,48 +533,6 @@ def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int,
     corner_px = float(np.hypot(*image_size)) / 2 * abs(found.value or 0.0)
     is_tiny = found.kind in FOCUS and corner_px < TINY_PX and max(metres, radians) < TINY
     return replace(found, severity="informs") if is_tiny else found
-
-
-def with_effects(
-    case: Case, model: Adjustment, findings: tuple[Finding, ...]
-) -> tuple[Solution | None, tuple[Finding, ...]]:
-    """Return an adjustment with the effects on camera and arm as parameters, and the findings with remaining shifts.
-
-    `model` includes the effects that `findings` report. The adjusted X is the effective hand-eye transform, which
-    predicts best from reported gripper poses. A finding's remaining shift is the difference from the transform for the
-    true poses, and the possible error of the scale. A thin prism becomes part of the intrinsics. Return None as
-    adjustment if there is no effect on camera or arm.
-    """
-    strains = [row for row in model.rows if row.kind.row.group == "strain"]
-    if not strains and not any(one.kind.row.group == "camera" for one in findings):
-        return None, findings
-    free, camera = model.combinations, model.intrinsics
-    if any(row.kind is FindingKind.THIN_PRISM for row in model.rows) and camera.model != "fisheye":
-        prism = with_thin_prism(case.reconstruction.intrinsics)
-        case = replace(case, reconstruction=replace(case.reconstruction, intrinsics=prism), adjusted=None)
-        rest = tuple(row for row in model.rows if row.kind is not FindingKind.THIN_PRISM)
-        if (free := replace(model, rows=rest).combinations) is not None:
-            # Rows for the new camera parameters are inserted after those of the previous camera model.
-            before, now = len(parameters(camera)), len(parameters(prism))
-            free = np.insert(free, [before] * (now - before), 0.0, axis=0)
-    bent = np.concatenate([row.unit * row.columns for row in strains], axis=1) if strains else None
-    adjusted, remaining = adjust_case(case, combinations=free, confirmed_errors=bent), list[Finding]()
-    for one in findings:
-        if one.kind.row.group == "camera":
-            one = as_adopted(one)
-        elif bent is not None and one.kind in (row.kind for row in strains):
-            # The shift due to all effects of the arm together belongs to the first finding.
-            straight = np.zeros(7)
-            if one.kind is strains[0].kind:
-                straight = straight_shift(adjusted, bent)[:7]
-            if one.kind is FindingKind.LENGTHS and one.value is not None:
-                # One of three axes has another scale; no image shows which scale is the true metre.
-                by_scale = adjusted.equations.jacobian[:, SCALE]
-                metre = abs(one.value) / 3 * np.r_[-(adjusted.poses.region.fit @ by_scale)[:6, 0], 1.0]
-                straight = straight + metre * (1 if straight[:6] @ metre[:6] >= 0 else -1)
-            one = replace(one, shift=tuple(straight.tolist()))
-        remaining.append(one)
-    return adjusted, tuple(remaining)
 
 
 def as_adopted(found: Finding) -> Finding:

@@ -9,7 +9,7 @@ from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import ARM, step_between
+from jcr.geometry import ARM, inverse, step_between
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.register import register
 
@@ -24,14 +24,13 @@ def check_pairing(case: Case) -> Case:
     The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted. Images
     with a merely wrong pose give no finding here.
     """
-    kinds = {one.kind for one in case.hand_eye.findings}
+    kinds = {one.kind for one in case.calibration.findings}
     disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
     if disagree or len(case.capture) - len(case.used) < 2:
         return case
     # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
-    fit = case.pose_fit
-    found = left_out_poses(case.capture, case.reconstruction, fit)
-    return case.after(tuple(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
+    found = left_out_poses(case.capture, case.reconstruction, case.fit)
+    return case.found(*(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
 
 
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
@@ -53,10 +52,11 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
         )
         places = zip(unseen, register(made, older, new), strict=True)
         camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
-    x, scale, z, right = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon.rigid, {*used}
+    x, scale, z, right = hand_eye.parent_from_camera, hand_eye.scale, hand_eye.body_from_recon.rigid, {*used}
+    moving = inverse(capture.base_from_gripper) if capture.mount == "base" else capture.base_from_gripper
     for row in (row for row in camera if row not in used):
         pose = predicted_gripper_poses(x, scale, z, camera[row][None])[0]
-        by = np.linalg.norm(step_between(capture.base_from_gripper, pose).reshape(-1, 2, 3), axis=2)
+        by = np.linalg.norm(step_between(moving, pose).reshape(-1, 2, 3), axis=2)
         if (by[row] < SAME).all():
             right.add(row)
             continue

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.adjust import refined_by
+from jcr.calibration.adjust import solved
 from jcr.calibration.case import Case
-from jcr.calibration.hand_eye import judged
 from jcr.calibration.record import Calibration
+from jcr.calibration.verdict import with_uncertainty
 from jcr.capture.images import read_depth_images
 from jcr.estimation.intrinsics_prior import MEASURED, camera_with_prior
-from jcr.estimation.problem import SCALE, LinearPrior, with_free
-from jcr.estimation.solve import Solution, size_of_boards, with_covariance
+from jcr.estimation.problem import SCALE, LinearPrior
+from jcr.estimation.solve import size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, DepthCheck, LengthCheck, Reconstruction
@@ -66,8 +66,8 @@ def check_lengths(case: Case) -> Case:
     of them contradict if they differ by more than SIGMAS standard deviations and by more than LEAST. The comparison is
     recorded in `Calibration.lengths`.
     """
-    hand_eye, lengths = _measured(case)
-    converged, percent = hand_eye.converged, hand_eye.uncertainty.scale_std_percent
+    depth, lengths = _measured(case)
+    converged, percent = case.calibration.converged, case.calibration.uncertainty.scale_std_percent
     robot = LengthCheck(name="robot", robot_longer_percent=0.0, std_percent=percent)
 
     def sigmas(pair: tuple[LengthCheck, LengthCheck]) -> float:
@@ -77,35 +77,39 @@ def check_lengths(case: Case) -> Case:
     pair = max(combinations([robot, *lengths], 2), key=sigmas, default=None) if converged else None
     if pair is not None and (sigmas(pair) <= SIGMAS or abs(pair[0].off - pair[1].off) <= LEAST):
         pair = None
-    of_images = converged and case.adjusted is not None and hand_eye.source == "images"
+    of_images = converged and case.numbers.source == "images"
     weighed = [
         one
         for one in lengths
         if of_images and pair is None and one.std < WORTH * robot.std and sigmas((one, robot)) < AGREES
     ]
-    hand_eye = replace(hand_eye, lengths=tuple(replace(one, used=one in weighed) for one in lengths))
     compared = any(one.name != "network" for one in lengths) or bool(case.priors)
     alone = not compared and case.reconstruction.metric_std is None
-    findings = (Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs"),) * alone
+    findings = [Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs")] * alone
     if pair is not None:
-        return case.after((_contradiction(*pair, hand_eye), *findings), hand_eye)
+        findings.insert(0, _contradiction(*pair, case.calibration))
     # The difference of the most exact length from the robot, as far as it exceeds their uncertainties, is a fault.
     best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
     beyond = best.off**2 - best.std**2 - robot.std**2
-    if best.std < EXACT and beyond > 0:
-        shift = _shift(float(np.sqrt(beyond)), hand_eye)
+    if pair is None and converged and best.std < EXACT and beyond > 0:
+        shift = _shift(float(np.sqrt(beyond)), case.calibration)
         fault = np.outer(shift, shift)
+    before = case.numbers.scale
     if weighed:
-        return case.after(findings, *_fused(case, hand_eye, weighed, fault))
-    if converged and fault.any():
-        hand_eye = judged(hand_eye.with_uncertainty(hand_eye.uncertainty.with_error(fault)))
-    return case.after(findings, hand_eye)
+        case = solved(case, replace(case.model, lengths=_priors(case, weighed)))
+    if depth is not None:
+        # The scale error of the depth images refers to the scale of the result.
+        percent = 100 * ((1 + depth.off_percent / 100) * before / case.numbers.scale - 1)
+        depth = replace(depth, off_percent=percent)
+    checked = tuple(replace(one, used=one in weighed) for one in lengths)
+    numbers = with_uncertainty(case.numbers, case.numbers.uncertainty.with_error(fault))
+    return replace(case, numbers=replace(numbers, lengths=checked, depth_check=depth)).found(*findings)
 
 
-def _measured(case: Case) -> tuple[Calibration, list[LengthCheck]]:
-    """Return the calibration with `depth_check` set, and the comparison of each known length of the case."""
-    hand_eye, found = case.hand_eye, list[LengthCheck]()
-    boards, adjusted, variance = case.reconstruction.tracks.boards, case.adjusted, hand_eye.covariance[6, 6]
+def _measured(case: Case) -> tuple[DepthCheck | None, list[LengthCheck]]:
+    """Return scale and noise of the depth images, and the comparison of each known length of the case."""
+    hand_eye, found, depth = case.calibration, list[LengthCheck](), None
+    boards, adjusted, variance = case.model.tracks.boards, case.solution, hand_eye.covariance[6, 6]
     is_known = boards is not None and hand_eye.source != "poses" and not boards.is_stretched
     size_std = boards.size_std if boards is not None and is_known else None
     if adjusted is not None and adjusted.problem.boards is not None and size_std is not None:
@@ -117,12 +121,11 @@ def _measured(case: Case) -> tuple[Calibration, list[LengthCheck]]:
         of_depth = max((depth.std_percent / 100) ** 2 - variance, 0.0)
         std = float(np.hypot(DEPTH_STD, np.sqrt(of_depth)))
         found.append(_length("depth camera", -float(np.log1p(depth.off_percent / 100)), std))
-        hand_eye = replace(hand_eye, depth_check=depth)
     # A metric unit with a standard deviation is a prior of the scale already, and no independent check.
     if case.reconstruction.is_metric and case.reconstruction.metric_std is None:
         # A length of 1 m in the network's reconstruction is `scale` metres by the robot.
         found.append(_length("network", float(np.log(hand_eye.scale)), NETWORK_STD))
-    return hand_eye, found
+    return depth, found
 
 
 def _length(name: Literal["board", "depth camera", "network"], off: float, std: float) -> LengthCheck:
@@ -157,41 +160,22 @@ def _shift(off: float, hand_eye: Calibration) -> Float[ndarray, "7"]:
 
     Translation and scale shrink by that factor.
     """
-    return -off * np.r_[hand_eye.gripper_from_camera[:3, 3], np.zeros(3), 1.0]
+    return -off * np.r_[hand_eye.parent_from_camera[:3, 3], np.zeros(3), 1.0]
 
 
-def _fused(
-    case: Case, hand_eye: Calibration, lengths: list[LengthCheck], fault: Float[ndarray, "7 7"]
-) -> tuple[Calibration, Solution]:
-    """Return calibration and adjustment with the lengths as priors of the scale.
-
-    `hand_eye` is the calibration without these priors, whose findings and checks are kept. `fault` is a covariance
-    (COVARIANCE_ORDER) that is added to the calibration's covariance.
-    """
-    adjusted, boards, known = case.adjusted, case.reconstruction.tracks.boards, list[LinearPrior]()
-    assert adjusted is not None
+def _priors(case: Case, lengths: list[LengthCheck]) -> tuple[LinearPrior, ...]:
+    """Return the known lengths as priors of the scale, for the unknowns of the case's solution."""
+    found, boards, known = case.solution, case.model.tracks.boards, list[LinearPrior]()
+    assert found is not None
     for one in lengths:
-        row, std = np.eye(adjusted.problem.unknowns)[SCALE.start], one.std
-        value = float(np.log(adjusted.most_likely.scale)) - one.off
+        row, std = np.eye(found.problem.unknowns)[SCALE.start], one.std
+        value = float(np.log(found.most_likely.scale)) - one.off
         if one.name == "board" and boards is not None and boards.size_std is not None:
-            size, row = size_of_boards(adjusted)
-            value = float(row @ adjusted.problem.coordinates(adjusted.state)) - size
+            size, row = size_of_boards(found)
+            value = float(row @ found.problem.coordinates(found.state)) - size
             std = boards.size_std
         known.append(LinearPrior(row, value, float(np.hypot(std, ROBOT_STD))))
-    # The arms' unknowns, error sizes and covariance are estimated anew; the images are not adjusted again.
-    problem = with_free(adjusted.problem, priors=tuple(known))
-    adjusted = with_covariance(problem, adjusted.most_likely, adjusted.evidence)
-    refined = refined_by(case, adjusted)
-    refined = refined.with_uncertainty(refined.uncertainty.with_error(fault))
-    for one in hand_eye.findings:
-        refined = refined.with_finding(one)
-    depth = hand_eye.depth_check
-    if depth is not None:
-        # The scale error of the depth images refers to the new scale.
-        percent = 100 * ((1 + depth.off_percent / 100) * hand_eye.scale / refined.scale - 1)
-        depth = replace(depth, off_percent=percent)
-    measured = {name: getattr(hand_eye, name) for name in ("findings", "lengths")}
-    return judged(replace(refined, depth_check=depth, **measured)), adjusted
+    return tuple(known)
 
 
 def check_predicted_focal(case: Case) -> Case:
@@ -213,7 +197,7 @@ def check_predicted_focal(case: Case) -> Case:
     moved = tuple((by_focal.directions @ by_focal.std).tolist())
     shifts = {"shift": (0.0,) * 7, "intrinsics_shift": moved}
     found = Finding.of(FindingKind.INTRINSICS, "warns", "intrinsics", **shown, **shifts)
-    return case.after((found,))
+    return case.found(found)
 
 
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: Calibration) -> DepthCheck | None:

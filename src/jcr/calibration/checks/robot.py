@@ -20,17 +20,18 @@ SURE = 2.5
 
 def _equations(case: Case) -> PoseEquations:
     """Return the equations of the used gripper poses, with the errors of the camera poses: of images, or as stated."""
-    if case.adjusted is not None and case.hand_eye.source == "images":
-        return case.adjusted.poses
-    fit, used, evidence = case.pose_fit, case.used, case.reconstruction.evidence
+    if case.solution is not None and case.numbers.source == "images":
+        return case.solution.poses
+    fit, used, evidence = case.fit, case.used, case.reconstruction.evidence
     problem, state = pose_problem(
         case.base_from_gripper[used],
         case.recon_from_camera[used],
-        (fit.gripper_from_camera, fit.scale, fit.base_from_recon.rigid),
+        (fit.parent_from_camera, fit.scale, fit.body_from_recon.rigid),
         camera_covariance=None if evidence is None else of_poses(evidence.covariance, used),
         error_covariance=case.systematic,
         noise_floor=fit.robot_noise.given,
         priors=case.priors,
+        carries=case.carries,
     )
     return pose_equations(problem, state, None)
 
@@ -42,14 +43,14 @@ def check_robot(case: Case) -> Case:
     are findings about the camera, whose effects also change the camera poses. Nothing is estimated for an unknown arm,
     or with fewer than MIN_EXAMINED used images.
     """
-    used, arm, joints, hand_eye = case.used, case.robot.arm, case.robot.joints, case.hand_eye
+    used, arm, joints = case.used, case.robot.arm, case.robot.joints
     if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
         return case
     found = joint_offsets(_equations(case), arm, joints[used])
-    hand_eye = replace(hand_eye, joint_offsets=found)
+    case = replace(case, numbers=replace(case.numbers, joint_offsets=found))
     off = np.flatnonzero(np.abs(found.offset) > SURE * found.std).tolist()
-    if not off or any(one.kind.row.group == "camera" for one in hand_eye.findings):
-        return replace(case, hand_eye=hand_eye)
+    if not off or any(one.kind.row.group == "camera" for one in case.findings):
+        return case
     degrees = np.degrees([found.offset, found.std]).T
     sizes = joined(f"{degrees[k, 0]:+.2f} ± {degrees[k, 1]:.2f}°" for k in off)
     named = f"joint{'s' * (len(off) > 1)} {joined(str(k + 1) for k in off)}"
@@ -57,4 +58,4 @@ def check_robot(case: Case) -> Case:
     for k in off:
         details |= {f"joint_{k + 1}": float(found.offset[k]), f"joint_{k + 1}_std": float(found.std[k])}
     details |= {"joints": tuple(k + 1 for k in off), "value": float(np.abs(found.offset[off]).max())}
-    return case.after((Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", **details),), hand_eye)
+    return case.found(Finding.of(FindingKind.JOINT_OFFSETS, "informs", "robot", **details))
