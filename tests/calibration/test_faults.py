@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.faults import calibrated, outcome
 from jcr.calibration.adjust import adjusted
-from jcr.calibration.checks.effects import as_remark, check_effects, tested_case
+from jcr.calibration.checks.effects import as_remark, check_effects, examined_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
@@ -189,7 +189,7 @@ def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_a
 def test_points_behind_a_camera_give_no_numpy_warning():
     capture, reconstruction = reconstructed(faulty_capture(np.random.default_rng(3), 6, Faults()), False)
     options, robot = CalibrateOptions(), errors_of(capture.base_from_gripper)
-    model = tested_case(adjusted(fitted_case(capture, reconstruction, options, robot)))
+    model = examined_case(adjusted(fitted_case(capture, reconstruction, options, robot)))
     images, observations = model.solution.images, model.solution.problem.observations
     assert observations is not None
     x_in_camera = images.view.in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]

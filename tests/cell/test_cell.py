@@ -11,7 +11,6 @@ import pytest
 import jcr
 from benchmarks.cameras import answered, wanted
 from jcr.calibration.checks.effects import effects
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
@@ -25,7 +24,7 @@ from jcr.cell.placement import (
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.cell.stage import _adopted, place_cameras
 from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.hypotheses import Tested
+from jcr.estimation.hypotheses import Examined
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import fit_known_scale
@@ -129,7 +128,7 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
     )
     names = png_names(count)
     alone = solve(*with_observations(problem, start))
-    tested = Tested(
+    tested = Examined(
         solution=alone,
         arm=1,
         names=names,

@@ -1,7 +1,8 @@
 """Record of a hand-eye calibration, in memory and as calibration.json: verdict, transform, uncertainty, findings."""
 
+import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -60,8 +61,15 @@ from jcr.records import (
 from jcr.records.checked import require_fields
 from jcr.records.json_fields import Matrix, Positive, rounded
 from jcr.records.json_file import read_json
+from jcr.records.npz import read_npz, write_npz
 
 FORMAT = "jcr.calibration/2"
+UNCERTAINTY, ARRAYS = "uncertainty.npz", "jcr.uncertainty/1"
+"""File beside calibration.json with the arrays that only programs read, and its format."""
+APART = ("model_error", "scene")
+"""Parts of the uncertainty that are in uncertainty.npz alone; that file also has the covariances of the budget."""
+LINE = 210
+"""Most characters of a line of calibration.json; the entry of an image has 200."""
 NAMES = {
     "gripper": ("gripper_from_camera", "base_from_recon"),
     "base": ("base_from_camera", "gripper_from_object"),
@@ -424,19 +432,95 @@ def adapter(kind: type[Outcome]) -> TypeAdapter:
 
 
 def write_calibration(path: Path, content: Outcome) -> None:
-    """Write a result as calibration.json; a failed write leaves an existing file unchanged."""
-    write_text(path, json.dumps(content.as_json(), indent=2, allow_nan=False) + "\n")
+    """Write a result as calibration.json, and the arrays that only programs read as uncertainty.npz beside it.
+
+    A failed write leaves existing files unchanged. The first file states the digest of the second.
+    """
+    made, arrays = content.as_json(), dict[str, ndarray]()
+    if (uncertainty := made.get("uncertainty")) is not None:
+        _take_arrays(uncertainty, arrays)
+    file = path.with_name(UNCERTAINTY)
+    if arrays:
+        write_npz(file, {"format": ARRAYS}, arrays)
+        made["uncertainty"]["arrays"] = digest_of(arrays)
+    else:
+        file.unlink(missing_ok=True)
+    write_text(path, as_text(made) + "\n")
+
+
+def _take_arrays(uncertainty: dict[str, Any], arrays: dict[str, ndarray]) -> None:
+    """Move model error, scene, and the covariances of the budget and of the intrinsics from JSON to arrays."""
+    if (joint := uncertainty.get("joint")) is not None:
+        arrays["joint"] = np.array(joint.pop("covariance"))
+    for part in APART:
+        for name, value in (uncertainty.pop(part, None) or {}).items():
+            arrays[f"{part}.{name}"] = np.array(value)
+    for cause, share in (uncertainty.get("budget") or {}).items():
+        arrays[f"budget.{cause}"] = np.array(share.pop("covariance"))
+
+
+def _with_arrays(content: dict[str, Any], file: Path, is_needed: bool) -> dict[str, Any]:
+    """Return the content of a calibration.json, `file`, with the arrays of uncertainty.npz beside it.
+
+    Without this file the parts with arrays are left out; raises InputError then if it `is_needed`, or if it belongs to
+    another calibration.
+    """
+    uncertainty = content.get("uncertainty")
+    if not isinstance(uncertainty, dict) or "arrays" not in uncertainty:
+        return content
+    stated, beside = uncertainty["arrays"], file.with_name(UNCERTAINTY)
+    whole = {name: value for name, value in uncertainty.items() if name not in ("arrays", "budget", "joint")}
+    if not is_needed and not beside.is_file():
+        return content | {"uncertainty": whole}
+    with read_npz(beside, ARRAYS) as (_, found):
+        arrays = {name: found[name] for name in found if name != "about"}
+        if digest_of(arrays) != stated:
+            raise InputError(
+                f"{beside}: belongs to another calibration than {file}; run the calibration again"
+            )
+    for part in APART:
+        names = [name for name in arrays if name.startswith(f"{part}.")]
+        if names:
+            whole[part] = {name.removeprefix(f"{part}."): arrays[name].tolist() for name in names}
+    budget, joint = uncertainty.get("budget"), uncertainty.get("joint")
+    if isinstance(joint, dict) and "joint" in arrays:
+        whole["joint"] = joint | {"covariance": arrays["joint"].tolist()}
+    if isinstance(budget, dict):
+        whole["budget"] = {
+            cause: {**share, "covariance": arrays[f"budget.{cause}"].tolist()}
+            for cause, share in budget.items()
+            if isinstance(share, dict) and f"budget.{cause}" in arrays
+        }
+    return content | {"uncertainty": whole}
+
+
+def digest_of(arrays: Mapping[str, ndarray]) -> str:
+    """Return a SHA-256 hash of the names and values of arrays."""
+    parts = (name.encode() + np.ascontiguousarray(arrays[name], float).tobytes() for name in sorted(arrays))
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def as_text(value: Any, indent: int = 0) -> str:
+    """Return JSON as text in which what fits on a line stays on it, as rows of a matrix and images of a list do."""
+    line = json.dumps(value, allow_nan=False)
+    if len(line) + 2 * indent <= LINE or not isinstance(value, dict | list):
+        return line
+    inner, outer = "\n" + (indent + 1) * "  ", "\n" + indent * "  "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key)}: {as_text(one, indent + 1)}" for key, one in value.items()]
+        return f"{{{inner}{f',{inner}'.join(parts)}{outer}}}"
+    return f"[{inner}{f',{inner}'.join(as_text(one, indent + 1) for one in value)}{outer}]"
 
 
 def read_calibration(path: Path) -> AnyCalibration:
-    """Read a calibration.json, given as a file or as its run folder.
+    """Read a calibration.json, given as a file or as its run folder, with the uncertainty.npz beside it.
 
-    Raises InputError if the file is missing, damaged, or of another format.
+    Raises InputError if a file is missing, damaged, or of another format or calibration.
     """
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
-    return validated(read_content(file), file)
+    return validated(read_content(file), file, with_arrays=True)
 
 
 def read_content(file: Path) -> dict[str, object]:
@@ -451,13 +535,17 @@ def read_content(file: Path) -> dict[str, object]:
     return content
 
 
-def validated(content: dict[str, object], file: Path) -> AnyCalibration:
-    """Return the calibration that the content of `file` describes; raise InputError, naming the file, if invalid."""
+def validated(content: dict[str, object], file: Path, with_arrays: bool = False) -> AnyCalibration:
+    """Return the calibration that the content of `file` describes; raise InputError, naming the file, if invalid.
+
+    `with_arrays`: the file uncertainty.npz beside it is needed; otherwise it is used if it is there.
+    """
     kind = content.get("format")
     if kind != FORMAT:
         raise InputError(
             f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; run the calibration again"
         )
+    content = _with_arrays(content, file, with_arrays)
     is_empty = content.get("scale") is None and content.get("uncertainty") is None
     of_method = PublishedCalibration if content.get("method") == "paper" else Calibration
     record = FailedCalibration if is_empty else of_method

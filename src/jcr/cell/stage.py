@@ -24,7 +24,7 @@ from jcr.cell.images import cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
-from jcr.estimation.hypotheses import Tested
+from jcr.estimation.hypotheses import Examined
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.problem import Effect, Problem, State, columns_of_arm, with_observations
 from jcr.estimation.solve import Solution, solve, solve_again
@@ -157,7 +157,7 @@ def _examined(
             continue
         placed = _placement(one, solution, hand_eye)
         assert placed.covariance is not None
-        tested = Tested(
+        tested = Examined(
             solution=solution,
             arm=one.arm or None,
             names=one.names,
@@ -172,7 +172,7 @@ def _examined(
 
 
 def _adopted(
-    tested: Tested, confirmed: Sequence[Effect], faults: Sequence[Finding]
+    tested: Examined, confirmed: Sequence[Effect], faults: Sequence[Finding]
 ) -> tuple[Solution, tuple[Finding, ...]]:
     """Return the solution with the effects on a camera and its arm, and the findings on them.
 

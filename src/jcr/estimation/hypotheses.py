@@ -106,7 +106,7 @@ class Test:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tested:
+class Examined:
     """Solution of a problem, and the camera and the arm of it whose effects are tested."""
 
     solution: Solution
@@ -129,7 +129,7 @@ class Tested:
         every = self.solution.problem.effects
         return tuple(one for one in every if one.part == (self.camera if one.of_camera else self.arm))
 
-    def with_effects(self, *effects: Effect) -> "Tested":
+    def with_effects(self, *effects: Effect) -> "Examined":
         """Return the solution that includes, of the tested camera and arm, exactly these effects.
 
         The sizes of all errors are estimated anew. Raises LinAlgError if the problem becomes singular.
@@ -200,7 +200,7 @@ class Tested:
         )
 
 
-def rank(model: Tested, effects: Sequence[Effect]) -> list[tuple[Effect, float]]:
+def rank(model: Examined, effects: Sequence[Effect]) -> list[tuple[Effect, float]]:
     """Return `effects` with the natural log p-values of their score tests (`Scores.log_p`), the smallest first."""
     each = [
         (model.camera_scores if effect.of_camera else model.pose_scores).log_p(effect) for effect in effects
@@ -208,7 +208,7 @@ def rank(model: Tested, effects: Sequence[Effect]) -> list[tuple[Effect, float]]
     return sorted(zip(effects, each, strict=True), key=lambda one: one[1])
 
 
-def confirm(model: Tested, effect: Effect) -> Test:
+def confirm(model: Examined, effect: Effect) -> Test:
     """Return Wald's test of one possible effect: whether its estimate differs significantly from 0.
 
     The error sizes are estimated anew together with the effect. An effect on the poses is estimated in the linearised
@@ -312,7 +312,7 @@ def explains_by_order(scores: Scores, effect: Effect) -> bool:
     return sum(one >= found - 1e-9 for one in others) <= BY_CHANCE * len(others)
 
 
-def pose_effects(model: Tested) -> Iterator[Effect]:
+def pose_effects(model: Examined) -> Iterator[Effect]:
     """Yield the effects on the poses of the tested arm: those of the image order, then those of the gripper pose.
 
     They are drift, slip of the camera, base moved and delayed poses; then those of `arm_effects`. Slip and moved base
@@ -399,7 +399,7 @@ TESTED_IF_ESTIMATED = ("fx", "p1", "p2")
 """Intrinsics that are tested of estimated ones, for which fx = fy and p1 = p2 = 0 was assumed."""
 
 
-def tested_intrinsics(model: Tested) -> list[str]:
+def tested_intrinsics(model: Examined) -> list[str]:
     """Return the names of the camera's parameters that the test of FindingKind.INTRINSICS frees.
 
     They are TESTED_IF_GIVEN or TESTED_IF_ESTIMATED, as far as the camera has them. A given distortion coefficient is
@@ -415,7 +415,7 @@ def tested_intrinsics(model: Tested) -> list[str]:
     return [name for name in tested if name in names and name not in loose]
 
 
-def camera_effects(model: Tested, min_images: int) -> Iterator[Effect]:
+def camera_effects(model: Examined, min_images: int) -> Iterator[Effect]:
     """Yield the possible effects on the tested camera: wrong intrinsics, effects on its images, then a thin prism.
 
     Effects on images are focal lengths and shears (rolling shutter). They include a zoom, with one effect for each image

@@ -24,8 +24,8 @@ from jcr.distributions import f as f_distribution
 from jcr.estimation.hypotheses import (
     STRAINS,
     TESTED_IF_GIVEN,
+    Examined,
     Test,
-    Tested,
     camera_effects,
     confirm,
     explains_by_order,
@@ -150,12 +150,12 @@ def check_effects(case: Case) -> Case:
             carries=case.carries,
         )
         return case.found(*found)
-    confirmed, findings = effects(tested_case(longer))
+    confirmed, findings = effects(examined_case(longer))
     return case.found(*findings) if longer is not case else _adopted(case, confirmed, findings)
 
 
-def tested_case(case: Case) -> Tested:
-    """Return the solution of a case in the form that the tests of effects need (hypotheses.Tested).
+def examined_case(case: Case) -> Examined:
+    """Return the solution of a case in the form that the tests of effects need (hypotheses.Examined).
 
     A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
     a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
@@ -171,7 +171,7 @@ def tested_case(case: Case) -> Tested:
         solution = solution_of(case, replace(case.model, most=fewer, most_points=MOST_POINTS))
     assert solution is not None
     found = case.calibration
-    return Tested(
+    return Examined(
         solution=solution,
         names=[case.names[row] for row in case.used],
         std=np.sqrt(np.diag(found.covariance)[:6]) * found.converged,
@@ -196,7 +196,7 @@ def effects_of_fit(
     problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
     used = with_rejected_runs(hand_eye.inliers)
     solution = solve(replace(problem, used=used), state, averaged=False)
-    model = Tested(
+    model = Examined(
         solution=solution,
         names=[names[k] for k in np.flatnonzero(used).tolist()],
         std=np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged,
@@ -213,7 +213,7 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 
 
 def effects(
-    model: Tested, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
+    model: Examined, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
 ) -> tuple[tuple[Effect, ...], tuple[Finding, ...]]:
     """Return the confirmed effects on the tested camera and arm, and one finding for each.
 
@@ -250,7 +250,7 @@ def effects(
     return confirmed, tuple(findings)
 
 
-def _best(model: Tested, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
+def _best(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> tuple[Test, Finding] | None:
     """Return Wald's test of the most significant effect that is confirmed, and its finding; None without one.
 
     `of_camera` True tests effects on the camera, False effects on the reported poses. Kinds in `passed` are not tested.
@@ -285,7 +285,7 @@ def _best(model: Tested, passed: Collection[FindingKind], of_camera: bool) -> tu
     return None
 
 
-def _promising(model: Tested, passed: Collection[FindingKind], of_camera: bool) -> list[Effect]:
+def _promising(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> list[Effect]:
     """Return the possible effects to confirm, the smallest p-value of the score test first; one per kind of effect.
 
     `of_camera` True selects effects on the camera, False effects on the reported poses. At most CONFIRMED_AT_MOST are
@@ -314,7 +314,7 @@ def _promising(model: Tested, passed: Collection[FindingKind], of_camera: bool) 
     return list(best.values())[: CONFIRMED_AT_MOST[of_camera]]
 
 
-def _log_alpha(kind: FindingKind, model: Tested) -> float:
+def _log_alpha(kind: FindingKind, model: Examined) -> float:
     """Return the natural logarithm of the largest p-value at which an effect of this kind is significant.
 
     The p-value is `Policy.alpha` of the kind, or ALPHA_IF_GIVEN for wrong intrinsics that were given.
@@ -323,7 +323,7 @@ def _log_alpha(kind: FindingKind, model: Tested) -> float:
     return float(np.log(ALPHA_IF_GIVEN if is_given else POLICIES[kind].alpha))
 
 
-def log_p_of_given(model: Tested) -> float:
+def log_p_of_given(model: Examined) -> float:
     """Return the natural log of the p-value of Wald's test that the given focal lengths and principal point are exact.
 
     The statistic is compared with an F distribution. The result is 0 (p = 1) without given intrinsics. It is also 0 if
@@ -338,7 +338,7 @@ def log_p_of_given(model: Tested) -> float:
     return float(f_distribution.logsf(ratio, 4, model.pose_scores.freedom))
 
 
-def finding_of(test: Test, model: Tested) -> Finding | None:
+def finding_of(test: Test, model: Examined) -> Finding | None:
     """Return the finding of a significant effect, which `test` found in `model`; None if it is small.
 
     A small effect changes the camera's pose by less than half a standard deviation (MATERIAL) along each axis. An
@@ -411,7 +411,7 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
     return {"value": value, "std": std, "frame": frame, **dict(zip("xyz", axis.tolist(), strict=True))}
 
 
-def _size_of_camera_effect(test: Test, after: Tested) -> dict[str, Any]:
+def _size_of_camera_effect(test: Test, after: Examined) -> dict[str, Any]:
     """Return the keyword arguments of `Finding.of` for the size of an effect on the camera, and its standard deviation.
 
     The size `value` is the rms of the effect's parameters: px, or a relative change of the focal length. A single
@@ -435,7 +435,7 @@ def _size_of_camera_effect(test: Test, after: Tested) -> dict[str, Any]:
     return {"value": effect.unit * float(size), "std": typical / float(np.sqrt(count))}
 
 
-def _intrinsics(after: Tested, stds: Float[ndarray, " p"]) -> dict[str, Any]:
+def _intrinsics(after: Examined, stds: Float[ndarray, " p"]) -> dict[str, Any]:
     """Return the `details` of the finding of wrong intrinsics: estimated, given and significantly different values.
 
     `after` is the adjustment with the effect. `stds` holds the standard deviation of each tested parameter
