@@ -232,9 +232,9 @@ def assumptions_of(case: Case) -> Assumptions:
     return Assumptions(
         gripper_from_camera=x,
         distance_m=median_distance(used @ x) if distance_m is None else distance_m,
-        noise=case.hand_eye.robot_noise,
+        noise=case.calibration.robot_noise,
         scale_std=case.reconstruction.metric_std,
-        camera=None if case.adjusted is None or distance_m is None else PredictedCamera.of(case.adjusted),
+        camera=None if case.solution is None or distance_m is None else PredictedCamera.of(case.solution),
     )
 
 
