@@ -16,7 +16,7 @@ from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import retract
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, Intrinsics
+from jcr.records import Capture, CellCamera, FrameNames, Intrinsics
 from simulation.motion import fixed_camera
 from simulation.poses import gripper_poses, random_hand_eye
 from simulation.render import render
@@ -63,6 +63,10 @@ class SimulateOptions:
     """Number of cameras that stand beside the table and see the scene, an image each."""
     truth: Literal["full", "scene"] = "full"
     """Write truth/ with depth and labels of every image, or with scene.json alone."""
+
+
+FRAME_NAMES = FrameNames(base="base_link", gripper="tool0", camera="camera_color_optical_frame")
+"""Names of the frames of the simulated arm."""
 
 
 def simulate(out: Path, options: SimulateOptions | None = None, progress: Progress = silent) -> Path:
@@ -125,6 +129,7 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
         image_size=(truth.intrinsics.width, truth.intrinsics.height),
         intrinsics=None if options.unknown_intrinsics else truth.intrinsics,
         others=tuple(others),
+        frame_names=FRAME_NAMES,
     )
     # Last: a folder with a capture.json is a complete capture.
     capture_json.write(out, capture, source={"program": "python -m simulation", "options": asdict(options)})

@@ -50,6 +50,7 @@ from .reconstruct import ReconstructOptions as ReconstructOptions
 from .records import Budget as Budget
 from .records import Capture as Capture
 from .records import CellCamera as CellCamera
+from .records import FrameNames as FrameNames
 from .records import Intrinsics as Intrinsics
 from .records import IntrinsicsAndStd as IntrinsicsAndStd
 from .records import LeaveOneOut as LeaveOneOut

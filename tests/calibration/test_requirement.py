@@ -96,4 +96,4 @@ def test_the_command_ends_with_3_unless_the_accuracy_is_reached_or_none_is_requi
         assert said.out.startswith(verdict) and is_shown and "(95 %)" in said.out
         is_missed = hand_eye.short is not None
         assert is_missed is (asked == (0.5, 0.1)) is ("\nRemedy " in said.out) and status == 3 * is_missed
-        assert "\nNext        jcr export out ros2" in said.out
+        assert "\nNext        jcr export out ros2 --parent-frame FRAME  # " in said.out

@@ -13,7 +13,7 @@ from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.recording import best_frames
 from jcr.capture.ros import image_of, read_ros_depth
-from jcr.records import Capture
+from jcr.records import Capture, FrameNames
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
 
@@ -46,8 +46,10 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
         assert sorted(view) == list(range(12)), kind
         assert off_mm.max() < 1e-6 and off_deg.max() < 1e-6
         assert got.intrinsics == capture.intrinsics
+        assert got.frame_names == FrameNames(base="base_link", gripper="tool0", camera="camera")
         # What was read is a capture folder itself.
         again = jcr.read_capture(tmp_path / f"{kind}-frames")
+        assert again.frame_names == got.frame_names
         assert (again.base_from_gripper == got.base_from_gripper).all() and again.images == got.images
         for name, k in zip(got.images, view, strict=True):
             files = got.folder / name, capture.folder / capture.images[k]
@@ -114,6 +116,7 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
         for k, pose in enumerate(writers.arm_poses(angles))
     }
     assert len(got) == 8 and got.intrinsics is None
+    assert got.frame_names == FrameNames(base="base_link", gripper="tool0")
     for name, pose in zip(got.images, got.base_from_gripper, strict=True):
         assert np.allclose(pose, expected[(got.folder / name).read_bytes()], atol=1e-6)
     writers.assert_joints(got, angles)

@@ -35,6 +35,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
+from simulation.capture import FRAME_NAMES
 from simulation.problems import shown_points
 from simulation.scenes import make_scene, solid_labels
 from simulation.truth import read_truth
@@ -104,7 +105,7 @@ def of_snippet(path: Path) -> np.ndarray:
 def of_calib(path: Path) -> np.ndarray:
     content = yaml.safe_load(path.read_text())
     names = ("calibration_type", "name", "robot_base_frame", "robot_effector_frame", "tracking_base_frame")
-    expected = ["eye_in_hand", path.stem, "base_link", "tool0", "optical"]
+    expected = ["eye_in_hand", path.stem, "base", "tool0", "optical"]
     assert [content["parameters"][name] for name in names] == expected
     at, rotation = content["transform"]["translation"], content["transform"]["rotation"]
     return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
@@ -394,6 +395,33 @@ def test_command_gives_the_asked_root_link(done: Path, tmp_path: Path, capsys: p
     np.testing.assert_allclose(found @ of_quat(*root_pose), gripper_from_camera, atol=1e-9)
     export(done, "ros2", tmp_path / "c.launch.xml", *options)
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
+
+
+def test_frames_are_those_of_the_capture_and_asked_for_where_unknown(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    content, run = json.loads((done / "calibration.json").read_text()), tmp_path / "run"
+    run.mkdir()
+    names = {"base": "ur_base", "gripper": "flange", "camera": "eye_optical"}
+    assert content["frame_names"] == vars(FRAME_NAMES)
+    (run / "calibration.json").write_text(json.dumps(content | {"frame_names": names}))
+    assert of_publisher_names(export(run, "ros2", tmp_path / "a.xml")) == ("flange", "eye_optical")
+    calib = yaml.safe_load(export(run, "easy_handeye2", tmp_path / "a.calib").read_text())["parameters"]
+    assert (calib["robot_base_frame"], calib["robot_effector_frame"]) == ("ur_base", "flange")
+    path = export(run, "ros2", tmp_path / "b.xml", "--parent-frame", "tcp", "--child-frame", "eye")
+    assert of_publisher_names(path) == ("tcp", "eye")
+    (run / "calibration.json").write_text(json.dumps(content | {"frame_names": {}}))
+    for name in ("ros2", "moveit", "urdf", "easy_handeye2"):
+        assert dispatch(["export", str(run), name]) == 2
+        assert "add --parent-frame FRAME" in capsys.readouterr().err
+    assert "fx" not in export(run, "camera_info", tmp_path / "info.yaml").read_text().split("\n")[0]
+    assert of_publisher_names(export(run, "ros2", tmp_path / "c.xml", "--parent-frame", "tcp"))[0] == "tcp"
+
+
+def of_publisher_names(path: Path) -> tuple[str, str]:
+    """Parent and child frame in a launch file."""
+    words = path.read_text().replace('"', " ").split()
+    return words[words.index("--frame-id") + 1], words[words.index("--child-frame-id") + 1]
 
 
 def test_a_file_with_other_content_is_replaced_by_overwrite_alone(

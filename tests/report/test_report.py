@@ -128,7 +128,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
         is_rotation(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=degrees))
     ros = elements.copied("the ROS 2 command")
     values = dict(re.findall(r"--([a-z-]+) (\S+)", ros))
-    assert (values["frame-id"], values["child-frame-id"]) == ("tool0", "camera_color_optical_frame")
+    assert (values["frame-id"], values["child-frame-id"]) == ("GRIPPER_FRAME", "camera_color_optical_frame")
     np.testing.assert_allclose([float(values[axis]) for axis in "xyz"], x[:3, 3], atol=1e-9)
     is_rotation(Rotation.from_quat([float(values[f"q{axis}"]) for axis in "xyzw"]))
 

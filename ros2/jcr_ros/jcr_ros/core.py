@@ -40,8 +40,8 @@ class Settings:
     """Take an image whenever the arm comes to rest in a new place; else by service alone."""
     robot: str = ""
     """Name of the arm, to model its joint offsets and link errors; empty: unknown."""
-    parent: str = "tool0"
-    """Frame of the gripper."""
+    frames: jcr.FrameNames = field(default_factory=jcr.FrameNames)
+    """Names of the frames of base, gripper and camera."""
     has_depth: bool = False
     """Whether images wait for their depth."""
 
@@ -144,6 +144,7 @@ class Calibrator:
                 settings.folder,
                 intrinsics=self.intrinsics,
                 robot=settings.robot or None,
+                frame_names=settings.frames,
                 options={"require": settings.options.require},
                 exclusive=True,
             )
@@ -235,7 +236,7 @@ class Calibrator:
         x, std = result.gripper_from_camera, np.sqrt(np.diag(result.covariance))
         offset = " ".join(f"{1e3 * value:.1f}" for value in x[:3, 3])
         line = (
-            f"camera at {offset} mm on {self.settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
+            f"camera at {offset} mm on {self.settings.frames.gripper}, sigma {1e3 * std[:3].max():.2g} mm and "
             f"{np.degrees(std[3:6].max()):.2g} deg; {result.verdict}"
         )
         is_accepted = result.verdict == "accepted"

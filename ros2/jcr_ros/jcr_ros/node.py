@@ -40,7 +40,7 @@ class CalibratorNode(Node):
             options=self._options(),
             at_rest=self._parameter("at_rest", True),
             robot=self._parameter("robot", ""),
-            parent=self.gripper,
+            frames=jcr.FrameNames(base=self.base, gripper=self.gripper, camera=self.camera),
             has_depth=bool(depth),
         )
         self.buffer = Buffer()

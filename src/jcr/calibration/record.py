@@ -43,6 +43,7 @@ from jcr.records import (
     Attempt,
     Capture,
     DepthCheck,
+    FrameNames,
     GivenIntrinsicsResult,
     ImageVerdict,
     IntrinsicsAndStd,
@@ -134,6 +135,8 @@ class Outcome:
     """Intrinsics to use together with the transform (px); None for a calibration from given poses."""
     findings: tuple[FindingJson, ...] = ()
     """Findings of the checks: first those that reject, then warnings, then remarks; causes before consequences."""
+    frame_names: FrameNames = FrameNames()
+    """Names of the frames of base, gripper and camera in the robot's software; null where unknown."""
     notes: tuple[str, ...] = ()
     """Remarks of the stages, and findings that require no action, in words."""
     attempts: tuple[Attempt, ...] = ()

@@ -41,9 +41,10 @@ class ReadOptions:
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
     """Number of frames to take from a recording: still, sharp, and chosen to determine the calibration best."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Recordings: tf frame or URDF link of the robot's base."""
+    """Name of the robot's base in tf; of recordings, the tf frame or URDF link whose poses are read."""
     gripper_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Recordings: tf frame or URDF link on which the camera is mounted."""
+    """Name of the frame whose poses these are, such as tool0 or flange; of recordings, the tf frame or URDF link on
+    which the camera is mounted."""
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None

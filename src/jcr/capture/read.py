@@ -91,6 +91,8 @@ def read_source(
     ):
         read = Reading(file=path.name, inverted=True, decided_by="option")
         found = replace(found, base_from_gripper=inverse(found.base_from_gripper), reading=read)
+    names = {"base": options.base_frame, "gripper": options.gripper_frame}
+    found = replace(found, frame_names=found.frame_names.replaced(**names))
     if folder is not None:
         capture_json.write(folder, found, notes=found.notes, made_from=origin)
         return replace(capture_json.read(folder), notes=found.notes)

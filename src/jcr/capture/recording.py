@@ -19,7 +19,7 @@ from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance, po
 from jcr.files import path_inside, write_bytes
 from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, FrameNames, Intrinsics
 
 STILL = 0.005
 """Speed (m/s) below which the arm is at rest; rotation counts as in motion_length. At half a metre this moves the image
@@ -60,6 +60,8 @@ class Recording:
     """Function from an image size (width, height) to the recorded intrinsics; used without `options.camera_info`."""
     joints: Float[ndarray, "n j"] | None = None
     """Joint angles (rad) of the arm in `options.urdf`, one row per frame; None if they are unknown."""
+    frame_names: FrameNames = FrameNames()
+    """Names of base and camera frame, as far as the recording states them."""
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
@@ -121,6 +123,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         joints=None if recording.joints is None else recording.joints[rows[kept]],
         urdf=None if recording.joints is None else options.urdf,
         intrinsics=known(capture.image_size),
+        frame_names=recording.frame_names,
         notes=(*notes, *remarks, *capture.notes),
     )
 

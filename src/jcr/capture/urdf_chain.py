@@ -121,6 +121,7 @@ class RecordedArm:
 
     arm: Arm
     urdf: "yourdfpy.URDF"
+    base: str
     gripper: str
     joints: tuple[str, ...]
     """Names of the joints, in the order of the chain."""
@@ -196,4 +197,6 @@ def read_arm(options: ReadOptions) -> RecordedArm:
     if not names:
         raise InputError(f"{file}: nothing moves between {base} and {gripper}; name a link after a joint")
     unit = float(np.radians(1.0)) if options.pose_units.endswith("deg") else 1.0
-    return RecordedArm(arm=_arm_of(chain, file), urdf=urdf, gripper=gripper, joints=names, unit=unit)
+    return RecordedArm(
+        arm=_arm_of(chain, file), urdf=urdf, base=base, gripper=gripper, joints=names, unit=unit
+    )

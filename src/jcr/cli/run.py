@@ -267,9 +267,15 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     facts = content.as_json()
     if cameras is not None:
         facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
-    # A driver often publishes the optical frame below a root link of the camera.
-    export = f"jcr export {shlex.quote(str(out))} ros2  # frames: --parent-frame tool0, --to-root camera_link"
-    following = export if content.converged else "jcr docs troubleshooting"
+    following = "jcr docs troubleshooting"
+    if content.converged:
+        is_named = content.mount == "base" or content.frame_names.gripper is not None
+        name = "" if is_named else " --parent-frame FRAME"
+        # A driver often publishes the optical frame below a root link of the camera.
+        about = (
+            "" if is_named else "FRAME is that of your poses: tool0, flange, …; "
+        ) + "for a driver: --to-root LINK"
+        following = f"jcr export {shlex.quote(str(out))} ros2{name}  # {about}"
     lines = list[str]()
     for camera in placed:
         about = f"REJECTED: {camera.doubt}"

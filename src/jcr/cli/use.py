@@ -71,7 +71,7 @@ class ExportCommand:
 
     for example:
       jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
-      jcr export out/table urdf --to-root camera_link
+      jcr export out/scan urdf --to-root camera_link
       jcr export out/table octomap table.bt --voxel-size 0.02
       jcr export out/table nerfstudio splat/ --undistort
     """

@@ -51,7 +51,7 @@ ros2 | hand_eye.launch.xml | static_transform_publisher line and launch file | r
 moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.moveit_launch | mount
 urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
 easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
-camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | mount
+camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | camera_frame
 ply | cloud.ply | points, colours, labels | views.write_cloud | cloud notes
 glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene map_notes
 octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene map_notes options
@@ -150,8 +150,8 @@ class ExportedRun:
     @property
     def notes(self) -> dict[str, str]:
         """Notes to store in files with data in the base frame, by key: frame, unit, version, reason of a rejection."""
-        ros.require_frame_name(self.options.base_frame)
-        return provenance(self.options.base_frame, self.doubt)
+        ros.require_frame_name(self.base_frame)
+        return provenance(self.base_frame, self.doubt)
 
     @property
     def map_notes(self) -> dict[str, str]:
@@ -161,8 +161,32 @@ class ExportedRun:
         return self.notes | {"margin_95_m": f"{self.scene.margin_95:.5f}"}
 
     @property
+    def base_frame(self) -> str:
+        """Name of the robot's base: that of the options, else of the capture, else BASE."""
+        return self.options.base_frame or self.calibration.frame_names.base or ros.BASE
+
+    @property
+    def gripper_frame(self) -> str | None:
+        """Name of the gripper frame: that of the options, else of the capture; None if it is unknown."""
+        return self.options.parent_frame or self.calibration.frame_names.gripper
+
+    @property
     def mount(self) -> ros.CameraMount:
-        """Transform of the exported camera (or its root link) to its parent frame, with frame names from the options.
+        """Transform of the exported camera to its parent frame, as `camera_frame`.
+
+        Raises InputError also if the name of the gripper frame is needed and unknown.
+        """
+        mount = self.camera_frame
+        if not mount.is_fixed and self.gripper_frame is None:
+            raise InputError(
+                f"{self.run.out}: the capture does not name the gripper frame of its poses, the parent of the camera; "
+                "add --parent-frame FRAME (the frame that the robot reports: tool0, flange, panda_hand, a TCP, …)"
+            )
+        return mount
+
+    @property
+    def camera_frame(self) -> ros.CameraMount:
+        """Transform of the exported camera (or its root link) to its parent frame, with names of options and capture.
 
         The parent is the gripper or, for a fixed camera, the base. Raises InputError if options and run do not fit.
         """
@@ -176,9 +200,10 @@ class ExportedRun:
                 )
             matrix, intrinsics = kept.gripper_from_camera, kept.intrinsics
         if self.camera is not None:
-            mount = self._mount_of(self.camera, options.child_frame)
+            mount = self._mount_of(self.camera, options.child_frame or f"{self.camera.name}_optical_frame")
         else:
-            mount = self._mount(found.mount, options.child_frame, matrix, self.doubt, intrinsics)
+            child = options.child_frame or found.frame_names.camera or ros.CHILD
+            mount = self._mount(found.mount, child, matrix, self.doubt, intrinsics)
         if options.to_root is None:
             return mount
         if options.root_from_optical is None:
@@ -203,7 +228,7 @@ class ExportedRun:
         shown = [camera for camera in self.placed if camera.doubt is None or self.options.force]
         mounts = [self._mount_of(camera, f"{camera.name}_optical_frame") for camera in shown]
         return mounts + [
-            self._mount("base", f"{arm.name}_{self.options.base_frame}", arm.base_from_other_base)
+            self._mount("base", f"{arm.name}_{self.base_frame}", arm.base_from_other_base)
             for arm in self.run.cameras.arms
         ]
 
@@ -237,7 +262,7 @@ class ExportedRun:
         which is put before the names of its frames.
         """
         of_arm = "" if arm is None else f"{arm}_"
-        base, effector = of_arm + self.options.base_frame, of_arm + self.options.parent_frame
+        base, effector = of_arm + self.base_frame, of_arm + (self.gripper_frame or ros.PARENT)
         return ros.CameraMount(
             parent=base if on == "base" else effector,
             child=child,

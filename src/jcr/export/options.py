@@ -17,12 +17,13 @@ ExportName = Literal[
 class ExportOptions:
     """Frames, resolution and images of an exported file; each format uses the options that concern it."""
 
-    parent_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "tool0"
-    """The gripper frame whose poses the capture contains."""
-    child_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "camera_color_optical_frame"
-    """The camera's optical frame: x right, y down, z forward."""
-    base_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "base_link"
-    """The robot's base, the frame of the map."""
+    parent_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
+    """The gripper frame whose poses the capture contains; unset: the one that the capture names."""
+    child_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
+    """The camera's optical frame: x right, y down, z forward; unset: the one that the capture names, else
+    camera_color_optical_frame."""
+    base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
+    """The robot's base, the frame of the map; unset: the one that the capture names, else base."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Another camera of the cell (cameras.json), for formats with one camera; unset: the run's own camera, and for ros2
     and urdf all cameras. The parent of a fixed camera is the base frame."""

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from jcr import __version__
 from jcr.errors import InputError
 from jcr.geometry import inverse, roll_pitch_yaw, transform
-from jcr.records import COEFFICIENTS, Intrinsics
+from jcr.records import COEFFICIENTS, FRAME_NAME, Intrinsics
 
-PARENT, CHILD, BASE = "tool0", "camera_color_optical_frame", "base_link"
-"""Default frame names of gripper, camera and robot base."""
+PARENT, CHILD, BASE = "GRIPPER_FRAME", "camera_color_optical_frame", "base"
+"""Names of gripper, camera and robot base where the capture names none; the first is to be replaced by the user."""
 
 _DISTORTIONS = {
     "pinhole": "plumb_bob",
@@ -30,8 +30,6 @@ _DISTORTIONS = {
 }
 ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
 """Transform from a camera's optical frame (z forward, x right) to its root link (x forward, z up), as in REP-103."""
-
-_FRAME_NAME = re.compile(r"(?!.*--)[A-Za-z0-9_][A-Za-z0-9_/.\-]*")  # two hyphens would end an XML comment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +66,7 @@ class CameraMount:
 
 def require_frame_name(name: str) -> None:
     """Raise InputError for a frame name that tf2 or XML would not accept."""
-    if not _FRAME_NAME.fullmatch(name):
+    if not FRAME_NAME.fullmatch(name):
         raise InputError(f"frame {name!r}: write letters, digits, _ . - and /, and no / in front")
 
 

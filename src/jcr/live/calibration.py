@@ -25,7 +25,7 @@ from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
 from jcr.live.progress import Progress
 from jcr.options import checked_options
-from jcr.records import Capture, Intrinsics, Tracks
+from jcr.records import Capture, FrameNames, Intrinsics, Tracks
 from jcr.records.capture_json import IntrinsicsEntry
 from jcr.sfm.live_map import LiveMap
 
@@ -44,7 +44,8 @@ class LiveCalibration:
     """Calibration that is computed again whenever an image is added to its capture or removed from it.
 
     `folder` is the folder of the capture; a capture that was begun there is continued. `intrinsics` belong to all
-    images; None: they are estimated. `robot` names the arm (`jcr capture --help` shows the names).
+    images; None: they are estimated. `robot` names the arm (`jcr capture --help` shows the names), `frame_names` the
+    frames of base, gripper and camera, for exports.
     Images and poses are written into the folder when they are added, so that jcr.read_capture can read the capture at
     any time. Methods may be called from several threads.
     """
@@ -55,6 +56,7 @@ class LiveCalibration:
         *,
         intrinsics: Intrinsics | IntrinsicsEntry | None = None,
         robot: str | None = None,
+        frame_names: FrameNames | None = None,
         options: CalibrateOptions | Mapping[str, Any] | None = None,
         exclusive: bool = False,
     ) -> None:
@@ -67,7 +69,7 @@ class LiveCalibration:
         if exclusive:
             self._opened.enter_context(locked(Path(folder)))
         given = IntrinsicsEntry.of(intrinsics) if isinstance(intrinsics, Intrinsics) else intrinsics
-        self.live = LiveFolder(Path(folder), given, robot)
+        self.live = LiveFolder(Path(folder), given, robot, frame_names)
         self._lock = threading.RLock()
         """Lock that is held while the capture, the map or `progress` is changed."""
         self._options = checked_options(options, CalibrateOptions)

@@ -17,7 +17,7 @@ from jcr.errors import InputError
 from jcr.files import IMAGES, capture_file, path_inside, remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
-from jcr.records import Capture
+from jcr.records import Capture, FrameNames
 from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
 from jcr.records.json_file import validated_content
 
@@ -33,11 +33,16 @@ class LiveFolder:
     """
 
     def __init__(
-        self, folder: Path, intrinsics: IntrinsicsEntry | None = None, robot: str | None = None
+        self,
+        folder: Path,
+        intrinsics: IntrinsicsEntry | None = None,
+        robot: str | None = None,
+        frame_names: FrameNames | None = None,
     ) -> None:
         """Open or begin a capture; raise InputError if the folder or its capture.json cannot be used.
 
-        `intrinsics` and `robot` (name of the arm) replace those of an existing capture.json; None: they are kept.
+        `intrinsics`, `robot` (name of the arm) and `frame_names` replace those of an existing capture.json; None: they
+        are kept.
         """
         self.folder, file = folder, folder / FILE
         if folder.exists() and not folder.is_dir():
@@ -46,7 +51,7 @@ class LiveFolder:
         if file.exists():
             content = read_capture_json(file)
         self.images = tuple(frame_of(content, row, file) for row in range(len(content.frames)))
-        given = {"intrinsics": intrinsics, "robot": robot}
+        given = {"intrinsics": intrinsics, "robot": robot, "frame_names": frame_names}
         update = {key: value for key, value in given.items() if value is not None}
         self._content = content.model_copy(update=update)
         files = {name: capture_file(folder, name, str(file)) for name in self.names}

@@ -135,7 +135,8 @@ def calibrate_poses(
     with locked(out):
         start = time.perf_counter()
         content = solved_pairs(pairs, options) if method == "paper" else calibrate_pose_pairs(pairs, options)
-        content = replace(content, timings_s={"calibrate": round(time.perf_counter() - start, 3)})
+        timings_s = {"calibrate": round(time.perf_counter() - start, 3)}
+        content = replace(content, timings_s=timings_s, frame_names=pairs.frame_names)
         forget_reconstruction(out)
         keep_calibration(out, content)
         result = RunResult(out, capture=pairs, calibration=content, reconstruction=pairs)

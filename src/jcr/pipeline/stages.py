@@ -253,7 +253,7 @@ def _calibrate(result: RunResult, progress: Progress) -> RunResult:
     """Add attempts, notes and a proposed board to the calibration; write calibration.json and log.txt."""
     capture, reconstruction, content = result.capture, result.reconstruction, result.solved
     notes = (*capture.notes, *reconstruction.notes)
-    content = replace(content, attempts=result.state.attempts, notes=notes)
+    content = replace(content, attempts=result.state.attempts, notes=notes, frame_names=capture.frame_names)
     if content.verdict == "rejected" or content.short is not None:
         content = content.with_findings(*proposed(capture, result.state.options.reconstruct.board))
     content = content.with_notes()

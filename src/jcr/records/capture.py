@@ -1,5 +1,6 @@
 """Records of a calibration's input: intrinsics, images with gripper poses, further cameras, or pairs of poses."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,9 @@ _Notation = Annotated[
 ]
 _Units = Annotated[str, StringConstraints(pattern=r"^(m|cm|mm)-(rad|deg)$")]
 Pixels = Annotated[int, Field(ge=1, le=LARGEST_PX)]
+FRAME_NAME = re.compile(r"[A-Za-z0-9_](-?[A-Za-z0-9_/.])*")
+"""Names of frames that tf2 and XML accept; two hyphens would end a comment of XML."""
+FrameName = Annotated[str, StringConstraints(pattern=f"^{FRAME_NAME.pattern}$", max_length=200)]
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,27 @@ class Reading:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameNames:
+    """Names of the frames in the user's robot software, as tf names or URDF links; None where unknown."""
+
+    base: FrameName | None = None
+    """Frame of the robot's base, in which the gripper poses are."""
+    gripper: FrameName | None = None
+    """Frame whose poses in the base the capture has, such as a flange or tool centre point."""
+    camera: FrameName | None = None
+    """Optical frame of the images: x right, y down, z forward."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for a name that tf2 or XML would not accept."""
+        require_fields(self)
+
+    def replaced(self, **names: Any) -> "FrameNames":
+        """Return the record with those of `names` replaced that are valid; others, and None, change nothing."""
+        valid = (name for name, text in names.items() if isinstance(text, str) and FRAME_NAME.fullmatch(text))
+        return replace(self, **{name: names[name] for name in valid})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """Images of one scene with the gripper pose at each, after the checks of the reader."""
 
@@ -182,6 +207,8 @@ class Capture:
     """Depth image of each image, or None for an image without one: aligned 16-bit PNG in mm, relative to `folder`."""
     camera_name: str = "wrist"
     """Name of the camera."""
+    frame_names: FrameNames = FrameNames()
+    """Names of the frames of base, gripper and camera."""
     mount: Mount = "gripper"
     """Body that the camera is mounted on; base: a fixed camera, whose images show an object in the gripper."""
     others: tuple[CellCamera, ...] = ()
@@ -241,6 +268,8 @@ class PosePairs:
     """Whether the unit of the camera poses is the metre, as with a marker of known size."""
     notes: tuple[str, ...] = ()
     backend: str = "poses given"
+    frame_names: FrameNames = FrameNames()
+    """Names of the frames of base, gripper and camera."""
     is_inverted: bool = False
     """Whether the gripper poses were inverted on reading, as `--pose-inverted` asks."""
 

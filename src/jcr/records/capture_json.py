@@ -21,7 +21,7 @@ from pydantic import (
 
 from jcr.errors import InputError, shown
 from jcr.geometry import HUGE, require_rigid
-from jcr.records.capture import COEFFICIENTS, DistortionModel, Intrinsics, Mount, Reading
+from jcr.records.capture import COEFFICIENTS, DistortionModel, FrameNames, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
@@ -206,7 +206,12 @@ def _read_reading(value: Any) -> Reading:
     return _READING.validate_python(value)
 
 
-_READING = TypeAdapter(Reading)
+def _read_frame_names(value: Any) -> FrameNames:
+    """Return names of frames from a JSON object; FrameNames are returned unchanged."""
+    return _FRAME_NAMES.validate_python(value)
+
+
+_READING, _FRAME_NAMES = TypeAdapter(Reading), TypeAdapter(FrameNames)
 
 
 class CaptureFile(Entry, extra="allow"):
@@ -221,6 +226,8 @@ class CaptureFile(Entry, extra="allow"):
     cameras: CameraEntries | None = None
     reading: Annotated[Reading, BeforeValidator(_read_reading)] | None = None
     """Reading of the poses from a file; absent where they were written as base_from_gripper."""
+    frame_names: Annotated[FrameNames, BeforeValidator(_read_frame_names)] = FrameNames()
+    """Names of the frames of base, gripper and camera in the robot's software."""
 
     def as_text(self) -> str:
         """Return the text of the capture.json."""

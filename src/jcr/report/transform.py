@@ -43,7 +43,9 @@ def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
     x, mount, covariance = hand_eye.parent_from_camera, hand_eye.mount, None
     if isinstance(hand_eye, Calibration):
         covariance = hand_eye.covariance
-    parent = PARENT if mount == "gripper" else BASE
+    names = hand_eye.frame_names
+    base, child = names.base or BASE, names.camera or CHILD
+    parent = names.gripper or PARENT if mount == "gripper" else base
     rotation = Rotation.from_matrix(x[:3, :3])
     rpy, order = roll_pitch_yaw(x[:3, :3]), list(COVARIANCE_ORDER)
     angles = ("roll", "pitch", "yaw")
@@ -60,13 +62,13 @@ def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
         ("Rotation vector (rad)", ("rx", "ry", "rz"), rotation.as_rotvec(), "axis times angle"),
     ]
     mounted = CameraMount(
-        parent=parent, child=CHILD, parent_from_child=x, base=BASE, intrinsics=hand_eye.intrinsics
+        parent=parent, child=child, parent_from_child=x, base=base, intrinsics=hand_eye.intrinsics
     )
     return {
         "sketch": sketch(x, hand_eye.intrinsics, mount),
         "mount": mount,
         "parent": parent,
-        "child": CHILD,
+        "child": child,
         "rejected": not hand_eye.converged,
         "matrix": "\n".join("".join(f"{value:>10.6f}" for value in row) for row in x[:3]),
         "copied_matrix": "[" + ",\n ".join(json.dumps(row) for row in x.tolist()) + "]",

@@ -20,7 +20,7 @@ from jcr.capture.urdf_chain import read_arm
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.extras import extra
 from jcr.progress import Progress
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, FrameNames, Intrinsics
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
@@ -44,11 +44,12 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
-        stamps, joints = bag.stamp_ns, None
+        stamps, joints, base = bag.stamp_ns, None, options.base_frame
         if options.urdf is None:
             poses_at = bag.tree.poses_at(options.base_frame, options.gripper_frame, path)
         else:
             arm = read_arm(options)
+            base = arm.base
             arm.columns(list(bag.joints), str(path))
             ordered = [dict(sorted(bag.joints[name].items())) for name in arm.joints]
             samples = [(np.array([*one]), np.array([*one.values()])) for one in ordered]
@@ -70,6 +71,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             images_of_rows=bag.pictures,
             intrinsics_of_size=bag.intrinsics,
             joints=joints,
+            frame_names=FrameNames().replaced(base=base, camera=bag.frame_id),
         )
         return capture_of_recording(recording, into, report)
 
@@ -88,6 +90,8 @@ class _Bag:
         self.joints = dict[str, dict[int, float]]()
         """Positions of each joint: from the joint's name to a dictionary from time stamp (ns) to position."""
         self.camera_info: Any = None
+        self.frame_id: object = None
+        """Frame in the header of the first image."""
         self.topic = topic = _camera_topic(reader, options, path)
         self.images = [c for c in reader.connections if c.topic == topic]
         infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
@@ -107,6 +111,7 @@ class _Bag:
                 elif kind == INFO:
                     self.camera_info = self.camera_info or message
                 else:
+                    self.frame_id = self.frame_id or message.header.frame_id
                     stamps.append(_stamp(message, at))
                     recorded.append(at)
             except (AttributeError, TypeError, ValueError, OverflowError) as error:

@@ -132,6 +132,7 @@ def stated_fields(
         "urdf": None if content.urdf is None else _inside(file.parent, content.urdf, f"{file}: urdf"),
         "depths": depths if any(depths) else None,
         "reading": content.reading,
+        "frame_names": content.frame_names,
         "notes": notes,
     }
 
@@ -256,8 +257,10 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         write_new(
             path_inside(folder, URDF, str(folder)), read_bytes(urdf)
         )  # so that the folder contains the whole capture
+    named = {key: name for key, name in vars(capture.frame_names).items() if name is not None}
     optional = {
         "reading": capture.reading,
+        "frame_names": named or None,
         "robot": capture.robot,
         "urdf": None if urdf is None else URDF,
         "cameras": camera_entries(capture) or None,

@@ -18,12 +18,12 @@ from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import interpolated_poses, speed
 from jcr.capture.readings import readings_of, undecided
 from jcr.capture.recording import Picture, Recording, capture_of_recording
-from jcr.capture.urdf_chain import read_arm
+from jcr.capture.urdf_chain import RecordedArm, read_arm
 from jcr.errors import InputError, shown
 from jcr.extras import extra
 from jcr.files import path_inside
 from jcr.progress import Progress
-from jcr.records import Capture
+from jcr.records import Capture, FrameNames
 from jcr.records.json_file import read_json, validated_content
 
 INFO = "meta/info.json"
@@ -103,7 +103,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             f"{path}: {len(options.episode)} episodes; read one, or several one by one with jcr batch"
         )
     episode = read_episode(path, info, camera, key, options.episode[0])
-    poses, joints = _poses(episode.state, key, features[key], options, path)
+    arm = None if options.urdf is None else read_arm(options)
+    poses, joints = _poses(episode.state, key, features[key], options, path, arm)
     stamps = np.round(1e9 * episode.time_s).astype(np.int64)
     recording = Recording(
         source=path,
@@ -114,6 +115,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         gap_ns=np.zeros(len(poses), np.int64),  # pose and image of a row have the same time
         images_of_rows=lambda rows: _images(episode, rows, camera, info.fps),
         joints=joints,
+        frame_names=FrameNames() if arm is None else FrameNames().replaced(base=arm.base),
     )
     return capture_of_recording(recording, into, report)
 
@@ -254,17 +256,21 @@ def _video_frames(
 
 
 def _poses(
-    state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
+    state: Float[ndarray, "n k"],
+    key: str,
+    feature: Feature,
+    options: ReadOptions,
+    path: Path,
+    arm: RecordedArm | None,
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
     """Return base_from_gripper (m) and joint angles (rad) of n frames from `state`, k numbers per frame.
 
-    With `options.urdf` the numbers are positions of the joints, else poses. The joint angles, in the order of the arm's
-    chain, are None without a URDF, or if a sliding joint moves the gripper. `key` and `feature` are the name and
+    With an `arm` the numbers are positions of its joints, else poses. The joint angles, in the order of the arm's
+    chain, are None without an arm, or if a sliding joint moves the gripper. `key` and `feature` are the name and
     description of the data set's column, `path` is that of the data set. Raises InputError if the numbers are neither.
     """
     where, names = f"{path}: {key}", feature.numbers()
-    if options.urdf is not None:
-        arm = read_arm(options)
+    if arm is not None:
         columns = arm.columns(names, where)
         if max(columns) >= state.shape[1]:
             raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
