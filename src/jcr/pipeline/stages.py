@@ -171,7 +171,7 @@ def fingerprint(*values: Any) -> str:
     return hashlib.sha256(json.dumps(values, default=identity).encode()).hexdigest()
 
 
-def _reconstruct(result: RunResult, progress: Progress) -> RunResult:
+def _select(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with a selected reconstruction and its calibration, and write the reconstruction.
 
     A reconstruction of the same inputs in the run folder, or in the one that `jcr capture` wrote, is used again. For a
@@ -249,7 +249,7 @@ def forget_reconstruction(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _calibrate(result: RunResult, progress: Progress) -> RunResult:
+def _record(result: RunResult, progress: Progress) -> RunResult:
     """Add attempts, notes and a proposed board to the calibration; write calibration.json and log.txt."""
     capture, reconstruction, content = result.capture, result.reconstruction, result.solved
     notes = (*capture.notes, *reconstruction.notes)
@@ -378,8 +378,8 @@ def _report(result: RunResult, progress: Progress = silent) -> RunResult:
 
 
 STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResult]]] = {
-    "reconstruct": ((RECONSTRUCTION,), _reconstruct),
-    "calibrate": ((CALIBRATION,), _calibrate),
+    "select": ((RECONSTRUCTION,), _select),
+    "record": ((CALIBRATION,), _record),
     "cameras": ((CAMERAS,), _cameras),
     "densify": ((DEPTH,), _densify),
     "map": ((CLOUD, MAP), _map),
