@@ -35,6 +35,7 @@ BENCHES = {
     "inputs": (ROBOTS, "Files as people hold them"),
     "coverage": (HONEST, "Is ± true?"),
     "faults": (HONEST, "Faults"),
+    "shuffled": (HONEST, "Effects of the order, in random orders"),
     "live": (HONEST, "Live calibration"),
     "spheres": (HONEST, "Spheres at a confidence"),
     "map": (MAPPED, "The map"),
