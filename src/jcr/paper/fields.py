@@ -22,25 +22,16 @@ BATCH, RATE = 6144, 5e-3
 """Points per training step, and learning rate of Adam; the paper states neither."""
 
 
-class PaperField(Field):
-    """Network f_θ of the property `name`: sinusoids φ of the position, 256 hidden ReLU units, linear outputs.
-
-    `box` (2,3) m is the workspace, whose longest side is scaled to [-1, 1]. The layers are drawn from `generator`.
-    """
-
-    def __init__(self, box: torch.Tensor, name: str, outputs: int, generator: torch.Generator | None = None):
-        super().__init__({name: outputs}, HIDDEN, box, frequencies=FREQUENCIES, generator=generator)
-
-
 def train_fields(
     cloud: PointCloud,
     options: MapOptions | None = None,
     box: Float[ndarray, "2 3"] | None = None,
     device: str = "cpu",
     progress: Progress | None = None,
-) -> tuple[dict[str, PaperField], int]:
-    """Return trained networks by property, "occupancy", "color" and with several labels "label", and number of steps.
+) -> tuple[dict[str, Field], int]:
+    """Return trained networks f_θ by property ("occupancy", "color", of several labels "label"), and number of steps.
 
+    Their input is φ, sinusoids of the position, with the longest side of the workspace scaled to [-1, 1].
     `box` are lower and upper corner (m, base frame) of the workspace; None computes them from the cloud. The training
     ends after `options.steps` steps or `options.max_seconds`, on the torch device `device`. The loss is the sum of the
     binary cross-entropy of occupancy (eq. 13), the cross-entropy of labels (eq. 14) and the squared error of colours
@@ -57,8 +48,9 @@ def train_fields(
     label = torch.tensor(cloud.label[inside], device=device)
     outputs = {"occupancy": 1, "color": 3} | ({"label": n} if (n := len(cloud.label_names)) > 1 else {})
     # The layers are drawn on the CPU, so that the initial weights are the same on every device.
-    fields = {name: PaperField(corners.cpu(), name, n, generator).to(device) for name, n in outputs.items()}
-    learnt = [p for field in fields.values() for p in field.parameters() if p.requires_grad]
+    arguments = {"hidden": HIDDEN, "box": corners.cpu(), "frequencies": FREQUENCIES, "generator": generator}
+    fields = {name: Field({name: n}, **arguments).to(device) for name, n in outputs.items()}
+    learnt = [p for field in fields.values() for p in field.parameters()]
     optimizer, taken = torch.optim.Adam(learnt, RATE), 0
     while taken < options.steps and time.perf_counter() - start < options.max_seconds:
         taken += 1

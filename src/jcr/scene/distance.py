@@ -14,17 +14,18 @@ from jcr.scene.fields import interpolate_grid
 
 BISECTIONS = 5
 """Number of bisections that locate the surface on a grid edge: to 0.3 mm for cells of 1 cm."""
+RADIUS = 0.25
+"""Radius (cells) of the discs that stand for the boundary between its points, which are about a cell apart. Points alone
+give distances that are too large. This radius has the least error (rms) within 5 cm of a box and a ball: 0.87 mm for
+cells of 1 cm. Half and one and a half of it give 0.95 and 0.87 mm, points alone 1.11 mm."""
 
 IsSolid = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]
 """Function that tests which points (n,3) m of the base frame are in solid space."""
 
-SurfaceStd = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
-"""Function that returns the standard deviation (m) of surface points (m, base frame) along unit normals."""
-
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """Signed distance (m, negative inside) and its gradient at the nodes of a regular grid."""
+    """Signed distance (m, negative inside), its gradient, and the surface's uncertainty at the nodes of a grid."""
 
     lower: Float[Tensor, "3"]
     """Position (m, base frame) of the first node, the lower corner of the grid."""
@@ -32,17 +33,16 @@ class DistanceGrid:
     """Distance (m) between neighbouring nodes."""
     nodes: Float[Tensor, "nz ny nx"]
     """Signed distance (m) at the nodes."""
-    gradients: Float[Tensor, "4 nz ny nx"]
-    """Signed distance (m), then its derivatives along x, y and z; the four values of a node are adjacent in memory."""
-    std: Float[Tensor, "nz ny nx"] | None = None
-    """Standard deviation (m) of the nearest surface along the gradient; None: unknown."""
+    values: Float[Tensor, "5 nz ny nx"]
+    """Signed distance (m), its derivatives along x, y and z, and the standard deviation (m) of the nearest surface along
+    the gradient, NaN if unknown; the five values of a node are adjacent in memory."""
 
-    def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-        """Return signed distance (m) and its derivatives along x, y, z, (n,4), interpolated trilinearly at n points (m).
+    def at(self, x_in_base: Float[Tensor, "n 3"], columns: slice) -> Float[Tensor, "n k"]:
+        """Return some of the `values` (n,k), interpolated trilinearly at n points (m, base frame).
 
-        The points are in the base frame; a point outside of the grid has the values of the nearest point on its border.
+        A point outside of the grid has the values of the nearest point on its border.
         """
-        return interpolate_grid(self.gradients, self.lower, self.cell, x_in_base).T
+        return interpolate_grid(self.values[columns], self.lower, self.cell, x_in_base).T
 
 
 def distance_grid(
@@ -51,50 +51,51 @@ def distance_grid(
     shape: tuple[int, int, int],
     is_solid: IsSolid,
     closed: bool,
-    surface_std: SurfaceStd | None = None,
+    surface_std: Callable[[ndarray, ndarray], ndarray] | None = None,
 ) -> DistanceGrid:
     """Return the signed distances (m) of grid nodes from the boundary of solid space, negative inside.
 
     The grid has `shape` (nz,ny,nx) nodes, `cell` m apart, from the corner `lower` (m, base frame) on. `is_solid`
     returns the mask of the points (n,3) m that are in solid space. If `closed`, space outside of the grid is solid.
-    Nodes next to the boundary have an interpolated boundary point; every other node takes that of the nearest such
-    node. Without any boundary, the distance is the grid's diagonal. Every node has the standard deviation
-    `surface_std` of its boundary point.
+    Nodes next to the boundary have an interpolated boundary point; every other node takes the distance from a disc of
+    RADIUS about the boundary point of the nearest such node, across the direction of that node. Without any boundary,
+    the distance is the grid's diagonal. Every node has the standard deviation (m) of its boundary point, which
+    `surface_std` returns for points (n,3) m and unit normals (n,3).
     """
     node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
     solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
     offset, beside = _boundary(lower, cell, solid, is_solid)
-    row = None
-    if not beside.any():
-        distance = np.full(shape, float(np.linalg.norm(shape)) * cell, np.float32)
-    else:
+    row = np.zeros(shape, int)
+    distance = np.full(shape, float(np.linalg.norm(shape)) * cell, np.float32)
+    if beside.any():
         nearest = distance_transform_edt(~beside, return_distances=False, return_indices=True)
         assert isinstance(nearest, ndarray)
         row = np.ravel_multi_index(tuple(nearest), shape)
-        squared = np.zeros(shape, np.float32)
-        for axis, (index, shift) in enumerate(zip(nearest, offset, strict=True)):
-            own = np.arange(shape[axis], dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
-            squared += (index + shift.take(row) - own) ** 2
-        distance = cell * np.sqrt(squared)
+        normal = offset / np.maximum(np.sqrt((offset**2).sum(0)), 1e-6)
+        squared, along = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        for index, own, shift, ahead in zip(
+            nearest, np.ogrid[*map(slice, shape)], offset, normal, strict=True
+        ):
+            apart = (index - own).astype(np.float32) + shift.take(row)
+            squared += apart**2
+            along += apart * ahead.take(row)
+        aside = np.maximum(np.sqrt(np.maximum(squared - along**2, 0)) - RADIUS, 0)
+        distance = cell * np.sqrt(along**2 + aside**2)
     distance[solid.cpu().numpy()] *= -1
     if closed:
         for axis, n in enumerate(shape):
             wall = cell * np.minimum(np.arange(n), np.arange(n)[::-1]).astype(np.float32)
             distance = np.minimum(distance, wall.reshape([-1 if a == axis else 1 for a in range(3)]))
-    dz, dy, dx = np.gradient(distance, cell)
-    std = None
-    if surface_std is not None:
-        spread = np.zeros(shape, np.float32)
-        if row is not None:
-            at, normal = np.argwhere(beside), np.stack([one[beside] for one in (dx, dy, dz)], 1)
-            x = lower.cpu().numpy() + cell * (at + offset[:, beside].T)[:, ::-1]
-            spread[beside] = surface_std(
-                x, normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-6)[:, None]
-            )
-        std = torch.as_tensor(spread if row is None else spread.take(row), device=lower.device)
+    slope = np.gradient(distance, cell)[::-1]
+    std = np.full(shape, np.nan if surface_std is None else 0.0, np.float32)
+    if surface_std is not None and beside.any():
+        x = lower.cpu().numpy() + cell * (np.argwhere(beside) + offset[:, beside].T)[:, ::-1]
+        toward = np.stack([one[beside] for one in slope], 1)
+        std[beside] = surface_std(x, toward / np.maximum(np.linalg.norm(toward, axis=1), 1e-6)[:, None])
+        std = std.take(row)
     nodes = torch.as_tensor(distance, device=lower.device)
-    gradients = torch.as_tensor(np.stack([distance, dx, dy, dz], -1), device=lower.device)
-    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2), std)
+    values = torch.as_tensor(np.stack([distance, *slope, std], -1), device=lower.device)
+    return DistanceGrid(lower, cell, nodes, values.permute(3, 0, 1, 2))
 
 
 def _boundary(

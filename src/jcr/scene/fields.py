@@ -72,38 +72,6 @@ class Lattice(nn.Module):
         return self.row.index_select(0, index.view(-1)).view(-1, 8), weight  # a third of the time of `take`
 
 
-class Interpolate(torch.autograd.Function):
-    """Differentiable weighted sum of 8 rows of a table per point, with a faster gradient than torch's embedding_bag."""
-
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-        """Return the sum of 8 weighted rows of `table` (k, features) for each of n points, shape (features, n).
-
-        `rows` (n,8) are the indices of the rows, `weight` (n,8) their weights; `ctx` is torch's context.
-        """
-        ctx.save_for_backward(table, rows, weight)
-        return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
-        """Return the gradient by `table`, None for `rows`, and the gradient by `weight`; None if one is not needed.
-
-        `gradients` has one element, the gradient (features,n) by the result of `forward`; `ctx` is torch's context.
-        """
-        (gradient,) = gradients
-        table, rows, weight = ctx.saved_tensors
-        of_table = of_weight = None
-        if ctx.needs_input_grad[0]:
-            of_table = torch.zeros(table.shape[::-1], device=table.device)
-            flat = rows.view(-1).long()
-            for column, out in zip(gradient, of_table, strict=True):
-                out.scatter_add_(0, flat, (column[:, None] * weight).view(-1))
-            of_table = of_table.T.contiguous()
-        if ctx.needs_input_grad[2]:
-            of_weight = (table[rows.long()] * gradient.T[:, None]).sum(-1)
-        return of_table, None, of_weight
-
-
 def interpolate_grid(
     table: Float[Tensor, "k nz ny nx"],
     lower: Float[Tensor, "3"],
@@ -138,6 +106,8 @@ class Field(nn.Module):
 
     frequency: Tensor
     center: Tensor
+    tables: nn.ParameterList
+    """Trainable features: for each grid a table with a row per selected node, after a row 0 for all others."""
 
     def __init__(
         self,
@@ -166,28 +136,10 @@ class Field(nn.Module):
         tables = (
             torch.zeros(len(lattices[k].nodes) + 1, n, device=lattices[k].lower.device) for k, n in grids
         )
-        self.encoding = nn.ModuleDict({"tables": nn.ParameterList(tables)})
+        self.tables = nn.ParameterList(tables)
         self._dense: list[Tensor] | None = None
         self.hidden = linear(sum((n for _, n in grids), 6 * frequencies), hidden, generator)
         self.heads = nn.ModuleDict({name: linear(hidden, n, generator) for name, n in heads.items()})
-        # Heads of plain values, whose unit is arbitrary, learn them standardised by these means and deviations.
-        self.standard = nn.ParameterDict(
-            {
-                name: nn.Parameter(torch.tensor([[0.0], [1.0]]).repeat(1, n), requires_grad=False)
-                for name, n in heads.items()
-                if name not in ("occupancy", "label")
-            }
-        )
-
-    @torch.no_grad()
-    def standardise(self, targets: Mapping[str, Tensor]) -> None:
-        """Set offset and scale of all outputs but occupancy and label to mean and std of the property's `targets`.
-
-        `targets` has an array (n, outputs) for each property, such as the colours of n points.
-        """
-        for name, standard in self.standard.items():
-            target = targets[name]
-            standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
     def expand(self) -> None:
         """Copy the trained features to dense grids; queries then need more memory, and a third of the time."""
@@ -195,14 +147,6 @@ class Field(nn.Module):
             table.detach()[lattice.row.long()].T.unflatten(1, lattice.shape)
             for table, lattice in zip(self.tables, self._lattices, strict=True)
         ]
-
-    @property
-    def tables(self) -> nn.ParameterList:
-        """Trainable features: for each grid a table with a row per selected node, after a row 0 for all others.
-
-        The columns are the features of a node.
-        """
-        return cast(nn.ParameterList, self.encoding["tables"])
 
     def encode(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Return the f inputs of the network's first layer for n points (m): interpolated features, or sinusoids.
@@ -214,8 +158,12 @@ class Field(nn.Module):
             angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
             return torch.cat([angle.sin(), angle.cos()])
         if self._dense is None:
-            parts = zip(self.tables, self._lattices, strict=True)
-            return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
+            near = [lattice.corners(x_in_base) for lattice in self._lattices]
+            # torch's embedding_bag, which does the same, takes twice the training's time.
+            parts = zip(self.tables, near, strict=True)
+            return torch.cat(
+                [torch.einsum("nkf,nk->fn", table[rows.long()], w) for table, (rows, w) in parts]
+            )
         parts = zip(self._dense, self._lattices, strict=True)
         return torch.cat([interpolate_grid(t, one.lower, one.cell, x_in_base) for t, one in parts])
 
@@ -226,13 +174,10 @@ class Field(nn.Module):
         """
         # Arrays are (features, n): with few features this product and its gradient take half the time of (n, features).
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, self.encode(x_in_base)))
-        outputs = {}
-        for name, head in self.heads.items():
-            outputs[name] = torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
-            if name in self.standard:
-                mean, std = self.standard[name]
-                outputs[name] = mean + std * outputs[name]
-        return outputs
+        return {
+            name: torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
+            for name, head in self.heads.items()
+        }
 
 
 class Fields(nn.Module):

@@ -2,13 +2,13 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from jcr.errors import InputError, first_fault
 from jcr.extras import extra
-from jcr.records.json_fields import Positive, Spread
+from jcr.records.json_fields import Positive
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,16 +56,6 @@ class NetworkHeader(BaseModel):
         return self
 
 
-class UncertaintyHeader(BaseModel):
-    """Fields of the map's uncertainty (scene.uncertainty.MapUncertainty) that are no arrays."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    order: tuple[str, ...]
-    shape_m: Spread
-    look_std_m: Spread
-    block_m: Positive
-
-
 class MapHeader(BaseModel):
     """Header of a map file, in JSON: its networks and grids, label names, cell size (m), and how it was made."""
 
@@ -76,7 +66,8 @@ class MapHeader(BaseModel):
     label_names: tuple[str, ...]
     cell: Positive
     history: dict[str, str]
-    uncertainty: UncertaintyHeader | None
+    uncertainty: dict[str, float | tuple[str, ...]] | None
+    """Fields of the map's uncertainty (scene.uncertainty.MapUncertainty) that are no arrays; None: unknown."""
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
@@ -97,19 +88,17 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, no mapping
-        if (found := metadata.get("format", "no map of jcr")) != FORMAT:
-            raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
-        if metadata.get("digest") != digest(tensors, metadata["about"]):
-            raise ValueError("its numbers changed since it was written")
-        return _scene_of(MapHeader.model_validate_json(metadata["about"], strict=True), tensors).to(device)
-    except ValidationError as error:
-        raise InputError(f"{path}: the map file is damaged (about: {first_fault(error)}); {again}") from None
+            if (found := metadata.get("format", "no map of jcr")) == FORMAT:
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, no mapping
+                if metadata.get("digest") != digest(tensors, metadata["about"]):
+                    raise ValueError("its numbers changed since it was written")
+                header = MapHeader.model_validate_json(metadata["about"], strict=True)
+                return _scene_of(header, tensors).to(device)
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        if isinstance(error, InputError) and str(error).startswith(str(path)):
-            raise
-        reason = " ".join(str(error).split())[:REASON]
+        text = f"about: {first_fault(error)}" if isinstance(error, ValidationError) else str(error)
+        reason = " ".join(text.split())[:REASON]
         raise InputError(f"{path}: the map file is damaged ({reason}); {again}") from None
+    raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
 
 
 def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
@@ -134,19 +123,16 @@ def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
         raise ValueError(f"{heads.get('label')} labels with {len(about.label_names)} names")
     lattices = _lattices_of(about, seen, tensors)
     fields = Fields([Field(**dict(of), box=seen.box, lattices=lattices) for of in about.networks], lattices)
+
+    def part(prefix: str) -> dict[str, Any]:
+        """Return the tensors whose names begin with a prefix, by the rest of their names."""
+        return {name.removeprefix(prefix): at for name, at in tensors.items() if name.startswith(prefix)}
+
+    fields.load_state_dict(part("fields."))
     uncertainty = None
     if about.uncertainty is not None:
-        own = {
-            name.removeprefix("uncertainty."): value
-            for name, value in tensors.items()
-            if name.startswith("uncertainty.")
-        }
-        arrays: dict[str, Any] = {name: value.numpy() for name, value in own.items()}
-        uncertainty = MapUncertainty(**dict(about.uncertainty), **arrays)
-    state = {
-        name.removeprefix("fields."): value for name, value in tensors.items() if name.startswith("fields.")
-    }
-    fields.load_state_dict(state)
+        arrays = {name: value.numpy() for name, value in part("uncertainty.").items()}
+        uncertainty = MapUncertainty(**cast(Any, about.uncertainty), **arrays)
     return SceneMap(fields, seen, about.label_names, about.history, uncertainty)
 
 

@@ -12,6 +12,7 @@ from jcr.camera import NORMALIZED
 from jcr.estimation.point_uncertainty import point_covariance
 from jcr.records import COVARIANCE_ORDER, PointCloud
 from jcr.records.checked import require_fields, require_finite
+from jcr.records.json_fields import Positive, Spread
 
 if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
@@ -34,14 +35,14 @@ class MapUncertainty:
     """Centre of the scene (m, base frame)."""
     similarity: Float[ndarray, "7 7"]
     """Covariance of the scene's similarity about `middle` (SceneUncertainty), the part common to all points."""
-    shape_m: float
+    shape_m: Spread
     """Standard deviation per axis of a point's remaining error by the calibration (m)."""
-    look_std_m: float
+    look_std_m: Spread
     """Standard deviation per axis (m) of a point that the robot locates by an image from another pose: by transform,
     intrinsics and the error of that gripper pose. It changes with the pose, and is no part of the map's errors."""
     lower: Float[ndarray, "3"]
     """Lower corner (m) of the first block; the sides of a block are `block_m`."""
-    block_m: float
+    block_m: Positive
     depth_std: Float[ndarray, "z y x"]
     """Standard deviation (m) of the surface's position along its normal by depth and map, per block."""
 
@@ -93,14 +94,14 @@ def map_uncertainty(scene: "SceneMap", cloud: PointCloud, hand_eye: Calibration)
 def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
     """Return the standard deviation (m) of the surface along its normal by depth and map, in blocks of the workspace.
 
-    It is the spread of the cloud's points about the map's surface in a block: half the distance of their 5 % and 95 %
-    quantiles over 1.645. The stated errors of the depth, if known, are a lower bound of it.
+    It is the distance from the map's surface that 90 % of the cloud's points in a block do not exceed, over 1.645. The
+    stated errors of the depth, if known, are a lower bound of it.
     """
     (low, high), side = scene.box, BLOCK * scene.cell
     inside = np.flatnonzero(((cloud.points_in_base > low) & (cloud.points_in_base < high)).all(1))
     x = cloud.points_in_base[inside]
     sample, stated = scene.query(x, unknown="free"), np.zeros(len(x))
-    off = np.clip(sample.distance, -2 * scene.cell, 2 * scene.cell)
+    off = np.abs(sample.distance)
     if cloud.depth_std is not None:
         ray = x - cloud.camera_centers_in_base[cloud.image[inside]]
         cosine = (ray * sample.gradient).sum(1) / np.linalg.norm(ray, axis=1)
@@ -112,11 +113,9 @@ def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
     block, off, stated = block[order], off[order], stated[order]
     first = np.flatnonzero(np.diff(block, prepend=-1))
     count = np.diff(np.r_[first, len(block)])
-    fifth, last = (off[first + (share * (count - 1)).astype(int)] for share in (0.05, 0.95))
-    spread = (last - fifth) / (2 * 1.645)
+    spread = off[first + (0.9 * (count - 1)).astype(int)] / 1.645
     own = np.maximum(spread, np.sqrt(np.add.reduceat(stated**2, first) / count))
-    overall = float(np.subtract(*np.quantile(off, [0.95, 0.05]))) / (2 * 1.645)
-    anywhere = max(overall, float(np.sqrt((stated**2).mean())))
+    anywhere = max(float(np.quantile(off, 0.9)) / 1.645, float(np.sqrt((stated**2).mean())))
     found = np.full(int(np.prod(shape)), anywhere)
     found[block[first]] = np.where(count >= LEAST_POINTS, own, anywhere)
     return found.reshape(shape)
