@@ -2,14 +2,19 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jcr.calibration.difference import StatedTransform, compare
+from jcr.calibration.record import Calibration, read_calibration
+from jcr.calibration.words import mixed_pair_mm, summary
+from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
 from jcr.geometry import retract, rotation_exp, transform
+from jcr.rounding import significant
 from places import ROOT
 
 ACCEPTED = ROOT / "tests" / "calibrations" / "accepted.json"
@@ -43,6 +48,21 @@ def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: p
         assert dispatch([str(word) for word in command]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "calibration.json" in line and words in line
+
+
+def test_the_error_of_a_mixed_pair_is_that_of_the_rays():
+    found = read_calibration(ACCEPTED)
+    assert isinstance(found, Calibration) and found.with_given_intrinsics is not None
+    camera = replace(NORMALIZED, fx=500.0, fy=500.0, cx=499.5, cy=0.0, width=1000, height=1)
+    other = replace(found.with_given_intrinsics, intrinsics=replace(camera, fx=505.0))
+    found = replace(found, intrinsics=camera.with_std(None), with_given_intrinsics=other)
+    seen = found.uncertainty.seen
+    assert seen is not None
+    turned = np.arctan2(499.5, 500.0) - np.arctan2(499.5, 505.0)
+    expected = 2 * np.sin(turned / 2) * seen.distance_mm
+    assert mixed_pair_mm(found) == pytest.approx(expected)
+    assert f"a point is up to {significant(expected)} mm off" in summary(found)
+    assert mixed_pair_mm(replace(found, with_given_intrinsics=None)) is None
 
 
 def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -134,7 +134,9 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
 
 
-def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path: Path):
+def test_files_name_the_intrinsics_that_their_transform_belongs_to(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     content = json.loads((done / "calibration.json").read_text())
     kept = content["with_given_intrinsics"]
     pairs = {
@@ -152,6 +154,12 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
         position = yaml.safe_load(text)["transform"]["translation"]
         assert [position[axis] for axis in "xyz"] == pytest.approx([row[3] for row in transform_of_pair[:3]])
         assert f"belongs to these intrinsics (640 x 480 px): fx {intrinsics['fx']:.6g}" in text
+        capsys.readouterr()
+        export(done, "ros2", tmp_path / f"{which}.xml", "--intrinsics", which)
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last.startswith(f"belongs to fx {intrinsics['fx']:.1f}") and "--intrinsics given" in last
+    export(done, "colmap", tmp_path / "colmap")
+    assert "mm (median) from gripper pose times transform" in capsys.readouterr().err
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
     with pytest.raises(InputError, match="--intrinsics given"):
@@ -402,6 +410,7 @@ def test_frames_are_those_of_the_capture_and_asked_for_where_unknown(
 ):
     content, run = json.loads((done / "calibration.json").read_text()), tmp_path / "run"
     run.mkdir()
+    shutil.copy(done / "uncertainty.npz", run)
     names = {"base": "ur_base", "gripper": "flange", "camera": "eye_optical"}
     assert content["frame_names"] == vars(FRAME_NAMES)
     (run / "calibration.json").write_text(json.dumps(content | {"frame_names": names}))
@@ -443,7 +452,7 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
 ):
     run = tmp_path / "run"
     run.mkdir()
-    for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json"):
+    for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json", "uncertainty.npz"):
         (run / name).symlink_to(done / name)
     content = json.loads((done / "calibration.json").read_text())
     findings = [
@@ -493,7 +502,8 @@ def test_what_cannot_be_exported_is_one_line(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
 ):
     """In a run folder that holds its calibration and nothing else."""
-    shutil.copy(done / "calibration.json", tmp_path)
+    for name in ("calibration.json", "uncertainty.npz"):
+        shutil.copy(done / name, tmp_path)
     assert dispatch(["export", str(tmp_path), *arguments]) == 2
     complaint = capsys.readouterr().err
     assert complaint.startswith("error: ") and complaint.count("\n") == 1 and words in complaint

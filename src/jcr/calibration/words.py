@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
+from jcr.camera import unproject
 from jcr.findings import (
     LENGTHS,
     Finding,
@@ -17,7 +18,7 @@ from jcr.findings import (
     verdict_of,
     without_consequences,
 )
-from jcr.records import GivenIntrinsicsResult, LeaveOneOut, PointUncertaintyOverImage, share_of
+from jcr.records import GivenIntrinsicsResult, Intrinsics, LeaveOneOut, PointUncertaintyOverImage, share_of
 from jcr.rounding import labelled, significant
 
 NEGLIGIBLE = 0.02
@@ -95,10 +96,34 @@ def _result(content: Calibration) -> list[str]:
     ]
     if (camera := content.intrinsics) is None:
         return lines
-    given = content.with_given_intrinsics is not None
-    how = "used" if camera.std is None else "given, refined" if given else "estimated"
-    numbers = " ".join(f"{name} {getattr(camera, name):.1f}" for name in ("fx", "fy", "cx", "cy"))
-    return [*lines, *labelled("Intrinsics", f"{how}: {numbers}; use them together with the transform")]
+    given = content.with_given_intrinsics
+    how = "used" if camera.std is None else "estimated" if given is None else "given, refined"
+    use = [f"{how}: {intrinsics_in_words(camera)}; use them together with the transform"]
+    if given is not None and (mm := mixed_pair_mm(content)) is not None:
+        pair = f"with the given ones (fx {given.intrinsics.fx:.1f}) and this transform"
+        use.append(f"{pair} a point is up to {significant(mm)} mm off (jcr docs exports)")
+    return [*lines, *labelled("Intrinsics", *use)]
+
+
+def intrinsics_in_words(camera: Intrinsics) -> str:
+    """Return focal lengths and principal point (px) in words."""
+    return " ".join(f"{name} {getattr(camera, name):.1f}" for name in ("fx", "fy", "cx", "cy"))
+
+
+def mixed_pair_mm(content: Calibration) -> float | None:
+    """Return the largest error (mm) of points at the working distance by the estimated transform and given intrinsics.
+
+    Compared are the points of the same pixels by the estimated intrinsics, at the image centre and in the corners. None
+    if the calibration has only one pair of transform and intrinsics.
+    """
+    given, camera, seen = content.with_given_intrinsics, content.intrinsics, content.uncertainty.seen
+    if given is None or camera is None or seen is None:
+        return None
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5]])
+    x_px = corners * [camera.width - 1, camera.height - 1]
+    rays = [unproject(one, x_px) for one in (camera, given.intrinsics)]
+    points = [seen.distance_mm * ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
+    return float(np.linalg.norm(points[1] - points[0], axis=1).max())
 
 
 def _transform(content: Calibration | PublishedCalibration) -> list[str]:

@@ -106,7 +106,10 @@ class ExportCommand:
         if row.name == "ros2":
             facts["line"] = static_transform_publisher(run.mount)
             lines = [facts["line"]]
-        self.output.result(lines, facts)
+        pair = run.pair_in_words(row.contents)
+        self.output.result(lines, facts | {"intrinsics": pair})
+        if pair is not None:
+            sys.stderr.write(f"{pair}\n")
         if run.doubt is not None:
             warn(f"the calibration is rejected, as the file says too: {run.doubt}")
         elif (short := run.calibration.short) is not None:

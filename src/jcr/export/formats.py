@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.words import intrinsics_in_words
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
@@ -20,6 +21,7 @@ from jcr.files import written_whole
 from jcr.geometry import scale_translation, transform
 from jcr.options import checked_options
 from jcr.result import CLOUD, RunResult
+from jcr.rounding import significant
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
@@ -216,6 +218,33 @@ class ExportedRun:
             )
         rotation = Rotation.from_quat(quat_xyzw).as_matrix()
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
+
+    def pair_in_words(self, contents: str) -> str | None:
+        """Return a sentence on the intrinsics that belong to an export with these contents, and on the other pair.
+
+        None for an export without cameras, or if the run has no intrinsics.
+        """
+        found = self.calibration
+        if "views" in contents.split():
+            views = self.views
+            off = views.base_from_camera - views.base_from_gripper @ found.gripper_from_camera
+            mm = 1e3 * float(np.median(np.linalg.norm(off[:, :3, 3], axis=1)))
+            return (
+                f"cameras and intrinsics ({intrinsics_in_words(views.intrinsics)}) are those of the images, as in the "
+                f"map; the centres are {significant(mm)} mm (median) from gripper pose times transform"
+            )
+        camera = self.camera_frame.intrinsics if {"mount", "camera_frame"} & {*contents.split()} else None
+        if camera is None:
+            return None
+        words, given = f"belongs to {intrinsics_in_words(camera)}", found.with_given_intrinsics
+        if self.camera is not None or given is None:
+            return f"{words}; jcr export {self.run.out} camera_info writes them"
+        if self.options.intrinsics == "given":
+            return f"{words}, the given ones; without --intrinsics given: for the refined ones"
+        return (
+            f"{words}, the refined ones (jcr export {self.run.out} camera_info); for the given ones, fx "
+            f"{given.intrinsics.fx:.1f}: --intrinsics given"
+        )
 
     @property
     def others(self) -> list[ros.CameraMount]:
