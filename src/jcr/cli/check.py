@@ -1,7 +1,8 @@
 """Commands that test a capture or a calibration: check, verify, compare and touch."""
 
 import shlex
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,15 +13,17 @@ import tyro
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy, check_options
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
+from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
 from jcr.pipeline.options import TOLERANCE
-from jcr.progress import progress_bars
+from jcr.progress import Progress, progress_bars
 from jcr.records import Capture, PosePairs
 from jcr.rounding import labelled, significant
 
 if TYPE_CHECKING:
     from jcr.pipeline.check import Examination
     from jcr.pipeline.verify import Verification
+    from jcr.pipeline.watch import Verified
 
 UNLIKELY = 1e-3
 """p-value below which the reported errors do not explain a difference."""
@@ -240,25 +243,28 @@ class CompareCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyCommand:
-    """Test a calibration with new images: has the camera moved on the gripper since?
+    """Test a calibration with later captures: has the camera moved on the gripper since?
 
-    OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
-    format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table).
-    Fixed cameras of the run that CAPTURE names in `cameras` are tested too. The exit status is 3 if something has
-    moved, or if the images cannot decide.
+    OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURES are captures in any
+    format, oldest first, or a folder of captures, with one or more new images of the same scene; three to five images
+    with the wrist rotated distinguish a moved camera from a moved table. Each capture is tested with those that were
+    verified before (OUT/verify.json), with at most 0.1 false alarms per hundred captures; OUT/verify.html shows all.
+    Fixed cameras of the run that the last capture names in `cameras` are tested too. The exit status is 3 if something
+    has moved, or if the images cannot decide.
 
     for example:
       jcr verify out/table captures/this-morning
-      jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
+      jcr verify out/table captures/november --tolerance 1 0.1 --json
+      jcr verify out/table droid/ --episode 40 80 120
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the run that calibrated the camera."""
-    capture: Annotated[Path, tyro.conf.Positional]
-    """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[CAPTURES...]")] = ()
+    """The new images and their poses: capture folders, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = TOLERANCE
-    """Drifts smaller than both raise no alarm, however significant."""
+    """Changes smaller than both raise no alarm, however significant."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -266,18 +272,47 @@ class VerifyCommand:
 
         The status is 3 if a camera has moved, else 0.
         """
-        from jcr.capture.read import read_capture
         from jcr.pipeline.verify import verify_run
+        from jcr.pipeline.watch_page import write_page
 
+        if not self.captures:
+            raise InputError("verify: no captures; name one or more with new images of the scene")
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
-            capture = read_capture(self.capture, self.read, into=scratch, progress=progress, at_least=1)
-            found = verify_run(self.out, capture, self.tolerance, progress)
+            captures = read_captures(self.captures, self.read, Path(scratch), progress)
+            found = verify_run(self.out, captures, self.tolerance, progress)
+        page = write_page(self.out, found, self.tolerance)
         cameras = (found, *found.others)
         drifts = [_drift(one, self.output.verbose) for one in cameras]
-        (_, facts), *others = drifts
-        others = {one.fixed: other for one, (_, other) in zip(found.others, others, strict=True)}
-        self.output.result([line for lines, _ in drifts for line in lines], facts | {"cameras": others})
+        (lines, facts), *others = drifts
+        rows = found.history[-len(captures) :]
+        lines += [line for more, _ in others for line in more]
+        lines += [*(_series(rows) if len(rows) > 1 else ()), *labelled("Page", str(page))]
+        facts |= {"cameras": {one.fixed: other for one, (_, other) in zip(found.others, others, strict=True)}}
+        self.output.result(lines, facts | {"history": [_row_facts(row) for row in found.history]})
         return 3 if any(one.moved for one in cameras) else 0
+
+
+def read_captures(
+    paths: Sequence[Path], read: ReadOptions, scratch: Path, progress: Progress
+) -> dict[str, Capture]:
+    """Return the captures at some paths by name, in their order: a folder of captures has one for each folder in it.
+
+    A data set has a capture for each episode that `read` names. Images of recordings are extracted into `scratch`.
+    """
+    from jcr.capture.read import read_capture
+
+    captures = dict[str, Capture]()
+    for path in paths:
+        inside = sorted(file.parent for file in path.glob("*/capture.json")) if path.is_dir() else []
+        for one in inside if inside and not (path / "capture.json").is_file() else [path]:
+            for episode in read.episode:
+                into, own = scratch / str(len(captures)), replace(read, episode=(episode,))
+                found = read_capture(one, own, into=into, progress=progress, at_least=1)
+                name = (one.parent if one.name == "capture.json" else one).absolute().name
+                name += f" episode {episode}" if len(read.episode) > 1 else ""
+                numbered = (name if k == 1 else f"{name} {k}" for k in range(1, len(captures) + 2))
+                captures[next(name for name in numbered if name not in captures)] = found
+    return captures
 
 
 def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, Any]]:
@@ -294,19 +329,45 @@ def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, A
     verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
     if warnings and not found.moved:
         verdict += f" with {warnings} warning{'s' * (warnings > 1)}"
-    noticed = f"9 of 10 drifts of {seen_mm:.1f} mm or {seen_deg:.2f}° are noticed"
+    noticed = f"9 of 10 changes of {seen_mm:.1f} mm or {seen_deg:.2f}° are found"
     lines = [
-        f"{verdict}: {found.finding}, {drift}",
+        f"{verdict}: {found.finding}" + ("" if found.moves else f", {drift}"),
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
         *labelled("Images", f"{len(found.images)}; {noticed}"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
-    same = {name: getattr(found, name) for name in ("verdict", "moved", "p_value", "images", "notes")}
-    cause = {"cause": found.cause if found.moved else None}
+    same = {
+        name: getattr(found, name) for name in ("verdict", "moved", "cause", "p_value", "images", "notes")
+    }
+    moves = [{"causes": one.causes, "since": one.since} for one in found.moves]
     drifts = {"drift_mm": mm, "drift_deg": deg, "drift_std_mm": mm_std, "drift_std_deg": deg_std}
-    return lines, same | cause | drifts | {"detectable_mm": seen_mm, "detectable_deg": seen_deg}
+    return lines, same | {"moves": moves} | drifts | {"detectable_mm": seen_mm, "detectable_deg": seen_deg}
+
+
+def _row_facts(row: "Verified") -> dict[str, Any]:
+    """Return the content of --json for one capture of the history."""
+    facts: dict[str, Any] = {"capture": row.name, "images": row.images, "notes": row.notes}
+    for name, one in (("camera", row.camera), ("scene", row.scene)):
+        std = np.sqrt(np.diag(one.covariance))
+        facts[name] = {"mm": 1e3 * one.step[:3], "deg": np.degrees(one.step[3:])}
+        facts[name] |= {"std_mm": 1e3 * std[:3], "std_deg": np.degrees(std[3:]), "p": one.p_value}
+    facts["detectable"] = {"mm": 1e3 * row.detectable[0], "deg": float(np.degrees(row.detectable[1]))}
+    return facts | {"odds": row.odds, "scene_left": row.scene_left}
+
+
+def _series(rows: Sequence["Verified"]) -> list[str]:
+    """Return the table of captures: drift of camera and scene, the smallest change that is found, scene left."""
+    width = max(len("capture"), *(len(row.name) for row in rows))
+    lines = [f"{'capture':<{width}}  {'camera':>16}  {'scene':>16}  {'found from':>16}  scene left"]
+    for row in rows:
+        steps = (row.camera.step, row.scene.step)
+        pairs = [(float(np.linalg.norm(one[:3])), float(np.linalg.norm(one[3:]))) for one in steps]
+        cells = (f"{1e3 * m:.2f} mm {np.degrees(rad):.3f}°" for m, rad in (*pairs, row.detectable))
+        left = "" if row.scene_left is None else f"{100 * row.scene_left:.0f} %"
+        lines.append(f"{row.name:<{width}}  {'  '.join(f'{cell:>16}' for cell in cells)}  {left:>10}")
+    return lines
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from jcr.calibration.difference import compare
-from jcr.calibration.drift import ALPHA
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -26,6 +25,7 @@ from jcr.files import locked, write_text
 from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline.options import BatchOptions
 from jcr.pipeline.run import run
+from jcr.pipeline.verify import ALPHA
 from jcr.progress import Progress, silent
 from jcr.report.render import render
 from jcr.result import CAPTURE, RunOptions, load_run

@@ -1,45 +1,73 @@
-"""Test from a few new images whether the camera has moved since its calibration."""
+"""Verification of a calibration by later captures of its scene: has camera, scene or robot changed since?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.drift import ALPHA, Drift, detectable, drift
+from jcr.calibration.drift import Cause, detectable
 from jcr.calibration.options import GRASPING
-from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
-from jcr.capture.folder import require_decided
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.absolute_pose import CameraPose
-from jcr.estimation.problem import pose_problem
-from jcr.estimation.robot_noise import of_poses
-from jcr.estimation.solve import solve
-from jcr.findings import Verdict, sentence
-from jcr.geometry import step_between
+from jcr.files import locked
+from jcr.findings import Verdict
+from jcr.geometry import Transform, retract, step_between
+from jcr.pipeline.old_scene import NewImages, calibration_digest, name_of, new_images, old_scene, require_new
 from jcr.pipeline.options import TOLERANCE
+from jcr.pipeline.watch import History, Verified, read_history, with_capture, write_history
 from jcr.progress import Progress, silent
-from jcr.records import Capture, CellCamera
+from jcr.records import Capture
 from jcr.result import RunResult
-from jcr.sfm.register import register
+
+ALPHA = 1e-3
+"""False-alarm rate of the test of a fixed camera, and of two calibrations."""
+
+
+class Move(NamedTuple):
+    """Change since the calibration that exceeds the tolerance."""
+
+    causes: tuple[Cause, ...]
+    """The most likely cause, then those that explain the captures nearly as well."""
+    first: int
+    """Index of the first capture after the change, in the history."""
+    since: str
+    """Name of that capture."""
+    step: Float[ndarray, "6"] | None
+    """Step of the camera (gripper axes) or the scene (base axes): m, rad; None: the robot's poses changed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verification(Drift):
-    """Result of the test for a moved camera: the measured drift, and the verdict on the old calibration."""
+class Verification:
+    """Result of a verification: the drift of the camera, and the verdict on the old calibration."""
 
+    name: str = ""
+    """Name of the capture that was verified last, or of a fixed camera."""
+    offset: Float[ndarray, "6"]
+    """Step from calibrated to present gripper_from_camera: translation (m), rotation vector (rad); gripper axes. For a
+    fixed camera the step of base_from_camera in base axes."""
+    covariance: Float[ndarray, "6 6"]
+    """Covariance of `offset`."""
+    p_value: float
+    """Probability of an offset this large or larger if nothing has moved."""
+    detectable: tuple[float, float]
+    """Translation (m) and rotation (rad), in the worst direction, that the test detects with probability 0.9."""
     moved: bool
-    """Whether the drift is significant and larger than the tolerance."""
+    """Whether a drift is significant and larger than the tolerance."""
     images: tuple[str, ...]
     """Names of the new images that were used."""
     notes: tuple[str, ...]
     """Warnings about the new images and the sensitivity of the test."""
+    moves: tuple[Move, ...] = ()
+    """Changes of camera, scene and robot since the calibration; empty if nothing has moved, and for a fixed camera."""
+    history: tuple[Verified, ...] = ()
+    """All captures that were verified against the run, oldest first."""
     fixed: str | None = None
     """Name of the camera if it is a fixed one, whose drift is along base axes; None: the camera on the gripper."""
     others: tuple["Verification", ...] = ()
@@ -47,138 +75,146 @@ class Verification(Drift):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the old calibration: rejected if the camera moved."""
+        """Verdict on the old calibration: rejected if something moved."""
         return "rejected" if self.moved else "accepted"
 
     @property
+    def cause(self) -> Cause | None:
+        """Most likely cause of the last change; None if nothing has moved."""
+        return self.moves[-1].causes[0] if self.moves else "camera" if self.moved else None
+
+    @property
     def finding(self) -> str:
-        """Phrase that states what has moved: nothing, the camera, the scene, or camera or scene if that is unclear."""
+        """Phrase that states what has moved, by how much, and since which capture."""
         if self.fixed is not None:
             return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
-        moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
-        return f"{moved[self.cause]} has moved" if self.moved else "no drift is detected"
+        return "; ".join(map(_in_words, self.moves)) or "no drift is detected"
 
     @property
     def advice(self) -> str:
         """Remedy, in words, for the case that something has moved."""
         if self.fixed is not None:
             return f"{self.fixed} has moved; fasten it, and calibrate it again (jcr add-camera, under another name)"
-        anew = "tighten the mount, then calibrate again from 8 or more images (jcr run)"
+        causes, anew = self.moves[-1].causes, "calibrate again from 8 or more images (jcr run)"
+        if causes[1:]:
+            return (
+                "two more images with the wrist rotated decide what has moved; if it is the camera, tighten the mount, "
+                f"then {anew}"
+            )
         return {
+            "camera": f"tighten the mount, then {anew}",
             "scene": "the scene or the robot's base was moved as a whole; the camera's calibration is still valid, the "
             "map is not: build it again (jcr run)",
-            "either": "either the camera has moved on the gripper, or the whole scene has; two more images with the "
-            f"wrist rotated decide which; if it is the camera, {anew}",
-            "camera": f"the camera has moved on the gripper; {anew}",
-        }[self.cause]
+            "robot": "the robot reports other poses than before (joints set to zero again, another tool frame or "
+            f"payload); the calibration does not belong to these: {anew}",
+        }[str(causes[0])]
+
+
+def _in_words(move: Move) -> str:
+    """Return a change in words."""
+    nouns = {"camera": "the camera", "scene": "the scene", "robot": "the robot's reported poses"}
+    said = " or ".join(nouns[one] for one in nouns if one in move.causes)
+    has = "have" if move.causes == ("robot",) else "has"
+    size = ""
+    if move.step is not None:
+        mm, deg = 1e3 * np.linalg.norm(move.step[:3]), np.degrees(np.linalg.norm(move.step[3:]))
+        size = f" by {mm:.2f} mm and {deg:.3f}°"
+    return f"{said} {has} {'changed' if move.causes == ('robot',) else 'moved'}{size} since {move.since}"
 
 
 def verify_run(
     out: str | Path,
-    new: Capture | str | Path,
+    new: Capture | str | Path | Mapping[str, Capture | NewImages],
     tolerance: tuple[float, float] = TOLERANCE,
     progress: Progress | None = None,
 ) -> Verification:
-    """Test with the images of `new`, a capture or its path, whether the cameras of the run folder `out` have moved.
+    """Test with new images whether the cameras of the run folder `out` have moved since its calibration.
 
-    The new images are located in the reconstruction of the calibrated scene. Drifts smaller than both parts of
-    `tolerance` (mm, degrees) raise no alarm, however significant. Raises InputError if the run has no accepted
-    calibration or the images are of another camera. Raises RejectedError if no image shares enough features
+    `new` is a capture, its path, or several captures by name, oldest first. Each is located in the calibrated scene, and
+    tested with the captures that were verified before, which verify.json in the run folder keeps. Changes smaller than
+    both parts of `tolerance` (mm, degrees) raise no alarm, however significant. Raises InputError if the run has no
+    accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
     with the scene.
     """
-    report = progress or silent
-    if not isinstance(new, Capture):
+    report, run = progress or silent, RunResult(out)
+    if isinstance(new, str | Path):
         new = read_capture(new, at_least=1)
-    new = require_decided(new)
-    run = RunResult(out)
-    _, capture, reconstruction = run.of_wrist_camera()
-    calibration = run.found
-    if not calibration.converged:
+    captures = {name_of(new): new} if isinstance(new, Capture) else new
+    if not captures:
+        raise InputError(f"{out}: no captures to verify it with; name one or more")
+    _, capture, _ = run.of_wrist_camera()
+    if not run.found.converged:
         raise InputError(
             f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
         )
-    taken_then, taken_now = _new_images(capture, capture, new, new)
-    report("find the old scene", 0.0)
-    found = register(reconstruction, [taken_then[row] for row in reconstruction.image_index], list(taken_now))
+    with locked(run.out):
+        digest = calibration_digest(run)
+        scene, history, row = old_scene(run.out, digest), read_history(run.out, digest), 0
+        for k, (name, one) in enumerate(captures.items()):
+            report("find the old scene", k / len(captures))
+            images = one if isinstance(one, NewImages) else new_images(one)
+            known = [verified.digest for verified in history.captures]
+            if images.digest not in known:
+                require_new(capture, scene.pixels, images)
+                history = with_capture(history, run, scene.located(name, images))
+                write_history(run.out, history)
+            row = known.index(images.digest) if images.digest in known else len(known)
     report("find the old scene", 1.0)
-    located, lost = dict[int, CameraPose](), list[str]()
-    for row, place in enumerate(found):
-        if isinstance(place, CameraPose):
-            located[row] = place
+    found, last = _judged(run, history, row, tolerance), list(captures.values())[-1]
+    fixed = [] if isinstance(last, NewImages) else _fixed_cameras(run, last, tolerance, progress)
+    return replace(found, others=tuple(fixed))
+
+
+def _judged(run: RunResult, history: History, index: int, tolerance: tuple[float, float]) -> Verification:
+    """Return the verification by one row of a history; changes above the tolerance (mm, degrees) have moved."""
+    row = history.captures[index]
+    x, z = run.found.gripper_from_camera, run.found.base_from_recon.rigid
+    moves, notes = list[Move](), list(row.notes)
+    transforms: dict[Cause, Transform] = {"camera": x, "scene": z, "robot": x}
+    for cause, transform in transforms.items():
+        own = [one for one in history.changes if one.cause == cause]
+        if not own:
+            continue
+        now = transform
+        for one in own:
+            now = retract(now, one.motion)
+        step = step_between(transform, now)
+        first = own[0].first
+        shown = None if cause == "robot" else step
+        move = Move((cause, *own[-1].rivals), first, history.captures[first].name, shown)
+        if cause == "robot" or _exceeds(step, tolerance):
+            moves.append(move)
         else:
-            lost.append(f"{new.images[row]} shares {place} points with the calibrated scene")
-    if not located:
-        raise RejectedError(
-            f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or calibrate images of "
-            "another one (jcr calibrate) and compare both runs (jcr compare)"
-        )
-    wrist = _in_old_scene(run, new, located, lost, tolerance)
-    return replace(wrist, others=tuple(_fixed_cameras(run, new, tolerance, progress)))
-
-
-def _new_images(
-    then: Capture | CellCamera, capture: Capture, now: Capture | CellCamera, new: Capture
-) -> tuple[list[UInt8[ndarray, "h w 3"]], list[UInt8[ndarray, "h w 3"]]]:
-    """Return the images of a camera's calibration, and its new images.
-
-    `then` is the camera in the capture `capture` of the calibration, `now` the same one in the capture `new`. Raises
-    InputError if the new images have another size, or if one of them was used for the calibration.
-    """
-    if now.image_size != then.image_size:
-        (width, height), (wide, high) = now.image_size, then.image_size
-        raise InputError(
-            f"{new.folder}: images of {width}x{height} pixels, the calibration is for {wide}x{high}; take them with the "
-            "same camera and resolution"
-        )
-    before, after = (
-        [read_image((one.folder or whole.folder) / name) for name in one.images]
-        for one, whole in ((then, capture), (now, new))
+            notes.append(f"{_in_words(move)}, which is significant and below the tolerance")
+    return Verification(
+        name=row.name,
+        offset=row.camera.step,
+        covariance=row.camera.covariance,
+        p_value=row.camera.p_value,
+        detectable=row.detectable,
+        moved=bool(moves),
+        images=row.images,
+        notes=(*notes, *_blindness(row.detectable)),
+        moves=tuple(sorted(moves, key=lambda one: one.first)),
+        history=history.captures,
     )
-    for name, image in zip(now.images, after, strict=True):
-        for old, other in zip(then.images, before, strict=True):
-            if np.array_equal(image, other):
-                raise InputError(
-                    f"{name}: equals {old}, an image of the calibration, and cannot test it; take a new image"
-                )
-    return before, after
 
 
-def _in_old_scene(
-    run: RunResult,
-    new: Capture,
-    located: Mapping[int, CameraPose],
-    notes: list[str],
-    tolerance: tuple[float, float],
-) -> Verification:
-    """Return the test for a moved wrist camera from new images with camera poses in the old reconstruction.
+def _exceeds(step: Float[ndarray, "6"], tolerance: tuple[float, float]) -> bool:
+    """Test whether translation or rotation of a step (m, rad) is larger than in `tolerance` (mm, degrees)."""
+    sizes = 1e3 * np.linalg.norm(step[:3]), np.degrees(np.linalg.norm(step[3:]))
+    return bool(sizes[0] > tolerance[0] or sizes[1] > tolerance[1])
 
-    `located` maps indices of images in `new` to these poses (recon frame); `notes` are warnings about new images without
-    one. The poses of the calibration are fitted again for their joint covariance, which calibration.json lacks.
-    """
-    _, capture, reconstruction = run.of_wrist_camera()
-    calibration = run.found
-    calibrate_options, rows = run.state.options.calibrate, list(located)
-    is_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
-    used = reconstruction.image_index[is_used]
-    robot = robot_errors(capture, calibrate_options, new)
-    old = capture.base_from_gripper[used], reconstruction.recon_from_camera[is_used]
-    similarity = calibration.base_from_recon
-    problem, state = pose_problem(
-        *old,
-        (calibration.gripper_from_camera, similarity.scale, similarity.rigid),
-        error_covariance=of_poses(robot.systematic, used),
-        noise_floor=calibrate_options.robot_noise_m_rad,
-    )
-    cameras = np.stack([one.a_from_camera for one in located.values()])
-    found = drift(
-        solve(problem, state, averaged=False),
-        old,
-        (new.base_from_gripper[rows], cameras, np.stack([one.covariance for one in located.values()])),
-        of_poses(robot.systematic, np.r_[used, len(capture) + np.array(rows)]),
-    )
-    if robot.unused is not None:
-        notes = [*notes, sentence(robot.unused)]
-    return _judged(found, tolerance, [new.images[row] for row in rows], notes)
+
+def _blindness(noticed: tuple[float, float]) -> list[str]:
+    """Return a warning if drifts that matter for grasping would not be noticed; `noticed` is what would be (m, rad)."""
+    mm, deg = 1e3 * noticed[0], float(np.degrees(noticed[1]))
+    if mm <= GRASPING[0] and deg <= GRASPING[1]:
+        return []
+    return [
+        f"drifts of less than {mm:.0f} mm or {deg:.1f}° would not be noticed; take more images, with the wrist rotated "
+        "and at other distances"
+    ]
 
 
 def _fixed_cameras(
@@ -205,7 +241,8 @@ def _fixed_cameras(
     hand_eye = calibrate_reconstruction(capture, reconstruction, calibrate_options)
     for camera in known_cameras:
         own = others[camera.name]
-        _new_images(own, capture, camera, new)
+        folder = own.folder or capture.folder
+        require_new(own, [read_image(folder / name) for name in own.images], new_images(new, camera))
         # Both poses are of the same camera, so that an error of its intrinsics cancels in their difference.
         intrinsics = placed[camera.name]
         known = {"intrinsics": intrinsics, "intrinsics_std": np.zeros(4 + len(intrinsics.distortion))}
@@ -220,46 +257,32 @@ def _fixed_cameras(
         before, after = (poses[one.name] for one in both)
         j = solution.derivative(after) - solution.derivative(before)
         offset = step_between(before(solution.state), after(solution.state))
-        found = _of_two(offset, j @ solution.covariance @ j.T)
         notes = [text for one in cell.cameras for text in one.warnings]
-        yield replace(_judged(found, tolerance, now.images, notes), fixed=own.name)
+        found = of_two_poses(offset, j @ solution.covariance @ j.T, tolerance, now.images, notes)
+        yield replace(found, name=own.name, fixed=own.name)
 
 
-def _of_two(offset: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"]) -> Drift:
-    """Return the drift of a camera from its old to its new pose, with a χ² test of the step between both.
+def of_two_poses(
+    offset: Float[ndarray, "6"],
+    covariance: Float[ndarray, "6 6"],
+    tolerance: tuple[float, float],
+    images: Sequence[str],
+    notes: Sequence[str],
+) -> Verification:
+    """Return the verification by the step of a camera from its old to its new pose; its χ² is tested at ALPHA.
 
     `offset` is that step (translation in m, then rotation vector in rad; axes of the gripper, or of the base for a fixed
-    camera), `covariance` its covariance.
+    camera), `covariance` its covariance. The camera moved if the step is significant and exceeds `tolerance` (mm,
+    degrees). `notes` are warnings to include, and `images` are the new images that were used.
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
-    noticed = detectable(covariance)
-    found = {"offset": offset, "covariance": covariance, "p_value": p_value, "detectable": noticed}
-    return Drift(**found, cause="camera", is_noisier=False)
-
-
-def _judged(
-    found: Drift, tolerance: tuple[float, float], images: Sequence[str], notes: Sequence[str]
-) -> Verification:
-    """Return the verification for a drift; the camera moved if the drift is significant and above the tolerance.
-
-    The drift is significant if its p-value is below ALPHA. The tolerance is exceeded if translation or rotation is
-    larger than in `tolerance` (mm, degrees). `notes` are warnings to include, and `images` are the new images that were
-    used.
-    """
-    notes = list(notes)
-    if found.is_noisier:
-        notes.append(
-            "the images disagree with one another; something else than the camera moved too, or the robot is less exact "
-            "than when it was calibrated"
-        )
-    unnoticed_mm, unnoticed_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
-    if unnoticed_mm > GRASPING[0] or unnoticed_deg > GRASPING[1]:
-        notes.append(
-            f"drifts of less than {unnoticed_mm:.0f} mm or {unnoticed_deg:.1f}° would not be noticed; take more images, "
-            "with the wrist rotated and at other distances"
-        )
-    millimetres = 1e3 * float(np.linalg.norm(found.offset[:3]))
-    degrees = float(np.degrees(np.linalg.norm(found.offset[3:])))
-    matters = millimetres > tolerance[0] or degrees > tolerance[1]
-    moved = found.p_value < ALPHA and matters
-    return Verification(**vars(found), moved=moved, images=tuple(images), notes=tuple(notes))
+    noticed = detectable(covariance, chi2.isf(ALPHA, 6))
+    return Verification(
+        offset=offset,
+        covariance=covariance,
+        p_value=p_value,
+        detectable=noticed,
+        moved=p_value < ALPHA and _exceeds(offset, tolerance),
+        images=tuple(images),
+        notes=(*notes, *_blindness(noticed)),
+    )

@@ -1,0 +1,183 @@
+"""Calibrated scene of a run: new images are located in it, and compared with it."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from jcr.calibration.drift import Located
+from jcr.camera import project
+from jcr.capture.folder import require_decided
+from jcr.capture.formats import bag
+from jcr.capture.formats.capture_json import origin
+from jcr.capture.images import read_image
+from jcr.errors import InputError, RejectedError
+from jcr.geometry import apply, inverse, motion_length
+from jcr.pipeline.stages import fingerprint
+from jcr.pipeline.watch import NewCapture
+from jcr.records import Capture, CellCamera
+from jcr.result import RunResult
+from jcr.sfm.register import KnownImages, Registration, features, registrations
+
+FOUND_PX = 2.0
+"""Largest distance (px) of a point of the scene from a feature at which the point counts as seen."""
+PLACE_M, LEAST_POINTS, CHANGED = 0.1, 20, 0.3
+"""Side (m) of the cubes in which the scene is compared, the fewest points of a cube, and the share of points left below
+which the scene has changed there. Views from other poses show half of the points of an unchanged scene."""
+MOST_PLACES = 3
+Image = UInt8[ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NewImages:
+    """New images of the wrist camera with the gripper poses at which they were taken."""
+
+    images: Sequence[str]
+    pixels: Sequence[Image]
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    joints: Float[ndarray, "n dof"] | None = None
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of images and poses, by which a capture is known again."""
+        return fingerprint(list(self.pixels), self.base_from_gripper)
+
+
+def calibration_digest(run: RunResult) -> str:
+    """Return a hash of the calibration of a run and the poses of its images."""
+    return fingerprint(run.found.gripper_from_camera, run.capture.base_from_gripper, run.capture.images)
+
+
+def new_images(new: Capture, camera: CellCamera | None = None) -> NewImages:
+    """Return the images of a new capture, or of one of its cameras; raise InputError if its poses are undecided."""
+    new = require_decided(new)
+    own = camera or new
+    return NewImages(
+        images=own.images,
+        pixels=[read_image((own.folder or new.folder) / image) for image in own.images],
+        base_from_gripper=new.base_from_gripper,
+        joints=new.joints,
+    )
+
+
+def name_of(capture: Capture) -> str:
+    """Return the name of a capture: that of its folder, or of the recording from which it was made."""
+    path = capture.source or origin(capture.folder)
+    return (path if path.is_dir() or path.suffix in bag.SUFFIXES else path.parent).absolute().name
+
+
+def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages) -> None:
+    """Raise InputError if new images have another size than those of the calibration, or if one of them is one of those.
+
+    `old` are the images of the camera `then` in the calibration.
+    """
+    for name, image in zip(new.images, new.pixels, strict=True):
+        if image.shape[1::-1] != then.image_size:
+            (height, width), (wide, high) = image.shape[:2], then.image_size
+            raise InputError(
+                f"{name}: has {width}x{height} pixels, the calibration is for {wide}x{high}; take them with "
+                "the same camera and resolution"
+            )
+        for before, other in zip(then.images, old, strict=True):
+            if np.array_equal(image, other):
+                raise InputError(
+                    f"{name}: equals {before}, an image of the calibration, and cannot test it; take a new image"
+                )
+
+
+@lru_cache(maxsize=2)
+def old_scene(out: Path, digest: str) -> "OldScene":
+    """Return the calibrated scene of a run; a process that verifies again need not look for its features again."""
+    return OldScene(RunResult(out))
+
+
+class OldScene:
+    """Calibrated scene of a run: its images with features, in which new images are located."""
+
+    def __init__(self, run: RunResult) -> None:
+        _, capture, reconstruction = run.of_wrist_camera()
+        self.capture, self.tracks, camera = capture, reconstruction.tracks, reconstruction.intrinsics
+        self.similarity = run.found.base_from_recon
+        self.pixels = [read_image(capture.folder / name) for name in capture.images]
+        old = [self.pixels[row] for row in reconstruction.image_index]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            found = tuple(threads.map(lambda image: features(image, camera), old))
+        self.known = KnownImages(camera, reconstruction.recon_from_camera, found)
+        self.seen = np.zeros((len(old), len(self.tracks.points_in_recon)), bool)
+        """Whether each image shows each point of the tracks."""
+        self.seen[self.tracks.image, self.tracks.point] = True
+
+    def located(self, name: str, new: NewImages) -> NewCapture:
+        """Return new images with their camera poses in the scene; raise RejectedError if none can be located."""
+        camera = self.known.camera
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            found = list(threads.map(lambda image: registrations(self.known, image, camera)[0], new.pixels))
+        rows = [row for row, (one, _) in enumerate(found) if one is not None]
+        lost = [
+            f"{image} shares {count} points with the calibrated scene"
+            for image, (one, count) in zip(new.images, found, strict=True)
+            if one is None
+        ]
+        if not rows:
+            raise RejectedError(
+                f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or calibrate images "
+                "of another one (jcr verify --new-scene)"
+            )
+        placed = [one for one, _ in found if one is not None]
+        left, places = self._left(placed)
+        if places:
+            at = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in places)
+            lost.append(
+                f"the scene has changed near {at} m (base frame); {100 * (left or 0):.0f} % of it is left"
+            )
+        located = Located(
+            base_from_gripper=tuple(new.base_from_gripper[rows]),
+            recon_from_camera=tuple(one.pose.a_from_camera for one in placed),
+            covariance=tuple(one.pose.covariance for one in placed),
+            joints=None if new.joints is None else tuple(new.joints[rows]),
+        )
+        images = tuple(new.images[row] for row in rows)
+        return NewCapture(
+            name=name,
+            digest=new.digest,
+            images=images,
+            notes=tuple(lost),
+            scene_left=left,
+            located=located,
+        )
+
+    def _left(self, placed: Sequence[Registration]) -> tuple[float | None, list[Float[ndarray, "3"]]]:
+        """Return the share of the scene that located images show unchanged, and where it has changed (m, base frame).
+
+        The points of an image are compared with those that the old image from the nearest view shows. The share is
+        None with too few points.
+        """
+        points, camera, old = self.tracks.points_in_recon, self.known.camera, self.known.recon_from_camera
+        expected, found = np.zeros(len(points)), np.zeros(len(points))
+        for one in placed:
+            pose = one.pose.a_from_camera
+            nearest = int(np.argmin(motion_length(inverse(old) @ pose)))
+            in_camera = apply(inverse(pose), points)
+            ahead = in_camera[:, 2] > 1e-6
+            x_px = project(camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
+            inside = ahead & ((x_px >= 0) & (x_px < [camera.width, camera.height])).all(1)
+            expected += inside & self.seen[nearest]
+            found += inside & (KDTree(one.x_px).query(x_px)[0] < FOUND_PX)
+        if expected.sum() < LEAST_POINTS:
+            return None, []
+        in_base = self.similarity(points)
+        cube, of_cube = np.unique(np.floor(in_base / PLACE_M), axis=0, return_inverse=True)
+        before, now = (np.bincount(of_cube.ravel(), part, len(cube)) for part in (expected, found))
+        changed = np.flatnonzero((before >= LEAST_POINTS) & (now < CHANGED * before))
+        largest = changed[np.argsort(-before[changed])][:MOST_PLACES]
+        middles = [np.average(in_base[own], axis=0, weights=expected[own])
+                   for own in (of_cube.ravel() == k for k in largest)]  # fmt: skip
+        # Texture that is new may hide no point; a place counts at most for what it showed.
+        return float(np.minimum(now, before).sum() / before.sum()), middles
