@@ -37,6 +37,7 @@ BENCHES = {
     "faults": (HONEST, "Faults"),
     "shuffled": (HONEST, "Effects of the order, in random orders"),
     "live": (HONEST, "Live calibration"),
+    "month": (HONEST, "A simulated month"),
     "spheres": (HONEST, "Spheres at a confidence"),
     "map": (MAPPED, "The map"),
     "speed": (TIME, "Speed"),

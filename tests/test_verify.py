@@ -12,7 +12,7 @@ from PIL import Image
 
 import jcr
 from conftest import shrunk_capture
-from jcr.calibration.drift import drift
+from jcr.calibration.drift import Located, Reference, check_series, step_of
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats import capture_json
@@ -22,10 +22,19 @@ from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.estimation.solve import solve
 from jcr.files import write_bytes
-from jcr.geometry import apply, inverse, retract, rotation_exp, scale_translation, transform
+from jcr.geometry import (
+    apply,
+    inverse,
+    retract,
+    rotation_exp,
+    rotation_log,
+    scale_translation,
+    step_between,
+    transform,
+)
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
-from jcr.pipeline.verify import TOLERANCE, _judged, _of_two
+from jcr.pipeline.verify import TOLERANCE, of_two_poses
 from jcr.records import Capture, RobotNoise, Uncertainty
 from jcr.result import RunOptions, RunResult
 from scenes import hand_eye_of, reconstruction_of, reference_of
@@ -60,65 +69,132 @@ def cameras(capture: Capture, x: np.ndarray) -> np.ndarray:
     return scale_translation(recon_from_base @ capture.base_from_gripper @ x, 1 / SCALE)
 
 
-def drifts(
-    capture: Capture, x: np.ndarray, seed: int, rows: list[int], noise=(0.5, 0.1), bump=None, nudge=None
-):
-    """The drift of images `rows` on poses alone: the robot pose noise and the cameras' drawn again."""
-    rng = np.random.default_rng(seed)
+def series(
+    capture: Capture, x: np.ndarray, seed: int, captures: list[list[int]], noise=(0.5, 0.1), **changed
+) -> tuple[Reference, list[Located], np.ndarray]:
+    """A calibration and later captures of images `captures` by poses alone, with drawn errors of robot and cameras.
+
+    `bump` and `nudge` move the camera and the table before capture `at`.
+    """
+    rng, at = np.random.default_rng(seed), changed.get("at", 0)
     camera_std = np.r_[np.full(3, 3e-4 / SCALE), np.full(3, 5e-4)]
-    places = cameras(capture, x)
-    for k in rows:
-        motion = camera_std * rng.normal(size=6)
-        places[k] = places[k] @ transform(rotation_exp(motion[3:]), motion[:3])
-    gripper = capture.base_from_gripper.copy()
-    if bump is not None:
-        gripper[rows] = gripper[rows] @ x @ inverse(x @ bump)
-    if nudge is not None:
-        gripper[rows] = nudge @ gripper[rows]
-    reported = with_robot_noise(gripper, *noise, rng)
+    places, gripper = cameras(capture, x), capture.base_from_gripper
     start = (
         x,
         SCALE,
         inverse(transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))),
     )
-    fit = solve(*pose_problem(reported[:OLD], places[:OLD], start))
-    spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
-    systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
-    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic)
+    old = with_robot_noise(gripper[:OLD], *noise, rng)
+    fit = solve(*pose_problem(old, places[:OLD], start)).state
+    poses = {"base_from_gripper": old, "recon_from_camera": places[:OLD]}
+    reference = Reference(x=fit.x[0], scale=fit.scale, z=fit.z[0], **poses)
+    later = list[Located]()
+    for k, rows in enumerate(captures):
+        there = gripper[rows]
+        if k >= at and "bump" in changed:
+            there = there @ x @ inverse(x @ changed["bump"])
+        if k >= at and "nudge" in changed:
+            there = changed["nudge"] @ there
+        motion = camera_std * rng.normal(size=(len(rows), 6))
+        located = places[rows] @ transform(rotation_exp(motion[:, 3:]), motion[:, :3])
+        spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
+        reported = with_robot_noise(there, *noise, rng)
+        later.append(
+            Located(
+                base_from_gripper=tuple(reported), recon_from_camera=tuple(located), covariance=tuple(spread)
+            )
+        )
+    every = np.concatenate([old, *(np.stack(one.base_from_gripper) for one in later)])
+    return reference, later, smooth_errors(every)
 
 
-def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):
-    # Of the seeds from 0 on two in 120 are below 1e-3 also by the noise that they were drawn with (9e-5 and 5e-4).
-    p = np.array([[drifts(capture, x, 7 * seed + k, rows).p_value for k, rows in enumerate(([9], [9, 10, 11]))]
-                  for seed in range(200, 220)])  # fmt: skip
-    # Binomial: 5 % of 40 is 2 ± 1.4, 50 % is 20 ± 3.2.
-    assert (p < 0.05).sum() <= 6
-    assert 11 <= (p < 0.5).sum() <= 29
+def test_p_values_of_one_capture_are_true(capture: Capture, x: np.ndarray):
+    p = []
+    for seed in range(200, 212):
+        for k, rows in enumerate(([9], [9, 10, 11])):
+            reference, (one,), systematic = series(capture, x, 7 * seed + k, [rows])
+            p.append(step_of(reference, one, systematic, "camera").p_value)
+    p = np.array(p)
+    # Binomial: 5 % of 24 is 1.2 ± 1.1, 50 % is 12 ± 2.4.
+    assert (p < 0.05).sum() <= 5
+    assert 5 <= (p < 0.5).sum() <= 19
     assert (p < 1e-3).sum() <= 1
 
 
 def test_what_is_called_detectable_is_detected_nine_times_in_ten(capture: Capture, x: np.ndarray):
-    shape = drifts(capture, x, 0, [9, 10]).covariance[:3, :3]
     found = []
-    for seed in range(20):
-        detectable = drifts(capture, x, seed, [9, 10]).detectable[0]
+    for seed in range(12):
+        reference, (one,), systematic = series(capture, x, seed, [[9, 10]])
+        detectable = check_series(reference, [one], systematic).detectable[0]
+        shape = step_of(reference, one, systematic, "camera").covariance[:3, :3]
         shift = detectable * np.linalg.eigh(shape)[1][:, -1]
         bump = transform(np.eye(3), x[:3, :3].T @ shift)
-        found.append(drifts(capture, x, seed, [9, 10], bump=bump).p_value < 1e-3)
-    # Binomial: 90 % of 20 is 18 ± 1.3.
-    assert sum(found) >= 14
+        test = check_series(*series(capture, x, seed, [[9, 10]], bump=bump))
+        found.append(bool(test.changes) or test.wrong_image is not None)
+    # Binomial: 90 % of 12 is 10.8 ± 1.0.
+    assert sum(found) >= 8
 
 
 def test_a_moved_table_is_distinguished_from_a_moved_camera(capture: Capture, x: np.ndarray):
     exact = (0.05, 0.01)
-    rows = [9, 10, 11]
-    assert drifts(capture, x, 0, rows, exact, nudge=NUDGE).cause == "scene"
-    assert drifts(capture, x, 0, rows, exact, bump=BUMP).cause == "camera"
-    assert drifts(capture, x, 0, [9], exact, nudge=NUDGE).cause == "either"
+    for rows in ([9, 10, 11], [9]):
+        (table,) = check_series(*series(capture, x, 0, [rows], exact, nudge=NUDGE)).changes
+        (camera,) = check_series(*series(capture, x, 0, [rows], exact, bump=BUMP)).changes
+        if len(rows) == 1:  # both fit a single image exactly
+            assert {"camera", "scene"} <= {table.cause, *table.rivals}
+            continue
+        assert (table.cause, table.rivals) == ("scene", ()) and (camera.cause, camera.rivals) == (
+            "camera",
+            (),
+        )
+        np.testing.assert_allclose(camera.motion, step_between(x, x @ BUMP), atol=5e-4)
+        turned, shift = rotation_log(NUDGE[:3, :3]), NUDGE[:3, 3]
+        np.testing.assert_allclose(table.motion[3:], turned, atol=5e-4)
+        assert np.linalg.norm(table.motion[:3] - shift) < 0.5 * np.linalg.norm(shift)
+
+
+def test_captures_together_find_a_bump_that_one_does_not_and_a_later_push_of_the_table(
+    capture: Capture, x: np.ndarray
+):
+    rows, bump = [9, 10, 11], transform(np.eye(3), np.array([1.2e-3, 0.0, 0.0]))
+    push = transform(np.eye(3), np.array([0.0, 0.01, 0.0]))
+    reference, later, _ = series(capture, x, 5, 9 * [rows], (0.2, 0.03), bump=bump, at=3)
+    for k in (7, 8):
+        moved = tuple(push @ pose for pose in later[k].base_from_gripper)
+        later[k] = later[k].model_copy(update={"base_from_gripper": moved})
+    systematic = smooth_errors(
+        np.concatenate([np.stack(one.base_from_gripper) for one in (reference, *later)])
+    )
+    changes, found = (), []
+    for n in range(1, len(later) + 1):
+        size = 6 * (OLD + len(rows) * n)
+        test = check_series(reference, later[:n], systematic[:size, :size], changes)
+        changes = test.changes
+        found.append([(one.cause, one.first) for one in changes])
+    assert found[:4] == 4 * [[]], "nothing moved, and then by less than one capture shows"
+    assert found[4] == [("camera", 3)]
+    assert found[8] == [("camera", 3), ("scene", 7)]
+    assert np.linalg.norm(changes[0].motion[:3]) == pytest.approx(1.2e-3, abs=4e-4)
+    assert changes[1].motion[1] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_one_wrong_pose_is_named_and_joints_set_to_zero_again_are_the_robots(capture: Capture, x: np.ndarray):
+    exact, rows = (0.05, 0.01), [9, 10, 11, 2, 5]
+    reference, later, systematic = series(capture, x, 1, [rows, rows], exact)
+    wrong = list(later[1].base_from_gripper)
+    wrong[3] = transform(rotation_exp(np.array([0.0, 0.01, 0.0])), np.zeros(3)) @ wrong[3]
+    replaced = later[1].model_copy(update={"base_from_gripper": tuple(wrong)})
+    assert check_series(reference, [later[0], replaced], systematic).wrong_image == 3
+    errors = np.linalg.cholesky(systematic + 1e-9 * np.eye(len(systematic)))[-30:]
+    strain = 0.004 * (errors @ np.random.default_rng(2).normal(size=len(systematic))).reshape(5, 6)
+    bent = tuple(retract(np.stack(later[1].base_from_gripper), strain))
+    replaced = later[1].model_copy(update={"base_from_gripper": bent})
+    test = check_series(reference, [later[0], replaced], systematic)
+    assert [(one.cause, one.first) for one in test.changes] == [("robot", 1)]
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, x: np.ndarray) -> Path:
+def calibrated(tmp_path_factory: pytest.TempPathFactory, capture: Capture, x: np.ndarray) -> Path:
     """The run folder of a calibration from the first nine images, with the noise of a good robot."""
     folder = tmp_path_factory.mktemp("run")
     content = json.loads((capture.folder / "capture.json").read_text())
@@ -135,6 +211,12 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, x: np.ndarra
     begin = begun(folder / "out", jcr.read_capture(old.folder), RunOptions())
     keep_reconstruction(begin, reconstruction)
     return folder / "out"
+
+
+@pytest.fixture
+def out(calibrated: Path, tmp_path: Path) -> Path:
+    """A copy of the run folder, because the history of verifications is in it."""
+    return Path(shutil.copytree(calibrated, tmp_path / "run"))
 
 
 def write_capture(folder: Path, capture: Capture, poses: np.ndarray, rows) -> Capture:
@@ -169,12 +251,14 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
     write_capture(tmp_path / "today", capture, poses, [10])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith("REJECTED: the camera or the scene has moved")
+    assert printed[0].startswith("REJECTED: the camera or the scene or the robot's reported poses has moved")
     assert printed[1].startswith("Remedy ") and "calibrate again" in printed[1]
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet", "--json"]) == 3
     printed = capsys.readouterr()
     found = json.loads(printed.out)
-    assert found["moved"] and found["p_value"] < 1e-3 and found["cause"] == "either"
+    assert (
+        found["moved"] and found["p_value"] < 1e-3 and {"camera", "scene"} <= set(found["moves"][0]["causes"])
+    )
     assert np.linalg.norm(found["drift_mm"]) == pytest.approx(3.0, abs=2.0)
     assert np.linalg.norm(found["drift_deg"]) == pytest.approx(1.0, abs=0.3)
     assert not printed.err
@@ -184,15 +268,14 @@ def test_images_of_another_scene_cannot_tell(out: Path, capture: Capture, tmp_pa
     today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10])
     Image.new("RGB", capture.image_size, (90, 90, 90)).save(today.folder / today.images[0], format="PNG")
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
-    assert "cannot tell" in (said := capsys.readouterr().err) and "jcr compare" in said
+    assert "cannot tell" in (said := capsys.readouterr().err) and "--new-scene" in said
     assert dispatch(["verify", str(out), str(tmp_path / "nothing"), "--quiet"]) == 2
     assert "no such capture" in capsys.readouterr().err
 
 
 def test_a_new_image_of_a_fixed_camera_shows_rotation(out: Path, capture: Capture, tmp_path: Path, capsys):
     """A rotation about the camera's own centre moves pixels by a homography, whatever the scene."""
-    run = tmp_path / "out"
-    shutil.copytree(out, run)
+    run = out
     intrinsics = capture.intrinsics
     assert intrinsics is not None
     content = json.loads((capture.folder / "capture.json").read_text())
@@ -223,13 +306,11 @@ def test_a_new_image_of_a_fixed_camera_shows_rotation(out: Path, capture: Captur
 @pytest.mark.parametrize(("std_mm", "is_blind"), [(0.5, False), (20.0, True)])
 def test_images_that_would_not_show_a_drift_that_matters_are_a_warning(std_mm: float, is_blind: bool):
     covariance = np.diag([*3 * [(1e-3 * std_mm) ** 2], *3 * [np.radians(0.05) ** 2]])
-    found = _of_two(np.zeros(6), covariance)
-    judged = _judged(found, TOLERANCE, ["0.png"], ())
+    judged = of_two_poses(np.zeros(6), covariance, TOLERANCE, ["0.png"], ())
     assert not judged.moved and judged.verdict == "accepted"
     assert any("would not be noticed" in note for note in judged.notes) is is_blind
     shift = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    found = _of_two(shift, covariance)
-    assert _judged(found, TOLERANCE, ["0.png"], ()).moved is not is_blind
+    assert of_two_poses(shift, covariance, TOLERANCE, ["0.png"], ()).moved is not is_blind
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,7 @@ from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
 from .pipeline.check import Examination as Examination
 from .pipeline.check import check_capture as check_capture
+from .pipeline.old_scene import NewImages as NewImages
 from .pipeline.run import add_camera as add_camera
 from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate
@@ -41,8 +42,10 @@ from .pipeline.run import measure as measure
 from .pipeline.run import run as run
 from .pipeline.touch import TouchTest as TouchTest
 from .pipeline.touch import touch as touch
+from .pipeline.verify import Move as Move
 from .pipeline.verify import Verification as Verification
 from .pipeline.verify import verify_run as verify_run
+from .pipeline.watch import Verified as Verified
 from .pointmaps.global_alignment.align import Alignment as Alignment
 from .pointmaps.global_alignment.align import global_align as global_align
 from .pointmaps.pairs import PairPredictions as PairPredictions

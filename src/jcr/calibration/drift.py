@@ -34,6 +34,8 @@ PRIOR_SIZES = 4.0 ** np.array([1, 2, 3, 5, 7, 9])
 """Prior variances of a change over that of its estimate, averaged: changes of 2 to 512 σ. The small ones
 matter for what is just found, the large ones for the cause of an obvious change; twice or half of all changes what is
 found by 3 %."""
+ROBOT_SIZES = TYPICAL[2] * np.array([0.3, 1.0, 3.0, 10.0])
+"""Sizes σ_s (rad) of a change of the robot's systematic errors: from typical ones of good arms to 1° in each joint."""
 CLEAR = 5.0
 """Difference of log evidence from which two causes are distinguished (150 to 1)."""
 POWER = 0.9
@@ -309,7 +311,6 @@ def _explained(data: _Data, sizes: Sequence[LogSizes], log_factors: Float[ndarra
     """
     model, last = _model(*data), len(data[1]) - 1
     evidence, made = dict[Cause, float](), dict[Cause, Change]()
-
     causes: tuple[Cause, ...] = ("camera", "scene")
     for cause, row in zip(causes, log_factors, strict=True):
         first = int(row.argmax())
@@ -319,10 +320,9 @@ def _explained(data: _Data, sizes: Sequence[LogSizes], log_factors: Float[ndarra
         made[cause] = Change(cause=cause, first=first, named=last, motion=motion)
     first = made[max(evidence, key=evidence.__getitem__)].first
     own = model.columns("robot") * (model.capture >= first)[:, None]
-    at = [
-        _Solved.of(model, one, own, size) for one in sizes for size in TYPICAL[2] * np.array([0.3, 1.0, 3.0])
-    ]
-    evidence["robot"], made["robot"] = _total(at) - np.log(3), Change(cause="robot", first=first, named=last)
+    at = [_Solved.of(model, one, own, size) for one in sizes for size in ROBOT_SIZES]
+    changed = Change(cause="robot", first=first, named=last)
+    evidence["robot"], made["robot"] = _total(at) - float(np.log(len(ROBOT_SIZES))), changed
     if len(each := _image_evidence(data, sizes)):
         evidence["image"] = float(logsumexp(each) - np.log(len(each)))
         made["image"] = Change(cause="image", first=int(each.argmax()), named=last)
@@ -443,7 +443,7 @@ def _model(
     model = _Model(equations, np.repeat(capture, 6), np.zeros((len(is_new), 0)), by_camera, by_scene)
     columns = [model.nuisance]
     for change in changes:
-        size = TYPICAL[2] if change.cause == "robot" else np.repeat(WEAK, 3)
+        size = ROBOT_SIZES[-1] if change.cause == "robot" else np.repeat(WEAK, 3)
         columns.append(model.columns(change.cause) * (model.capture >= change.first)[:, None] * size)
     return model._replace(nuisance=np.concatenate(columns, axis=1))
 
