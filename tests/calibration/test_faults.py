@@ -9,13 +9,15 @@ import pytest
 
 from benchmarks.faults import calibrated, outcome
 from jcr.calibration.adjust import adjusted
-from jcr.calibration.checks.effects import as_remark, check_effects, examined_case
+from jcr.calibration.checks.effects import _is_plausible, as_remark, check_effects, examined_case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
+from jcr.estimation import hypotheses
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import camera_effects
 from jcr.estimation.intrinsics_prior import ESTIMATED, MEASURED, camera_with_prior
+from jcr.estimation.problem import Effect
 from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
 from jcr.records import CameraEvidence
@@ -269,3 +271,33 @@ def test_a_tiny_difference_of_focal_lengths_is_a_remark(share: float, moved_m: f
     found = Finding.of(FindingKind.FOCUS_BY_IMAGE, "warns", "images", value=share, std=1e-5)
     moved = np.array([moved_m, 0, 0, 0, 0, 0])
     assert as_remark(found, moved, (640, 480)).severity == severity
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "std", "plausible"),
+    [
+        (FindingKind.ZOOM, 0.1, 0.01, True),
+        (FindingKind.ZOOM, 0.4, 0.01, False),
+        (FindingKind.ROLLING_SHUTTER, 0.05, 0.002, True),
+        (FindingKind.ROLLING_SHUTTER, 0.05, 0.06, False),
+        (FindingKind.THIN_PRISM, 0.5, 0.01, False),
+    ],
+)
+def test_optics_that_no_camera_has_are_no_explanation(
+    kind: FindingKind, size: float, std: float, plausible: bool
+):
+    """A fixed camera before a plain object was accepted with p2 of -1.5 and images sheared by 40 px."""
+    capture, reconstruction = reconstructed(faulty_capture(np.random.default_rng(3), 6, Faults()), False)
+    case = adjusted(
+        fitted_case(capture, reconstruction, CalibrateOptions(), errors_of(capture.base_from_gripper))
+    )
+    model = examined_case(case)
+    test = hypotheses.Test(
+        effect=Effect(kind=kind, columns=np.ones((4, 1))),
+        estimate=np.array([size]),
+        covariance=np.array([[std**2]]),
+        log_p=-50.0,
+        shift=np.zeros(7),
+        noise=case.numbers.robot_noise,
+    )
+    assert _is_plausible(test, model) is plausible

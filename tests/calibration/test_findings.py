@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jcr.calibration.checks.capture import check_remarks
 from jcr.calibration.hand_eye import solve_hand_eye
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction
+from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
 from jcr.calibration.verdict import appended, judged
 from jcr.calibration.words import summary
 from jcr.errors import InputError
@@ -169,3 +172,16 @@ def test_a_misspelt_field_of_a_finding_fails():
     sizes = {"value": 0.01, "rotatoin": 0.02, "longer": "before", "count": 6.0}
     with pytest.raises(TypeError, match="rotation_deg"):
         Finding.of(FindingKind.SLIP, "warns", "mount", "3.png", "4.png", **sizes)
+
+
+def test_images_that_are_left_out_lead_the_warnings_where_they_are_most():
+    """5 of 12 images are registered, and the first warning said how sharp they are."""
+    problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=(2e-4, 5e-4))
+    intrinsics = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+    made = reconstruction_of(problem.recon_from_camera[:5], intrinsics=intrinsics)
+    made = replace(made, warnings=("something else",))
+    capture = capture_of(problem.base_from_gripper)
+    case = fitted_case(capture, made, CalibrateOptions(), errors_of(problem.base_from_gripper[:5]))
+    first = check_remarks(case).calibration.findings[0]
+    assert first.kind is FindingKind.HALF_UNUSED and first.severity == "warns"
+    assert "only 5 of 12 images are used: 7 were not registered, 0 contradict the others" in text(first)

@@ -319,6 +319,10 @@ class FindingKind(StrEnum):
         "may be matched in the wrong places",
         "put different, textured objects on the table", explains=(*MISFIT, *TOO_FEW),
         means="regular tiles or patterns; rejects where the calibration is rejected")
+    HALF_UNUSED = "most images left out", KindRow("images",
+        "only {value:.0f} of {of:.0f} images are used: {lost:.0f} were not registered, {wrong:.0f} contradict the "
+        "others",
+        "look at the images that are left out, and at their poses; take more that overlap"),
     FEW_USED = "few images used", KindRow("reconstruction",
         "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
         "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",

@@ -83,12 +83,17 @@ def check_pieces(case: Case) -> Case:
 
 
 def check_remarks(case: Case) -> Case:
-    """Return the case with findings on an arm model that does not fit, and on the warnings of the back end.
+    """Return the case with findings on unused images, on an arm model that does not fit, and the back end's warnings.
 
     An arm model that the gripper poses do not fit is not used (`RobotErrorPrior.unused`).
     """
-    texts = case.reconstruction.warnings
-    warnings = (Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts)
+    texts, every, used = case.reconstruction.warnings, len(case.capture), len(case.used)
+    warnings = [Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts]
+    if used < every / 2:
+        registered = len(case.names)
+        counts = {"of": float(every), "lost": float(every - registered), "wrong": float(registered - used)}
+        kind = FindingKind.HALF_UNUSED
+        warnings.insert(0, Finding.of(kind, "warns", "images", value=float(used), **counts))
     return case.found(*filter(None, [case.robot.unused]), *warnings)
 
 

@@ -83,11 +83,18 @@ class Policy:
     alpha: float
     """Largest significant p-value, corrected for the number of tested places."""
     largest: tuple[float, float] = (np.inf, np.inf)
-    """Largest plausible estimate: (m, rad) of a motion, else the parameters' norm and no second limit."""
+    """Largest plausible estimate: (m, rad) of a motion, the norm of the parameters of another effect on the poses, or
+    the largest parameter of an effect on the camera, which must be known to half of this, too."""
     least_px: float = 0.0
     """Smallest reported size (px); smaller ones are remaining errors of the distortion model."""
 
 
+LARGEST_FOCUS, LARGEST_SHEAR, LARGEST_PRISM = 0.3, 0.1, 0.2
+"""Largest plausible change of a focal length (relative; a zoom of 1.3), shear of an image by its shutter (focal lengths;
+an image read in 30 ms by a camera 0.3 m away that moves by 1 m/s), and prism coefficient. Real lenses stay far below."""
+PLAUSIBLE = {"fx": 0.3, "fy": 0.3, "cx": 0.25, "cy": 0.25, "k1": 2.0, "k2": 5.0, "p1": 0.05, "p2": 0.05}
+"""Largest plausible difference of each intrinsic from the given or first one: focal lengths relative, principal point in
+image widths. Tangential distortions of real lenses are below 0.01."""
 OF_STRAIN = 1e-6
 """Significance level of effects of the arm: in 132 simulated captures of 8 to 20 images without such effects, 72 of
 them by arms with joint offsets up to 1° and link errors of 1 mm, no p-value is below 1e-5."""
@@ -99,12 +106,12 @@ POLICIES = {
     FindingKind.LENGTHS: Policy("robot", OF_STRAIN, (0.1, np.inf)),
     FindingKind.BASE_LEANS: Policy("robot", OF_STRAIN, (0.3, np.inf)),
     FindingKind.TOOL_SAGS: Policy("robot", OF_STRAIN, (0.3, np.inf)),
-    FindingKind.FOCUS_BY_DISTANCE: Policy("images", 1e-6),
-    FindingKind.FOCUS_BY_IMAGE: Policy("images", 1e-6),
-    FindingKind.ZOOM: Policy("images", 1e-6),
-    FindingKind.ROLLING_SHUTTER: Policy("images", 1e-6, least_px=3.0),
-    FindingKind.ROLLING_SHUTTER_BY_IMAGE: Policy("images", 1e-6, least_px=3.0),
-    FindingKind.THIN_PRISM: Policy("intrinsics", 1e-6, least_px=1.0),
+    FindingKind.FOCUS_BY_DISTANCE: Policy("images", 1e-6, (LARGEST_FOCUS, np.inf)),
+    FindingKind.FOCUS_BY_IMAGE: Policy("images", 1e-6, (LARGEST_FOCUS, np.inf)),
+    FindingKind.ZOOM: Policy("images", 1e-6, (LARGEST_FOCUS, np.inf)),
+    FindingKind.ROLLING_SHUTTER: Policy("images", 1e-6, (LARGEST_SHEAR, np.inf), least_px=3.0),
+    FindingKind.ROLLING_SHUTTER_BY_IMAGE: Policy("images", 1e-6, (LARGEST_SHEAR, np.inf), least_px=3.0),
+    FindingKind.THIN_PRISM: Policy("intrinsics", 1e-6, (LARGEST_PRISM, np.inf), least_px=1.0),
     FindingKind.INTRINSICS: Policy("intrinsics", 1e-6),
 }
 """Effects that are tested, by the kind of their finding."""
@@ -275,14 +282,32 @@ def _best(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> 
             if any((one @ focal) ** 2 > NEARLY_ALL * (one @ one) * (focal @ focal) for one in simple):
                 continue
         is_motion = test.effect.motion is not None
-        sizes = np.linalg.norm(test.estimate.reshape(1 + is_motion, -1), axis=1)
-        if (sizes > POLICIES[kind].largest).any() or not poses_agree(test.noise):
+        if not _is_plausible(test, model) or not poses_agree(test.noise):
             return None
         if is_motion and not explains_by_order(model.pose_scores, test.effect):
             continue
         if (found := finding_of(test, model)) is not None:
             return test, found
     return None
+
+
+def _is_plausible(test: Test, model: Examined) -> bool:
+    """Return whether the estimate of an effect is of a size that arms or lenses have, and determined within that size.
+
+    Few images, or images of a plain object, may fit any optics; such an effect is then no explanation.
+    """
+    effect, sizes = test.effect, np.abs(test.estimate)
+    if not effect.of_camera:
+        sizes = np.linalg.norm(test.estimate.reshape(1 + (effect.motion is not None), -1), axis=1)
+        return bool((sizes <= POLICIES[effect.kind].largest[: len(sizes)]).all())
+    std, most = np.sqrt(np.maximum(np.diag(test.covariance), 0.0)), np.array(POLICIES[effect.kind].largest[0])
+    if effect.kind is FindingKind.INTRINSICS:
+        most = np.array([PLAUSIBLE[name] for name in tested_intrinsics(model)])
+    elif effect.kind is FindingKind.FOCUS_BY_DISTANCE:
+        most = most / effect.unit
+    elif effect.kind not in OF_EACH:
+        return bool((sizes <= most).all() and (std <= most / 2).all())
+    return bool((sizes <= most).all() and np.median(std / most) <= 0.5)
 
 
 def _promising(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> list[Effect]:
