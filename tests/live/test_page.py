@@ -108,6 +108,12 @@ def test_the_page_advises_until_the_requirement_is_met(capture: tuple[LiveSessio
             assert ("verdict good" in head) is is_met
             assert ("Requirement met, press Finish" in head) is is_met
             assert ("Rotate the wrist by 20° or more" in head) is not is_met
+        # Nobody reads the gripper's pose here, so no button takes an image, and the next posted pose replaces one.
+        assert 'data-press="take"' not in head and 'data-press="retake"' in head
+        live.press("retake", 2)
+        shown = parts(page)["parts"]
+        assert "next image replaces images/001.png" in shown["head"] and len(live.folder.names) == 5
+        assert shown["images"].count("the next image replaces this one") == 1
 
 
 def test_the_server_serves_until_the_report_is_sent(capture: tuple[LiveSession, Scripted], tabletop: Path):

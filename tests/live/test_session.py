@@ -75,9 +75,14 @@ def test_a_capture_ends_by_itself_when_it_is_accurate(tmp_path: Path, tabletop: 
 
 def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop, has_gripper=False)
-    removed, undo = ("remove", 1), ("undo",)
-    heard = taken.run([0, 1, 2, ("retake", 2), 3, ("remove", 9), removed, undo, undo, removed, undo, undo])
-    assert ({"images": ["images/000.png", "images/002.png"]}, ["removed images/001.png"]) in heard
+    retake, removed, undo = ("retake", 2), ("remove", 1), ("undo",)
+    heard = taken.run([0, 1, 2, retake, undo, retake, 3, ("remove", 9), removed, undo, undo])
+    said = [line for _, lines in heard for line in lines]
+    # Nothing is removed before its replacement is there.
+    waits, kept = "the next image replaces images/001.png", "images/001.png is kept"
+    assert [line for line in said if "001" in line and line != "kept images/001.png"] == [
+        waits, kept, waits, "kept images/003.png in place of images/001.png",
+    ]  # fmt: skip
     assert any(answer.get("reason") == "there is no image 9" for answer, _ in heard)
     assert ({"images": ["images/002.png", "images/003.png"]}, ["removed images/000.png"]) in heard
     assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png", "images/002.png"]

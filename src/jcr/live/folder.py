@@ -91,10 +91,12 @@ class LiveFolder:
         time_s: float | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         color: Channels = "rgb",
+        replaces: str | None = None,
     ) -> str:
         """Check an image and its gripper pose, write both, and return the name of the image.
 
-        The arguments are those of `LiveCalibration.add`; `joints` are written only if all images have them. Raises
+        The arguments are those of `LiveCalibration.add`; `joints` are written only if all images have them. The image
+        named `replaces` is removed in the same step; None: none is. Raises
         InputError if the image or the pose does not fit the capture, and OSError if a file cannot be written. The
         capture is then unchanged.
         """
@@ -110,12 +112,13 @@ class LiveFolder:
         if self.size not in (None, size):
             remedy = "set its old resolution or name a new folder"
             raise other_size("the camera's image", size, self.size, f"those in {self.folder}", remedy)
-        self._refuse_repeated(summary, pose, number)
+        others = tuple(one for one in self.images if one.image != replaces)
+        self._refuse_repeated(summary, pose, number, others)
         entry = {"image": f"{IMAGES}/{stem}.png", "base_from_gripper": pose, "time_s": time_s}
         entry |= {"joints": None if joints is None else np.asarray(joints, np.float64).tolist()}
         entry |= {"depth": None if depth_mm is None else f"depth/{stem}.png"}
         new: FrameEntry = validated_content(FrameEntry, entry, number)
-        images = (*self.images, new)
+        images = (*others, new)
         if len({len(one.joints) for one in images if one.joints is not None}) > 1:
             raise InputError(f"joints of {new.image}: not as many angles as the other images have; give all")
         self._capture_of(images, size)
@@ -155,12 +158,14 @@ class LiveFolder:
         images = self.images
         return None if not images or self.size is None else self._capture_of(images, self.size)
 
-    def _refuse_repeated(self, new: ImageSummary, base_from_gripper: ndarray, number: str) -> None:
-        """Raise InputError if the image `new` is the same as an image of the folder, whether the gripper moved or not.
+    def _refuse_repeated(
+        self, new: ImageSummary, base_from_gripper: ndarray, number: str, others: tuple[FrameEntry, ...]
+    ) -> None:
+        """Raise InputError if the image `new` is the same as one of the `others`, whether the gripper moved or not.
 
         `base_from_gripper` (4,4) is the gripper pose (m) of the new image; `number` names the image in the message.
         """
-        for one in self.images:
+        for one in others:
             if not new.is_like(self.summary(one.image)):
                 continue
             metres, radians = largest_motion(np.stack([one.base_from_gripper, base_from_gripper]))

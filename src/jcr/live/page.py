@@ -55,6 +55,7 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
     kind, *lines = verdict_lines(state)
     headline, *below = (line[:1].upper() + line[1:] for line in lines)
     content = {"state": state, "has_report": has_report, "kind": kind, "headline": headline, "lines": below}
+    content["has_gripper"] = session.has_gripper
     content |= {"cards": _cards(state)[::-1], "tiles": _tiles(state, session.options.require)}
     return {
         "version": state.version,
@@ -78,6 +79,7 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
             against[one.images[0]] = sentence(one)
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
+    registered |= dict.fromkeys(filter(None, [state.replaces]), "the next image replaces this one")
     return [
         {"number": number, "name": name, "fault": against.get(name, ""), "state": registered.get(name, "new")}
         for number, name in enumerate(state.names, 1)

@@ -67,6 +67,8 @@ class SessionState:
     """Entries of the images in capture.json."""
     can_undo: bool = False
     """Whether a change can be undone."""
+    replaces: str | None = None
+    """Name of the image that the next one replaces; None: the next one is added."""
     progress: Progress = Progress(images=())
     """Last state of the calibration; the newest images may be missing in it."""
     is_over: bool = False
@@ -108,6 +110,8 @@ class LiveSession:
         """Lock that is held while an image is taken or a command is executed."""
         self._changed = threading.Condition()
         """Condition that is notified when `state` changes."""
+        self.has_gripper = gripper is not None
+        """Whether the session can read the pose of the gripper, so that a person can take an image."""
         self.state = SessionState(images=self.folder.images)
         self._calibrated: tuple[str, ...] | None = None
         self._error: Exception | None = None
@@ -167,16 +171,17 @@ class LiveSession:
         """Take an image while the arm rests at `state`, start to calibrate all images, and return an answer for JSON.
 
         `state` is written with the image: gripper pose and joint angles. The answer has "accepted", and "image" (name)
-        or "reason". `waits`: wait for the calibration, and add its state to the answer.
+        or "reason". An image that the new one replaces is removed with its addition. `waits`: wait for the calibration,
+        and add its state to the answer.
         """
         with self._lock:
             if self.state.is_over:
                 return {"accepted": False, "reason": "the capture has ended", "done": True}
+            old = self.state.replaces
             try:
                 frame = self._frame(state.base_from_gripper)
-                name = self.folder.add(
-                    frame.image, state.base_from_gripper, state.joints, frame.time_s, frame.depth_mm
-                )
+                data = state.joints, frame.time_s, frame.depth_mm
+                name = self.folder.add(frame.image, state.base_from_gripper, *data, replaces=old)
             except (InputError, OSError) as error:
                 why = str(error)
                 if isinstance(error, OSError):
@@ -187,7 +192,8 @@ class LiveSession:
                 self._follow()
                 is_over = len(self.folder.names) >= self._most
                 answer = {"accepted": True, "image": name, "done": self.state.is_over or is_over}
-                self._say(f"kept {name}", answer, is_over=is_over)
+                event = f"kept {name}" if old is None else f"kept {name} in place of {old}"
+                self._say(event, answer, is_over=is_over, replaces=None)
             following = self._following
         if not waits:
             return answer
@@ -206,26 +212,41 @@ class LiveSession:
                 return
             if action == "finish":
                 self._show(is_over=True)
-            elif action == "undo" and not self.folder.undo():
-                self._refuse("refused: nothing to undo")
+            elif action == "undo":
+                self._undo()
             elif action in ("retake", "remove") and not 1 <= number <= len(names):
                 self._refuse(f"refused: there is no image {number}")
+            elif action == "remove":
+                name = names[number - 1]
+                self.folder.remove(name)
+                kept = None if self.state.replaces == name else self.state.replaces
+                self._say(f"removed {name}", {"images": self.folder.names}, replaces=kept)
+                self._follow()
             else:
-                if action in ("retake", "remove"):
-                    self.folder.remove(names[number - 1])
-                if (left := self.folder.names) != names:
-                    event = (
-                        f"undone: {len(left)} images" if action == "undo" else f"removed {names[number - 1]}"
-                    )
-                    self._say(event, {"images": left})
-                    self._follow()
-                if action in ("take", "retake") and self._gripper is None:
+                if action == "retake":
+                    name = names[number - 1]
+                    self._say(f"the next image replaces {name}", {"replaces": name}, replaces=name)
+                if self._gripper is not None:
+                    self._take_now(self._gripper)
+                elif action == "take":
                     self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
-                elif action in ("take", "retake") and self._gripper is not None:
-                    try:
-                        self.take(self._gripper())
-                    except InputError as error:
-                        self._refuse(f"refused: {error}")
+
+    def _take_now(self, gripper: Callable[[], RobotState]) -> None:
+        """Take an image where the gripper is now; refuse if its pose cannot be read."""
+        try:
+            self.take(gripper())
+        except InputError as error:
+            self._refuse(f"refused: {error}")
+
+    def _undo(self) -> None:
+        """Undo the last change: a replacement that waits for its image, else the last addition or removal."""
+        if (waiting := self.state.replaces) is not None:
+            self._say(f"{waiting} is kept", {"replaces": None}, replaces=None)
+        elif self.folder.undo():
+            self._say(f"undone: {len(self.folder.names)} images", {"images": self.folder.names})
+            self._follow()
+        else:
+            self._refuse("refused: nothing to undo")
 
     def finish(self) -> "RunResult | None":
         """Calibrate all images and return the result; None with fewer than three images, or if it failed."""
@@ -240,7 +261,7 @@ class LiveSession:
 
     def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
         """Return a frame taken while the gripper rests at this pose (4,4); raise InputError if none can be kept."""
-        images = self.folder.images
+        images = [one for one in self.folder.images if one.image != self.state.replaces]
         for one in images:
             if not is_farther(one.base_from_gripper, base_from_gripper, SAME_PLACE):
                 raise InputError(f"the gripper is where {one.image} was taken; move to another pose")
@@ -316,13 +337,14 @@ class LiveSession:
         """
         with self._changed:
             changes["is_over"] = self.state.is_over or changes.get("is_over", False)
+            waiting = changes.get("replaces", self.state.replaces)
             self.state = replace(
                 self.state,
                 version=self.state.version + 1,
                 event=event,
                 is_refusal=is_refusal,
                 images=self.folder.images,
-                can_undo=self.folder.can_undo,
+                can_undo=self.folder.can_undo or waiting is not None,
                 **changes,
             )
             self._changed.notify_all()
