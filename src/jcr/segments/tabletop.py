@@ -42,6 +42,8 @@ FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 with fewer points hold only stray points."""
 PATCH = 0.02
 """Side (m) of a patch of the table that counts as flat even if the table is bent."""
+REACH = 10.0
+"""Largest distance (m) of an object from the middle of all along an axis; no arm reaches as far. It bounds the memory."""
 FEWEST_MEASURED = 1000
 """Smallest number of measured points for which the fit of the support plane ignores filled-in points."""
 
@@ -98,6 +100,7 @@ def label_tabletop(
     over = (height > founding) & (height < options.object_highest)
     object_of = np.zeros(len(height), int)
     if over.any():
+        over &= (np.abs(x_in_support[:, :2] - np.median(x_in_support[over, :2], axis=0)) < REACH).all(1)
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
         # Two empty cells on every side; points farther out are counted in the outermost one.
         low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
