@@ -43,7 +43,7 @@ with fewer points hold only stray points."""
 PATCH = 0.02
 """Side (m) of a patch of the table that counts as flat even if the table is bent."""
 REACH = 10.0
-"""Largest distance (m) of an object from the middle of all along an axis; no arm reaches as far. It bounds the memory."""
+"""Largest distance (m) of an object from the middle of all along an axis; no arm reaches as far. It bounds memory."""
 FEWEST_MEASURED = 1000
 """Smallest number of measured points for which the fit of the support plane ignores filled-in points."""
 
