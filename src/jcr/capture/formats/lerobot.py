@@ -30,6 +30,11 @@ INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
 """Key of the gripper pose in DROID: x, y, z (m), roll, pitch, yaw (rad) in the robot's base frame."""
 STATE = "observation.state"
+USUAL_BYTES, PACKED = 200_000_000, 20
+"""Size in memory up to which columns are read from any file, and the largest ratio to the size of their file above it:
+images hardly pack, and a file of LeRobot has 100 MB. Zeros pack to a thousandth."""
+MOST_FRAMES = 500_000
+"""Largest number of frames of an episode: five hours at 30 Hz."""
 LATEST_S = 9e9
 """Largest time stamp (s), about that of the largest int64 in ns (9.2e9); time since 1970 is 1.8e9."""
 
@@ -133,9 +138,9 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
         of_video = [f"videos/{camera}/{n}" for n in ("chunk_index", "file_index", "from_timestamp")]
         columns = ["data/chunk_index", "data/file_index", *(of_video if has_video else [])]
         listed = _read_table(path / "meta" / "episodes", columns, index)
-        if not listed["data/chunk_index"]:
+        if not len(listed):
             raise InputError(f"{path}: no episode {index} in meta/episodes; they are counted from 0")
-        chunk, number, *video = (listed[name][0] for name in columns)
+        chunk, number, *video = (listed[name][0].as_py() for name in columns)
         fields = {"chunk_index": chunk, "file_index": number}
         if video:
             video_fields = {"chunk_index": video[0], "file_index": video[1]}
@@ -146,6 +151,11 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
     if not table.is_file():
         raise InputError(f"{table}: not there, so there is no episode {index}; they are counted from 0")
     rows = _read_table(table, ["frame_index", "timestamp", key], index)
+    if len(rows) > MOST_FRAMES:
+        raise InputError(
+            f"{table}: {len(rows):,} frames in episode {index}; {MOST_FRAMES:,} at most, choose another"
+        )
+    rows = rows.to_pydict()
     time_s = _seconds(rows["timestamp"], f"{table}: timestamp of episode {index}")
     try:
         state, frame = np.array(rows[key], np.float64), np.array(rows["frame_index"])
@@ -173,19 +183,34 @@ def _seconds(values: Sequence[Any], where: str) -> Float[ndarray, " n"]:
     return np.array(values, np.float64)
 
 
-def _read_table(
-    path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None
-) -> dict[str, list]:
-    """Read columns of one episode from a Parquet table: a list of values for each name in `columns`.
+def _read_table(path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None) -> Any:
+    """Read columns of one episode from Parquet, a file or a folder of files, as a table of pyarrow.
 
-    `rows` are the frame indices to read; None: all frames of the episode.
+    `rows` are the frame indices to read; None: all frames of the episode. Raises InputError for damaged files, and for
+    those that unpack to far more than their size.
     """
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
     if rows is not None:
         filters.append(("frame_index", "in", rows))
     try:
-        return parquet.read_table(path, columns=columns, filters=filters, partitioning=None).to_pydict()
+        for file in path.rglob("*.parquet") if path.is_dir() else [path]:
+            about = parquet.read_metadata(file)
+            every = (
+                about.row_group(k).column(j) for k, j in np.ndindex(about.num_row_groups, about.num_columns)
+            )
+            read = [
+                one
+                for one in every
+                if any(f"{one.path_in_schema}.".startswith(f"{name}.") for name in columns)
+            ]
+            size = sum(max(one.total_uncompressed_size, 8 * one.num_values) for one in read)
+            if size > max(USUAL_BYTES, PACKED * file.stat().st_size):
+                raise ValueError(f"it unpacks to {size / 1e9:.1f} GB")
+        images = [f"{name}.bytes" for name in columns]  # equal ones are kept once
+        return parquet.read_table(
+            path, columns=columns, filters=filters, partitioning=None, read_dictionary=images
+        )
     except Exception as error:  # Arrow's own errors have no common base
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable table of the set ({reason}); download it again") from None
@@ -215,9 +240,9 @@ def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) ->
         return
     numbers = episode.frame[rows].tolist()
     found = _read_table(episode.table, ["frame_index", key], episode.index, numbers)
-    images = dict(zip(found["frame_index"], found[key], strict=True))
+    place = {number: k for k, number in enumerate(found["frame_index"].to_pylist())}
     for row, number in zip(rows.tolist(), numbers, strict=True):
-        cell = images.get(number)
+        cell = found[key][place[number]].as_py() if number in place else None
         file = cell.get("bytes") if isinstance(cell, dict) else None
         if not file or not isinstance(file, bytes):
             what = f"holds no {key} of frame {number}; write the data set with embedded images"
