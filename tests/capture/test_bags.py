@@ -186,6 +186,10 @@ def test_the_best_frames_are_still_sharp_and_spread():
     assert len({tuple(pose.ravel()) for pose in poses[rows]}) == 12
     assert "5 moments of the recording are blurred" in notes[0]
     assert len(asked) == 1 and (speed[asked[0]] < 0.005).all()
+    # Twelve stops suffice where fifteen frames are wanted.
+    some = (poses[:120], speed[:120], np.ones(120, bool), lambda rows: np.ones(len(rows)), 15)
+    rows, notes = best_frames(*some)
+    assert len(rows) == 12 and (speed[rows] < 0.005).all() and not notes
     # Only where the arm never stops are moving frames taken, and said to be.
     rows, notes = best_frames(poses, speed + 0.05, np.ones(400, bool), lambda rows: sharp[rows], 8)
     assert len(rows) == 8 and "stands still at 0 different views where 8" in notes[-1]

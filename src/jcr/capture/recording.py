@@ -26,6 +26,9 @@ STILL = 0.005
 by a tenth of a pixel in 20 ms."""
 LOOKS = 5
 """Number of frames of one stop whose sharpness is compared."""
+ENOUGH = 8
+"""Number of different views at rest that suffice: a frame in motion is blurred, and its pose less exact. With eight
+images a wrong one is recognised."""
 SAME_VIEW = 0.005
 """Smallest distance (m) between two views, as by motion_length; the sharpest of closer frames is kept."""
 UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
@@ -81,10 +84,11 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     worst = gap_ns[gap_ns < NEVER].max(initial=0) / 1e6
     stale = f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit} (gaps up to {worst:.0f} ms): "
 
-    faults = dict[int, str]()
+    faults, looked = dict[int, str](), 0
 
     def sharpness_of(rows: Rows) -> Float[ndarray, " k"]:
-        values = []
+        nonlocal looked
+        values, looked = [], looked + len(rows)
         for k, (row, image, _) in enumerate(recording.images_of_rows(rows)):
             try:
                 values.append(sharpness(_pixels_of(image, f"{recording.source}: {recording.names[row]}")))
@@ -92,8 +96,6 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
                 faults[row] = str(error)
                 values.append(UNREADABLE)
             report("frames", 0.1 + 0.7 * k / len(rows))
-        if len(faults) == len(values) > 0:
-            raise InputError(f"{faults[min(faults)]} (none of {len(values)} images can be read)")
         if len(values) < len(rows):
             raise InputError(
                 f"{recording.source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its "
@@ -102,7 +104,12 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         return np.array(values)
 
     poses = recording.base_from_gripper
-    rows, remarks = best_frames(poses, recording.speed, fresh, sharpness_of, options.frames)
+    try:
+        rows, remarks = best_frames(poses, recording.speed, fresh, sharpness_of, options.frames)
+    except InputError:
+        if len(faults) < max(looked, 1):
+            raise
+        raise InputError(f"{faults[min(faults)]} (none of {looked} images can be read)") from None
     images = list[str]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         images.append(f"images/{recording.names[row]}{ending}")
@@ -146,31 +153,42 @@ def best_frames(
 
     The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
     as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows,
-    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame;
-    the slowest frames between stops are added if necessary. Raises InputError if fewer than three frames are left.
+    which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame.
+    With fewer than ENOUGH different views at rest, the slowest frames between stops are added. Raises InputError if
+    fewer than three frames are left.
     """
     steps = np.asarray(motion_length(inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]))
     # A camera that is triggered at the stops has no frames between them: the arm's moves part the stops, too.
     moved = np.append(steps > SAME_VIEW, False)
     still = _runs(usable & (speed < STILL), moved)
     moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]
-    if len(moments) < count:  # add the slowest frame of each of about 4 · count equal pieces of the motion
+    sharp, left_out = np.full(len(speed), np.nan), 0
+
+    def different_views() -> Rows:
+        """Return the sharpest frame of each moment, without blurred ones and those near a sharper one."""
+        nonlocal left_out
+        rows = np.unique(np.concatenate([*moments, np.zeros(0, int)]))
+        rows = rows[np.isnan(sharp[rows])]
+        sharp[rows] = sharpness_of(rows)
+        sharpest = np.array([moment[sharp[moment].argmax()] for moment in moments], dtype=int)
+        sharpest = sharpest[sharp[sharpest] > UNREADABLE]
+        least = BLURRED * np.median(sharp[sharpest]) if len(sharpest) else 0.0
+        clear = sharpest[sharp[sharpest] >= least]
+        left_out, views = len(sharpest) - len(clear), clear[:0]
+        for row in clear[np.argsort(-sharp[clear], kind="stable")]:
+            motion = inverse(base_from_gripper[views]) @ base_from_gripper[row]
+            if (np.asarray(motion_length(motion)) > SAME_VIEW).all():
+                views = np.append(views, row)
+        return views
+
+    views = different_views() if moments else np.zeros(0, int)
+    if len(views) < min(count, ENOUGH):
+        # Add the slowest frame of each of about 4 · count equal pieces of the motion.
         moving = _runs(usable & (speed >= STILL))
         piece = max(sum(map(len, moving)) // (4 * count), 1)
         parts = [part for run in moving for part in np.array_split(run, max(len(run) // piece, 1))]
         moments += [part[[speed[part].argmin()]] for part in parts]
-    rows = np.unique(np.concatenate([*moments, np.zeros(0, int)]))
-    sharp = np.zeros(len(speed))
-    sharp[rows] = sharpness_of(rows)
-    sharpest = np.array([moment[sharp[moment].argmax()] for moment in moments], dtype=int)
-    sharpest = sharpest[sharp[sharpest] > UNREADABLE]
-    least = BLURRED * np.median(sharp[sharpest]) if len(sharpest) else 0.0
-    clear = sharpest[sharp[sharpest] >= least]
-    views = clear[:0]
-    for row in clear[np.argsort(-sharp[clear], kind="stable")]:  # skip views near a sharper one
-        motion = inverse(base_from_gripper[views]) @ base_from_gripper[row]
-        if (np.asarray(motion_length(motion)) > SAME_VIEW).all():
-            views = np.append(views, row)
+        views = different_views()
     if len(views) < MIN_FRAMES:
         raise InputError(
             f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
@@ -183,8 +201,8 @@ def best_frames(
         chosen = _most_informative(gain, known, count - len(frames))
         frames, known = np.append(frames, views[of_kind][chosen]), known + gain.sum(0)
     notes = []
-    if len(clear) < len(sharpest):
-        notes.append(f"{len(sharpest) - len(clear)} moments of the recording are blurred and were left out")
+    if left_out:
+        notes.append(f"{left_out} moments of the recording are blurred and were left out")
     at_rest = int((speed[views] < STILL).sum())
     if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
         notes.append(
