@@ -73,7 +73,8 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
     assert "\nWARNING     with 4 images" in printed.out and not printed.err
     rejected = ROOT / "tests" / "calibrations" / "rejected.json"
     shutil.copy(rejected, tmp_path / "out" / "calibration.json")
-    assert dispatch(["export", str(tmp_path / "out"), "urdf", "--force", "--quiet"]) == 0
+    export = ["export", str(tmp_path / "out"), "urdf", "--parent-frame", "tool0", "--force", "--quiet"]
+    assert dispatch(export) == 0
     printed = capsys.readouterr()
     assert printed.err.startswith("warning: the calibration is rejected") and printed.err.count("\n") == 1
 

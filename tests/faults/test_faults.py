@@ -50,7 +50,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def place(tmp_path: Path, sound: Path, small_done: Path) -> Path:
     """A folder with copies of a capture and a finished run."""
     shutil.copytree(sound, tmp_path / "capture")
-    shutil.copytree(small_done, tmp_path / "done", ignore=shutil.ignore_patterns("*.npz", "*.ply", "*.html"))
+    large = shutil.ignore_patterns("reconstruction.npz", "depth.npz", "*.ply", "*.html")
+    shutil.copytree(small_done, tmp_path / "done", ignore=large)
     return tmp_path
 
 
