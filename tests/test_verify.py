@@ -16,6 +16,7 @@ from jcr.calibration.drift import Located, Reference, check_series, step_of
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats import capture_json
+from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.estimation.problem import pose_problem
@@ -32,6 +33,7 @@ from jcr.geometry import (
     step_between,
     transform,
 )
+from jcr.pipeline import recalibrate as recalibrating
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
 from jcr.pipeline.verify import TOLERANCE, of_two_poses
@@ -264,6 +266,38 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
     assert not printed.err
 
 
+def test_a_start_check_in_python_counts_an_image_once(out: Path, capture: Capture):
+    rng = np.random.default_rng(2)
+    poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, rng)
+    files, run = [capture.folder / name for name in capture.images], jcr.load_run(out)
+    first = run.verify([files[10]], poses[[10]], name="start")
+    assert not first.moved and len(first.history) == 1
+    # One image more of the same check takes its place; the same images again change nothing.
+    images = [read_image(file) for file in files[10:12]]
+    both = run.verify(images, poses[10:12], name="start")
+    assert len(both.history) == 1 and len(both.images) == 2
+    assert both.detectable[0] < first.detectable[0]
+    again = run.verify(files[10:12], poses[10:12])
+    assert [row.name for row in again.history] == ["start"]
+    run.verify([files[9]], poses[[9]], name="next")
+    with pytest.raises(InputError, match="verified before"):
+        run.verify(files[9:11], poses[9:11])
+    with pytest.raises(InputError, match="n images"):
+        run.verify(files[9:11], poses[[9]])
+
+
+def test_the_poses_that_tell_most_are_those_of_the_run(done: Path, capsys):
+    assert dispatch(["verify", str(done), "--check-poses", "--json"]) == 0
+    poses = json.loads(capsys.readouterr().out)["poses"]
+    assert len(poses) == 5 and len({one["image"] for one in poses}) == 5
+    old = jcr.load_run(done).capture
+    for one in poses:
+        pose = old.base_from_gripper[old.images.index(one["image"])]
+        np.testing.assert_allclose(one["base_from_gripper"], pose)
+    found = [one["detectable_mm"] for one in poses]
+    assert found == sorted(found, reverse=True) and found[-1] < 0.8 * found[0]
+
+
 def test_images_of_another_scene_cannot_tell(out: Path, capture: Capture, tmp_path: Path, capsys):
     today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10])
     Image.new("RGB", capture.image_size, (90, 90, 90)).save(today.folder / today.images[0], format="PNG")
@@ -301,6 +335,56 @@ def test_a_new_image_of_a_fixed_camera_shows_rotation(out: Path, capture: Captur
         found = json.loads(capsys.readouterr().out)["cameras"]["overhead"]
         assert (status, found["moved"]) == ((3, True) if deg else (0, False))
         assert np.linalg.norm(found["drift_deg"]) == pytest.approx(deg, abs=0.06)
+
+
+def test_a_run_is_calibrated_again_with_old_images_unless_the_camera_moved(
+    out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = list[Capture]()
+
+    def calibrate(one: Capture, folder: Path, options: RunOptions, progress: object) -> RunResult:
+        made.append(one)
+        return begun(folder, one, options)
+
+    monkeypatch.setattr(recalibrating, "calibrate", calibrate)
+    rng = np.random.default_rng(4)
+    still = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, rng)
+    bumped = with_robot_noise(capture.base_from_gripper @ x @ inverse(x @ BUMP), 0.2, 0.03, rng)
+    old = jcr.load_run(out).capture
+    taken = {"monday": write_capture(tmp_path / "monday", capture, still, [9, 10])}
+    found = jcr.verify_run(out, taken)
+    result = recalibrating.recalibrate(out, taken, tmp_path / "second", found)
+    assert len(made[0]) == len(old) + 2 and made[0].intrinsics == old.intrinsics
+    np.testing.assert_allclose(made[0].base_from_gripper[-2:], still[[9, 10]], atol=1e-9)
+    np.testing.assert_array_equal(
+        read_image(made[0].folder / made[0].images[0]), read_image(old.folder / old.images[0])
+    )
+    assert (result.state.version, result.state.predecessor) == (2, str(out.resolve()))
+    # What is written to the folder later keeps the version.
+    assert begun(tmp_path / "second", made[0], RunOptions()).state.version == 2
+    taken["tuesday"] = write_capture(tmp_path / "tuesday", capture, bumped, [11])
+    found = jcr.verify_run(out, taken)
+    assert [move.since for move in found.moves] == ["tuesday"]
+    recalibrating.recalibrate(out, taken, tmp_path / "third", found)
+    assert len(made[1]) == 1
+    with pytest.raises(InputError, match="holds a run"):
+        recalibrating.recalibrate(out, taken, tmp_path / "third", found)
+
+
+def test_a_calibration_of_another_scene_is_compared(
+    out: Path, capture: Capture, x: np.ndarray, monkeypatch: pytest.MonkeyPatch
+):
+    before = jcr.load_run(out).found
+    offset = np.array([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for step, moved in ((0.0, False), (1.0, True)):
+        now = replace(before, on_gripper=retract(before.gripper_from_camera, step * offset))
+        monkeypatch.setattr(
+            recalibrating, "calibrate", lambda *_, now=now, **__: RunResult("new", calibration=now)
+        )
+        found = recalibrating.verify_by_new_scene(out, "other", capture)
+        assert found.moved is moved and found.offset[0] == pytest.approx(step * 3e-3, abs=1e-9)
+        assert ("the camera has moved by 3.00 mm" in found.finding) is moved
+        np.testing.assert_allclose(found.covariance, 2 * before.covariance[:6, :6])
 
 
 @pytest.mark.parametrize(("std_mm", "is_blind"), [(0.5, False), (20.0, True)])

@@ -3,6 +3,8 @@
 A file of the run folder may be invalid, because the user has edited it; reading then raises InputError.
 """
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -39,6 +41,9 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from jcr.pipeline.verify import Verification
     from jcr.scene.scene_map import SceneMap
     from jcr.segments.measure import Measurement
 
@@ -72,6 +77,10 @@ class RunState(BaseModel):
     capture: Annotated[str, Field(max_length=4096, pattern=r"^[^\x00]+$")]
     """Folder of the capture."""
     options: RunOptions
+    version: Annotated[int, Field(ge=1)] = 1
+    """Number of this calibration of the camera: 1, and one more with each `jcr verify --recalibrate`."""
+    predecessor: str | None = None
+    """Run folder of the version before; None for the first one."""
     attempts: tuple[Attempt, ...] = ()
     """Attempts with different back ends, from which the reconstruction was selected."""
     made: dict[str, str] = {}
@@ -210,6 +219,26 @@ class RunResult:
         """Standard deviation of the scale (metres per recon unit) divided by the scale; 0 if it is unknown."""
         uncertainty = self.calibration.uncertainty
         return 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100
+
+    def verify(
+        self,
+        images: "Sequence[ArrayLike | Path | str]",
+        base_from_gripper: "ArrayLike",
+        *,
+        joints: "ArrayLike | None" = None,
+        name: str | None = None,
+        **options: Any,
+    ) -> "Verification":
+        """Test with new images of the calibrated scene whether the camera has moved since, as `jcr verify` does.
+
+        `images` are n RGB images (h,w,3) uint8 or their files, `base_from_gripper` (n,4,4) their gripper poses, `joints`
+        (n,dof) the joint angles (rad), if known. `name` is the capture's name in the history; None: the time. `options`
+        are further arguments of `verify_run`, which states the errors, too.
+        """
+        import jcr  # the test is a stage above this module
+
+        new = jcr.NewImages.of(images, base_from_gripper, joints)
+        return jcr.verify_run(self.out, {name or time.strftime("%Y-%m-%d %H:%M:%S"): new}, **options)
 
     def of_wrist_camera(self) -> tuple[Calibration | PublishedCalibration, Capture, Reconstruction]:
         """Return calibration, capture and reconstruction of a run with a camera on the gripper.

@@ -344,6 +344,26 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
     assert np.allclose(taken[1].base_from_gripper[:3, :3], np.diag([-1, 1, -1]))
 
 
+def test_a_run_is_verified_when_a_program_asks(serving: Callable[..., Any]):
+    outcomes: list[Any] = [
+        {"moved": True, "drift_mm": np.arange(3.0)},
+        jcr.RejectedError("cannot tell: no images"),
+    ]
+
+    def verify() -> dict[str, Any]:
+        if isinstance(outcome := outcomes.pop(0), Exception):
+            raise outcome
+        return outcome
+
+    with serving() as (server, _):
+        assert posted(server, "", "/verify")[0] == 409
+    with serving(verify=verify) as (server, taken):
+        assert posted(server, "", "/verify", Authorization="Bearer wrong")[0] == 403
+        assert posted(server, "", "/verify") == (200, {"moved": True, "drift_mm": [0.0, 1.0, 2.0]})
+        assert posted(server, "{}", "/verify") == (422, {"reason": "cannot tell: no images"})
+        assert not taken
+
+
 def test_samples_of_a_watched_arm_are_refused(tmp_path: Path, tabletop: Path):
     image = read_image(tabletop / "images" / "00.jpg")
     capture, _ = a_capture(tmp_path / "c", still_frames(lambda: image))

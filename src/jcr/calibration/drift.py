@@ -24,7 +24,7 @@ from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, log_root_determinant, lower
 from jcr.estimation.pose_equations import pose_residuals, weak_prior
 from jcr.estimation.problem import ROTATION, TRANSLATION, UNKNOWNS, columns_of_arm
-from jcr.estimation.robot_noise import REACH, TYPICAL, Equations, LogSizes, most_likely
+from jcr.estimation.robot_noise import REACH, TYPICAL, Equations, LogSizes, most_likely, of_poses
 from jcr.geometry import Poses, Transform, retract, skew
 from jcr.records.json_fields import Covariance6, Matrix, Numbers, Part, Spread
 
@@ -50,6 +50,8 @@ WEAK = (0.1, 0.3)
 BEFORE, COARSE = 4, 0.05
 """Number of captures before the newest from which error sizes are estimated, and the last step (log) of their estimate:
 the grid is coarser."""
+EQUAL = np.repeat([1e-3, np.radians(0.1)], 3)
+"""Steps (m, rad) of equal weight in the choice of poses: at 0.5 m they move a point equally far."""
 MOST_OLD = 30
 """Largest number of images of the calibration that are used; their errors are then a small part of a new image's."""
 SETTLED, ITERATIONS = 1e-6, 10
@@ -215,6 +217,43 @@ def step_of(
     best = at[int(share.argmax())]
     p_value = float(share @ [chi2.sf(one.squared, 6) for one in at])
     return Step(step=motion, covariance=np.linalg.inv(best.information), p_value=p_value)
+
+
+def most_telling(
+    reference: Reference, candidates: Located, systematic: Float[ndarray, "s s"], count: int
+) -> list[tuple[int, tuple[float, float]]]:
+    """Return the `count` poses at which new images would tell most about the camera, best first.
+
+    Each is an index of `candidates` with the `detectable` change (m, rad) of the camera by the images up to this one. A
+    greedy search reduces the variance of the camera's step, for a scene that may have moved too. `systematic` is the
+    covariance of systematic errors at the poses of the calibration, then of the candidates.
+    """
+    old, chosen, found = (
+        len(reference.base_from_gripper),
+        list[int](),
+        list[tuple[int, tuple[float, float]]](),
+    )
+    sizes, scene = None, np.diag(np.r_[np.zeros(6), np.repeat(WEAK, 3) ** -2.0])
+
+    def solved(rows: list[int]) -> _Solved:
+        nonlocal sizes
+        taken = {name: part and tuple(part[row] for row in rows) for name, part in vars(candidates).items()}
+        own = of_poses(systematic, np.r_[:old, old + np.array(rows)])
+        model = _model(reference, [Located(**taken)], own, ())
+        sizes = sizes or _sizes(model)
+        columns = np.concatenate([model.by_camera, model.by_scene], axis=1)
+        return _Solved.of(model, sizes[len(sizes) // 2], columns)  # the mode is the middle of the grid
+
+    def variance(rows: list[int]) -> float:
+        covariance = np.linalg.inv(solved(rows).information + scene)[:6, :6]
+        return float((np.diag(covariance) / EQUAL**2).sum())
+
+    while len(chosen) < min(count, len(candidates)):
+        left = [row for row in range(len(candidates)) if row not in chosen]
+        chosen.append(min(left, key=lambda row: variance([*chosen, row])))
+        information = solved(chosen).information[:6, :6]
+        found.append((chosen[-1], detectable(np.linalg.inv(information))))
+    return found
 
 
 @cache

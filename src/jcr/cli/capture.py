@@ -2,7 +2,7 @@
 
 import os
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from jcr.result import RunResult
 
 
+VERIFIED = 5
+"""Default number of images that verify a run; more add little (jcr verify --check-poses)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureCommand:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
@@ -37,6 +41,7 @@ class CaptureCommand:
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
       jcr capture captures/table --camera 2 --camera-size 1920 1080 --poses xarm:192.168.1.203
       jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses http --page-port 7464
+      jcr capture captures/today --camera 0 --poses ur:192.168.0.2 --verify out/table
     """
 
     out: tyro.conf.Positional[Path]
@@ -56,13 +61,17 @@ class CaptureCommand:
     intrinsics_from: Path | None = None
     """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
     (RealSense), otherwise estimated."""
+    verify: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Verify this run with the images (default: 5) instead of calibrating them: at the end, and at each POST /verify."""
     session: SessionOptions = field(default_factory=SessionOptions)
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
         """Take images until the user ends or `--until-accurate` is met, and calibrate with all."""
+        from jcr.cli.check import verification_lines
         from jcr.live.calibration import LiveCalibration
         from jcr.live.server import LiveServer
+        from jcr.pipeline.verify import verify_run
 
         options, out, states = self.session, self.out, states_of(self.poses)
         if options.until_accurate and options.require == "none":
@@ -70,7 +79,9 @@ class CaptureCommand:
         given = None if self.intrinsics_from is None else read_intrinsics(self.intrinsics_from)
         if states is None and self.poses != "http":
             raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST or http")
-        answers: list[Answer] = []
+        answers, run = list[Answer](), self.verify
+        if run is not None:
+            options = replace(options, images=options.images or VERIFIED)
 
         def tell(answer: Answer, lines: list[str]) -> None:
             """Print the lines of an answer, and keep the answer for --json."""
@@ -84,7 +95,8 @@ class CaptureCommand:
             session = LiveSession(calibration, camera, options, tell, gripper)
             token = os.environ.get("JCR_TOKEN") or None
             try:
-                with LiveServer(session, self.page_port, token, self.poses == "http") as server:
+                check = None if run is None else lambda: verify_run(run, out).as_json()
+                with LiveServer(session, self.page_port, token, self.poses == "http", check) as server:
                     _print(
                         f"{len(calibration.live.names)} images in {out}; open {server.address} in a browser"
                     )
@@ -95,10 +107,14 @@ class CaptureCommand:
                         where = self.poses.partition(":")[2]
                         _print(f"move the arm; an image is taken whenever it rests ({where})")
                         session.run(lambda: session.watch(states))
-                    result = session.finish()
+                    result = session.finish(calibrates=run is None)
             finally:
                 calibration.close()
         facts = {"capture": str(out), "images": calibration.live.names, "answers": answers}
+        if run is not None:
+            found = verify_run(run, out)
+            self.output.result(verification_lines(found, False), facts | {"verification": found.as_json()})
+            return 3 if found.moved else 0
         return _conclude(self, facts, result, calibration.progress.requirement_met)
 
 

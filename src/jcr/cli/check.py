@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from jcr.pipeline.verify import Verification
     from jcr.pipeline.watch import Verified
 
+MOST_POSES = 5
+"""Number of poses that `jcr verify --check-poses` prints; more images than that add little."""
 UNLIKELY = 1e-3
 """p-value below which the reported errors do not explain a difference."""
 
@@ -256,6 +258,9 @@ class VerifyCommand:
       jcr verify out/table captures/this-morning
       jcr verify out/table captures/november --tolerance 1 0.1 --json
       jcr verify out/table droid/ --episode 40 80 120
+      jcr verify out/table --check-poses
+      jcr verify out/table captures/other-table --new-scene
+      jcr verify out/table captures/november --recalibrate out/table-2
     """
 
     out: Annotated[Path, tyro.conf.Positional]
@@ -265,6 +270,13 @@ class VerifyCommand:
     read: ReadOptions = field(default_factory=ReadOptions)
     tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = TOLERANCE
     """Changes smaller than both raise no alarm, however significant."""
+    new_scene: bool = False
+    """The images show another scene: calibrate the capture by itself (8 images or more) and compare it with the run."""
+    recalibrate: Annotated[Path | None, tyro.conf.arg(metavar="NEW_OUT")] = None
+    """Calibrate again into this run folder: old and new images together if nothing has moved, else those since then. The
+    exit status is that of the new calibration."""
+    check_poses: bool = False
+    """Print the gripper poses of the run at which new images tell most, and what they would find; verify nothing."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -272,24 +284,72 @@ class VerifyCommand:
 
         The status is 3 if a camera has moved, else 0.
         """
+        from jcr.calibration.words import summary
+        from jcr.pipeline.recalibrate import recalibrate
         from jcr.pipeline.verify import verify_run
         from jcr.pipeline.watch_page import write_page
 
+        if self.check_poses:
+            return self._print_poses()
         if not self.captures:
-            raise InputError("verify: no captures; name one or more with new images of the scene")
+            raise InputError(
+                "verify: no captures; name one or more with new images of the scene, or --check-poses"
+            )
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
             captures = read_captures(self.captures, self.read, Path(scratch), progress)
+            if self.new_scene:
+                return self._print_new_scene(captures, progress)
             found = verify_run(self.out, captures, self.tolerance, progress)
-        page = write_page(self.out, found, self.tolerance)
-        cameras = (found, *found.others)
-        drifts = [_drift(one, self.output.verbose) for one in cameras]
-        (lines, facts), *others = drifts
-        rows = found.history[-len(captures) :]
-        lines += [line for more, _ in others for line in more]
-        lines += [*(_series(rows) if len(rows) > 1 else ()), *labelled("Page", str(page))]
-        facts |= {"cameras": {one.fixed: other for one, (_, other) in zip(found.others, others, strict=True)}}
-        self.output.result(lines, facts | {"history": [_row_facts(row) for row in found.history]})
-        return 3 if any(one.moved for one in cameras) else 0
+            lines, facts = verification_lines(found, self.output.verbose), found.as_json()
+            rows = found.history[-len(captures) :]
+            page = write_page(self.out, found, self.tolerance)
+            lines += [*(_series(rows) if len(rows) > 1 else ()), *labelled("Page", str(page))]
+            status = 3 if found.moved or any(one.moved for one in found.others) else 0
+            if self.recalibrate is not None:
+                result = recalibrate(self.out, captures, self.recalibrate, found, progress)
+                facts |= {
+                    "run": str(result.out),
+                    "verdict_of_run": result.verdict,
+                    "version": result.state.version,
+                }
+                lines += [*labelled("New run", f"{result.out}, version {result.state.version}"), ""]
+                lines += summary(result.calibration).splitlines()
+                status = 0 if result.verdict == "accepted" else 3
+        self.output.result(lines, facts)
+        return status
+
+    def _print_new_scene(self, captures: dict[str, Capture], progress: Progress) -> int:
+        """Print the comparison of the run with a calibration of another scene; return the exit status."""
+        from jcr.pipeline.recalibrate import verify_by_new_scene
+
+        if len(captures) > 1 or self.recalibrate is not None:
+            raise InputError("--new-scene: takes one capture, and nothing is calibrated again with it")
+        ((name, capture),) = captures.items()
+        found = verify_by_new_scene(self.out, name, capture, self.tolerance, progress)
+        self.output.result(verification_lines(found, self.output.verbose), found.as_json())
+        return 3 if found.moved else 0
+
+    def _print_poses(self) -> int:
+        """Print the gripper poses of the run at which new images would tell most; return the exit status 0."""
+        from scipy.spatial.transform import Rotation
+
+        from jcr.pipeline.watch import telling_poses
+        from jcr.result import load_run
+
+        run, lines, facts = load_run(self.out), list[str](), list[dict[str, object]]()
+        capture = run.capture
+        for row, (metres, radians) in telling_poses(run, MOST_POSES):
+            pose, image = capture.base_from_gripper[row], capture.images[row]
+            quat_xyzw = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+            mm, deg = 1e3 * metres, float(np.degrees(radians))
+            lines.append(f"{image:<20} {numbers([*pose[:3, 3], *quat_xyzw], 4)}   {mm:.2f} mm {deg:.3f}°")
+            joints = None if capture.joints is None else capture.joints[row]
+            lines += [] if joints is None else [f"{'':<20} joints (rad) {numbers(joints, 4)}"]
+            facts.append({"image": image, "base_from_gripper": pose, "joints": joints})
+            facts[-1] |= {"detectable_mm": mm, "detectable_deg": deg}
+        head = "go to these poses (m, quaternion xyzw); so many images find 9 of 10 bumps of the camera from"
+        self.output.result([head, *lines], {"poses": facts})
+        return 0
 
 
 def read_captures(
@@ -315,46 +375,26 @@ def read_captures(
     return captures
 
 
-def _drift(found: "Verification", verbose: bool) -> tuple[list[str], dict[str, Any]]:
-    """Return the result of `jcr verify` for one camera: the lines to print, and the content of --json.
-
-    The lines are verdict, remedy, motion with its standard deviation, images and warnings.
-    """
+def verification_lines(found: "Verification", verbose: bool) -> list[str]:
+    """Return the lines of `jcr verify`: verdict, remedy, drift with its σ, images and warnings of each camera."""
     std = np.sqrt(np.diag(found.covariance))
     mm, mm_std = (1e3 * part[:3] for part in (found.offset, std))
     deg, deg_std = (np.degrees(part[3:]) for part in (found.offset, std))
-    seen_mm, seen_deg = 1e3 * found.detectable[0], float(np.degrees(found.detectable[1]))
     drift = f"{np.linalg.norm(mm):.2f} mm, {np.linalg.norm(deg):.3f}° from the calibration"
     moved = f"{numbers(mm, 2)} ± {numbers(mm_std, 2)} mm, {numbers(deg, 3)} ± {numbers(deg_std, 3)}°"
     verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
     if warnings and not found.moved:
         verdict += f" with {warnings} warning{'s' * (warnings > 1)}"
-    noticed = f"9 of 10 changes of {seen_mm:.1f} mm or {seen_deg:.2f}° are found"
+    noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
     lines = [
         f"{verdict}: {found.finding}" + ("" if found.moves else f", {drift}"),
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
-        *labelled("Images", f"{len(found.images)}; {noticed}"),
+        *labelled("Images", f"{len(found.images)}; 9 of 10 changes of {noticed} are found"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
-    same = {
-        name: getattr(found, name) for name in ("verdict", "moved", "cause", "p_value", "images", "notes")
-    }
-    moves = [{"causes": one.causes, "since": one.since} for one in found.moves]
-    drifts = {"drift_mm": mm, "drift_deg": deg, "drift_std_mm": mm_std, "drift_std_deg": deg_std}
-    return lines, same | {"moves": moves} | drifts | {"detectable_mm": seen_mm, "detectable_deg": seen_deg}
-
-
-def _row_facts(row: "Verified") -> dict[str, Any]:
-    """Return the content of --json for one capture of the history."""
-    facts: dict[str, Any] = {"capture": row.name, "images": row.images, "notes": row.notes}
-    for name, one in (("camera", row.camera), ("scene", row.scene)):
-        std = np.sqrt(np.diag(one.covariance))
-        facts[name] = {"mm": 1e3 * one.step[:3], "deg": np.degrees(one.step[3:])}
-        facts[name] |= {"std_mm": 1e3 * std[:3], "std_deg": np.degrees(std[3:]), "p": one.p_value}
-    facts["detectable"] = {"mm": 1e3 * row.detectable[0], "deg": float(np.degrees(row.detectable[1]))}
-    return facts | {"odds": row.odds, "scene_left": row.scene_left}
+    return [*lines, *(line for one in found.others for line in verification_lines(one, verbose))]
 
 
 def _series(rows: Sequence["Verified"]) -> list[str]:

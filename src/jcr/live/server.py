@@ -12,6 +12,7 @@ import secrets
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -23,7 +24,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.errors import InputError
+from jcr.errors import InputError, RejectedError
 from jcr.live.page import camera_image, image_card, page_parts, whole_page
 from jcr.live.robot import Action, RobotState, pose_of_numbers
 from jcr.live.session import LiveSession
@@ -70,16 +71,18 @@ class LiveServer(ThreadingHTTPServer):
         port: int = 0,
         token: str | None = None,
         takes_samples: bool = False,
+        verify: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
         """Bind a port of the loopback address; raise InputError if that fails.
 
         `token` is the key that the addresses of all requests contain; None: a random key. `port` 0: any free port.
-        `takes_samples`: other programs may post gripper poses, at which images are then taken.
+        `takes_samples`: other programs may post gripper poses, at which images are then taken. `verify` verifies a run
+        with the images taken so far, and returns the answer to `POST /verify`; None: no run is verified.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError("JCR_TOKEN: has characters that no address has; use letters, digits, - and _")
         self.session, self.key = session, token or secrets.token_urlsafe(16)
-        self.takes_samples = takes_samples
+        self.takes_samples, self.verify = takes_samples, verify
         self.page_version, self.page_s = -1, -np.inf
         """Version of the state that the page shows, and time (s, monotonic clock) of the page's last request."""
         try:
@@ -159,8 +162,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Execute a command of the page, or take an image at the gripper pose of a posted sample."""
-        if self.path == "/sample":
-            self._send_json(*self._sampled())
+        if self.path in ("/sample", "/verify"):
+            if (refused := self._refused()) is not None:
+                answer, status = {"accepted": False, "reason": refused}, 403
+            else:
+                answer, status = self._sampled() if self.path == "/sample" else self._verified()
+            self._send_json(answer, status)
         elif (path := self._path()) is not None:
             is_json = self.headers.get("Content-Type", "") == "application/json"
             is_own, command = is_json and self._is_own_origin(), None
@@ -172,15 +179,30 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 self._send(status=400 if is_own else 403)
 
+    def _refused(self) -> str | None:
+        """Return the reason why a request of a program is refused; None if its key, host and origin are right."""
+        key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
+        if self.headers.get("Host") not in self.server.hosts or not self._is_key(key):
+            return "no or a wrong key; send the header Authorization: Bearer KEY"
+        if "Origin" in self.headers and not self._is_own_origin():
+            return "a request from another web site"
+        return None
+
+    def _verified(self) -> tuple[dict[str, Any], int]:
+        """Verify the run with the images taken so far; return the answer and the HTTP status."""
+        if self._body(MAX_COMMAND) is None:
+            return {"reason": f"no Content-Length, or more than {MAX_COMMAND} bytes"}, 400
+        if self.server.verify is None:
+            return {"reason": "no run is verified; start the capture with --verify OUT"}, 409
+        try:
+            return self.server.verify(), 200
+        except (InputError, RejectedError) as error:
+            return {"reason": str(error)}, 422
+
     def _sampled(self) -> tuple[dict[str, Any], int]:
         """Take an image at the gripper pose in the request's body; return the answer and the HTTP status."""
         server, why, status = self.server, None, 400
-        key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
-        if self.headers.get("Host") not in server.hosts or not self._is_key(key):
-            why, status = "no or a wrong key; send the header Authorization: Bearer KEY", 403
-        elif "Origin" in self.headers and not self._is_own_origin():
-            why, status = "a sample from another web site", 403
-        elif not server.takes_samples:
+        if not server.takes_samples:
             why, status = "the poses of this capture come from elsewhere (--poses)", 409
         elif (body := self._body(MAX_SAMPLE)) is None:
             why = f"no Content-Length, or more than {MAX_SAMPLE} bytes"
@@ -228,7 +250,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_json(self, content: dict[str, Any], status: int = 200) -> None:
         """Send a response with JSON content."""
-        self._send(json.dumps(content).encode() + b"\n", "application/json", status)
+        text = json.dumps(content, default=lambda array: array.tolist())
+        self._send(text.encode() + b"\n", "application/json", status)
 
     def _send(self, body: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> None:
         """Send a response with MIME type `kind`, HTTP `status`, and the security headers HEADERS.

@@ -248,9 +248,9 @@ class LiveSession:
         else:
             self._refuse("refused: nothing to undo")
 
-    def finish(self) -> "RunResult | None":
-        """Calibrate all images and return the result; None with fewer than three images, or if it failed."""
-        if self.state.result is None and len(self.folder.names) >= LEAST_IMAGES:
+    def finish(self, calibrates: bool = True) -> "RunResult | None":
+        """Calibrate all images, if `calibrates`, and return the result; None with fewer than three, or if it failed."""
+        if calibrates and self.state.result is None and len(self.folder.names) >= LEAST_IMAGES:
             self._show(f"calibrating all {len(self.folder.names)} images", is_over=True)
             try:
                 self._show(result=self.calibration.finish())

@@ -1,5 +1,6 @@
 """Calibrated scene of a run: new images are located in it, and compared with it."""
 
+import json
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jcr.calibration.drift import Located
@@ -19,12 +21,13 @@ from jcr.capture.formats import bag
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
-from jcr.geometry import apply, inverse, motion_length
+from jcr.geometry import apply, inverse, motion_length, require_rigid
 from jcr.pipeline.stages import fingerprint
 from jcr.pipeline.watch import NewCapture
 from jcr.records import Capture, CellCamera
+from jcr.records.npz import read_npz, write_npz
 from jcr.result import RunResult
-from jcr.sfm.register import KnownImages, Registration, features, registrations
+from jcr.sfm.register import ImageFeatures, KnownImages, Registration, features, registrations
 
 FOUND_PX = 2.0
 """Largest distance (px) of a point of the scene from a feature at which the point counts as seen."""
@@ -32,6 +35,8 @@ PLACE_M, LEAST_POINTS, CHANGED = 0.1, 20, 0.3
 """Side (m) of the cubes in which the scene is compared, the fewest points of a cube, and the share of points left below
 which the scene has changed there. Views from other poses show half of the points of an unchanged scene."""
 MOST_PLACES = 3
+FEATURES, FORMAT = "features.npz", "jcr.features/1"
+"""File of the features of the calibration's images, which a verification finds once; half of its time otherwise."""
 Image = UInt8[ndarray, "h w 3"]
 
 
@@ -44,10 +49,43 @@ class NewImages:
     base_from_gripper: Float[ndarray, "n 4 4"]
     joints: Float[ndarray, "n dof"] | None = None
 
+    @staticmethod
+    def of(
+        images: Sequence[ArrayLike | Path | str],
+        base_from_gripper: ArrayLike,
+        joints: ArrayLike | None = None,
+    ) -> "NewImages":
+        """Return n RGB images (h,w,3) uint8 or image files with their gripper poses (n,4,4) and joint angles (n,dof).
+
+        Raises InputError unless there is an image for each rigid pose.
+        """
+        pixels = [read_image(Path(one)) if isinstance(one, str | Path) else np.asarray(one) for one in images]
+        names = [
+            Path(one).name if isinstance(one, str | Path) else f"image {k}" for k, one in enumerate(images)
+        ]
+        for name, image in zip(names, pixels, strict=True):
+            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+                raise InputError(
+                    f"{name}: {image.dtype} of shape {image.shape}; give RGB, (h, w, 3) of uint8"
+                )
+        poses = np.asarray(base_from_gripper, np.float64)
+        angles = None if joints is None else np.asarray(joints, np.float64)
+        if (
+            not pixels
+            or poses.shape != (len(pixels), 4, 4)
+            or (angles is not None and len(angles) != len(pixels))
+        ):
+            raise InputError(
+                f"{len(pixels)} images with poses of shape {poses.shape}; give (n, 4, 4) for n images"
+            )
+        for name, pose in zip(names, poses, strict=True):
+            require_rigid(pose, f"base_from_gripper of {name}")
+        return NewImages(images=names, pixels=pixels, base_from_gripper=poses, joints=angles)
+
     @cached_property
-    def digest(self) -> str:
-        """Hash of images and poses, by which a capture is known again."""
-        return fingerprint(list(self.pixels), self.base_from_gripper)
+    def digests(self) -> tuple[str, ...]:
+        """Hash of each image with its pose, by which it is known again."""
+        return tuple(fingerprint(*one) for one in zip(self.pixels, self.base_from_gripper, strict=True))
 
 
 def calibration_digest(run: RunResult) -> str:
@@ -95,20 +133,42 @@ def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages
 @lru_cache(maxsize=2)
 def old_scene(out: Path, digest: str) -> "OldScene":
     """Return the calibrated scene of a run; a process that verifies again need not look for its features again."""
-    return OldScene(RunResult(out))
+    return OldScene(RunResult(out), digest)
+
+
+def _kept_features(file: Path, digest: str, count: int) -> tuple[ImageFeatures, ...] | None:
+    """Return the features of the `count` images of a calibration from a file of its run folder; None if it has none."""
+    if not file.is_file():
+        return None
+    with read_npz(file, FORMAT) as (about, arrays):
+        if json.loads(about)["digest"] != digest:
+            return None
+        return tuple(
+            ImageFeatures(
+                arrays[f"x_px{k}"], arrays[f"rays{k}"], arrays[f"descriptors{k}"].astype(np.float32)
+            )
+            for k in range(count)
+        )
 
 
 class OldScene:
     """Calibrated scene of a run: its images with features, in which new images are located."""
 
-    def __init__(self, run: RunResult) -> None:
+    def __init__(self, run: RunResult, digest: str) -> None:
         _, capture, reconstruction = run.of_wrist_camera()
         self.capture, self.tracks, camera = capture, reconstruction.tracks, reconstruction.intrinsics
         self.similarity = run.found.base_from_recon
         self.pixels = [read_image(capture.folder / name) for name in capture.images]
         old = [self.pixels[row] for row in reconstruction.image_index]
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            found = tuple(threads.map(lambda image: features(image, camera), old))
+        found = _kept_features(run.out / FEATURES, digest, len(old))
+        if found is None:
+            with ThreadPoolExecutor(os.cpu_count()) as threads:
+                found = tuple(threads.map(lambda image: features(image, camera), old))
+            parts = {f"{name}{k}": part for k, one in enumerate(found) for name, part in vars(one).items()}
+            halves = {
+                name: part.astype(np.float16) if "desc" in name else part for name, part in parts.items()
+            }
+            write_npz(run.out / FEATURES, {"format": FORMAT, "digest": digest}, halves)
         self.known = KnownImages(camera, reconstruction.recon_from_camera, found)
         self.seen = np.zeros((len(old), len(self.tracks.points_in_recon)), bool)
         """Whether each image shows each point of the tracks."""
@@ -146,7 +206,7 @@ class OldScene:
         images = tuple(new.images[row] for row in rows)
         return NewCapture(
             name=name,
-            digest=new.digest,
+            digests=new.digests,
             images=images,
             notes=tuple(lost),
             scene_left=left,

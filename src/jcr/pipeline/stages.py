@@ -78,6 +78,10 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     facts = *of_capture, candidates(own), weights, FORMAT, options.method
     made = {"reconstruct": fingerprint(facts, own, __version__)}
     state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
+    with suppress(InputError):
+        before = RunResult(out).state
+        if before.capture == folder:
+            state = state.model_copy(update={"version": before.version, "predecessor": before.predecessor})
     return RunResult(out, capture=capture, state=state)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +21,7 @@ from jcr.findings import Verdict
 from jcr.geometry import Transform, retract, step_between
 from jcr.pipeline.old_scene import NewImages, calibration_digest, name_of, new_images, old_scene, require_new
 from jcr.pipeline.options import TOLERANCE
-from jcr.pipeline.watch import History, Verified, read_history, with_capture, write_history
+from jcr.pipeline.watch import History, Verified, read_history, with_capture, without_part, write_history
 from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.result import RunResult
@@ -78,6 +78,21 @@ class Verification:
         """Verdict on the old calibration: rejected if something moved."""
         return "rejected" if self.moved else "accepted"
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of `jcr verify --json`, with lengths in mm and angles in degrees."""
+        names = ("verdict", "moved", "cause", "p_value", "images", "notes")
+        facts: dict[str, Any] = {name: getattr(self, name) for name in names}
+        facts["moves"] = [{"causes": one.causes, "since": one.since} for one in self.moves]
+        facts |= _in_mm_deg("drift", self.offset, self.covariance)
+        facts |= {
+            "detectable_mm": 1e3 * self.detectable[0],
+            "detectable_deg": float(np.degrees(self.detectable[1])),
+        }
+        if self.fixed is None:
+            facts["cameras"] = {one.fixed: one.as_json() for one in self.others}
+            facts["history"] = [_row_as_json(row) for row in self.history]
+        return facts
+
     @property
     def cause(self) -> Cause | None:
         """Most likely cause of the last change; None if nothing has moved."""
@@ -108,6 +123,28 @@ class Verification:
             "robot": "the robot reports other poses than before (joints set to zero again, another tool frame or "
             f"payload); the calibration does not belong to these: {anew}",
         }[str(causes[0])]
+
+
+def _in_mm_deg(
+    name: str, step: Float[ndarray, "6"], covariance: Float[ndarray, "6 6"]
+) -> dict[str, Float[ndarray, "3"]]:
+    """Return a step and its standard deviations in mm and degrees, for JSON: NAME_mm, NAME_deg, NAME_std_mm, ..."""
+    std = np.sqrt(np.diag(covariance))
+    parts = {"": step, "_std": std}
+    return {f"{name}{kind}_{unit}": factor * part[axes] for kind, part in parts.items()
+            for unit, factor, axes in (("mm", 1e3, slice(0, 3)), ("deg", np.degrees(1.0), slice(3, 6)))}  # fmt: skip
+
+
+def _row_as_json(row: Verified) -> dict[str, Any]:
+    """Return the content of --json for one capture of the history."""
+    facts: dict[str, Any] = {"capture": row.name, "images": row.images, "notes": row.notes}
+    for name, one in (("camera", row.camera), ("scene", row.scene)):
+        facts |= _in_mm_deg(name, one.step, one.covariance) | {f"{name}_p": one.p_value}
+    facts |= {
+        "detectable_mm": 1e3 * row.detectable[0],
+        "detectable_deg": float(np.degrees(row.detectable[1])),
+    }
+    return facts | {"odds": row.odds, "scene_left": row.scene_left}
 
 
 def _in_words(move: Move) -> str:
@@ -153,12 +190,14 @@ def verify_run(
         for k, (name, one) in enumerate(captures.items()):
             report("find the old scene", k / len(captures))
             images = one if isinstance(one, NewImages) else new_images(one)
-            known = [verified.digest for verified in history.captures]
-            if images.digest not in known:
+            known = [k for k, past in enumerate(history.captures) if set(images.digests) <= set(past.digests)]
+            if not known:
                 require_new(capture, scene.pixels, images)
-                history = with_capture(history, run, scene.located(name, images))
+                history = with_capture(
+                    without_part(history, images.digests), run, scene.located(name, images)
+                )
                 write_history(run.out, history)
-            row = known.index(images.digest) if images.digest in known else len(known)
+            row = known[0] if known else len(history.captures) - 1
     report("find the old scene", 1.0)
     found, last = _judged(run, history, row, tolerance), list(captures.values())[-1]
     fixed = [] if isinstance(last, NewImages) else _fixed_cameras(run, last, tolerance, progress)

@@ -10,9 +10,19 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field, ValidationError
 
-from jcr.calibration.drift import MOST_OLD, Change, Located, Reference, Step, check_series, step_of
+from jcr.calibration.drift import (
+    MOST_OLD,
+    Change,
+    Located,
+    Reference,
+    Step,
+    check_series,
+    most_telling,
+    step_of,
+)
 from jcr.calibration.robot_errors import robot_errors
 from jcr.errors import InputError, first_fault
+from jcr.estimation.absolute_pose import absolute_pose
 from jcr.estimation.robot_noise import of_poses
 from jcr.files import write_text
 from jcr.records.json_fields import Part, Spread
@@ -29,8 +39,8 @@ class NewCapture(Part):
     """Capture that was located in the calibrated scene."""
 
     name: str
-    digest: str
-    """Hash of its images and poses."""
+    digests: tuple[str, ...]
+    """Hashes of all its images, each with its pose."""
     images: tuple[str, ...]
     """Images that were located and whose poses are used."""
     notes: tuple[str, ...] = ()
@@ -71,6 +81,23 @@ def read_history(out: Path, calibration: str) -> History:
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; remove the file, the history begins again") from None
     return found if found.calibration == calibration else empty
+
+
+def without_part(history: History, digests: Sequence[str]) -> History:
+    """Return the history without its last capture, if that holds a part of the images with these hashes.
+
+    Raises InputError if some of the images belong to other captures.
+    """
+    known = [one for one in history.captures if not set(digests).isdisjoint(one.digests)]
+    if not known:
+        return history
+    last = history.captures[-1]
+    if known != [last] or not set(last.digests) < set(digests):
+        names = ", ".join(one.name for one in known)
+        raise InputError(f"some of the images were verified before ({names}); take new ones")
+    index = len(history.captures) - 1
+    changes = tuple(one for one in history.changes if one.named < index)
+    return history.model_copy(update={"captures": history.captures[:-1], "changes": changes})
 
 
 def write_history(out: Path, history: History) -> None:
@@ -115,14 +142,47 @@ def with_capture(history: History, run: RunResult, new: NewCapture) -> History:
     count = 6 * len(reference.base_from_gripper)
     own = np.r_[:count, len(systematic) - 6 * len(new.located) : len(systematic)]
     alone = reference, new.located, systematic[np.ix_(own, own)]
+    decided = [one for one in test.changes if not one.rivals]
     row = Verified(
         **vars(new),
-        camera=step_of(*alone, "camera", test.changes),
-        scene=step_of(*alone, "scene", test.changes),
+        camera=step_of(*alone, "camera", decided),
+        scene=step_of(*alone, "scene", decided),
         detectable=test.detectable,
         odds=float(np.exp(min(test.log_odds, 100.0))),
     )
     return history.model_copy(update={"captures": (*history.captures, row), "changes": test.changes})
+
+
+def telling_poses(run: RunResult, count: int) -> list[tuple[int, tuple[float, float]]]:
+    """Return the images of a run at whose poses new images would tell most about the camera, best first.
+
+    Each is the index of an image in the capture, with the change (m, rad) of the camera that the images up to this one
+    find nine times in ten. The errors of their camera poses are taken from the points that the old images show.
+    """
+    reference, rows = reference_of(run)
+    _, capture, reconstruction = run.of_wrist_camera()
+    tracks, covariances = reconstruction.tracks, list[ndarray]()
+    for row in rows:
+        own = tracks.image == np.flatnonzero(reconstruction.image_index == row)[0]
+        pose = absolute_pose(
+            tracks.x_px[own],
+            tracks.points_in_recon[tracks.point[own]],
+            reconstruction.intrinsics,
+            gate_px=3.0,
+        )
+        if pose is None:
+            raise InputError(
+                f"{capture.images[row]}: shows too few points of the scene; name poses of your own"
+            )
+        covariances.append(pose.covariance)
+    there = Located(
+        base_from_gripper=tuple(reference.base_from_gripper),
+        recon_from_camera=tuple(reference.recon_from_camera),
+        covariance=tuple(covariances),
+        joints=None if capture.joints is None else tuple(capture.joints[rows]),
+    )
+    systematic = _systematic(run, rows, [there])
+    return [(int(rows[k]), noticed) for k, noticed in most_telling(reference, there, systematic, count)]
 
 
 def _systematic(run: RunResult, rows: ndarray, series: Sequence[Located]) -> Float[ndarray, "s s"]:

@@ -80,6 +80,8 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
     lines = [about]
+    if has_images and (state := result.state).predecessor is not None:
+        lines.append(f"version {state.version} of this calibration, after {printable(state.predecessor)}")
     if (found := calibration.intrinsics) is not None:
         focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
         lines.append(
