@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from jaxtyping import Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.calibration.options import CalibrateOptions
@@ -41,8 +42,6 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from jcr.pipeline.verify import Verification
     from jcr.scene.scene_map import SceneMap
     from jcr.segments.measure import Measurement
@@ -222,10 +221,10 @@ class RunResult:
 
     def verify(
         self,
-        images: "Sequence[ArrayLike | Path | str]",
-        base_from_gripper: "ArrayLike",
+        images: Sequence[ArrayLike | Path | str],
+        base_from_gripper: ArrayLike,
         *,
-        joints: "ArrayLike | None" = None,
+        joints: ArrayLike | None = None,
         name: str | None = None,
         **options: Any,
     ) -> "Verification":

@@ -1,11 +1,12 @@
 """File report.html: one page with the verdict on a calibration, the transform to copy, and the evidence."""
 
+from contextlib import suppress
 from datetime import UTC, datetime
 
 from jcr.calibration.record import FailedCalibration, PublishedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.readings import decision_in_words
-from jcr.errors import printable
+from jcr.errors import InputError, printable
 from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
 from jcr.report.images import images_section
@@ -80,8 +81,9 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
     lines = [about]
-    if has_images and (state := result.state).predecessor is not None:
-        lines.append(f"version {state.version} of this calibration, after {printable(state.predecessor)}")
+    with suppress(InputError):  # results that are no runs have no state
+        if (state := result.state).predecessor is not None:
+            lines.append(f"version {state.version} of this calibration, after {printable(state.predecessor)}")
     if (found := calibration.intrinsics) is not None:
         focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
         lines.append(
