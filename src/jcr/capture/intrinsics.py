@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jcr.camera import HALF_PIXEL
 from jcr.capture.documents import read_content, read_tables, root_of_xml
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.options import ReadOptions
@@ -35,7 +36,7 @@ DISTORTION_KEYS = (
 """Keys of distortion coefficients, the usual ones first."""
 SKEW = 1e-4
 """Largest skew, as a share of the focal length, that counts as none: a tenth of a pixel at the edge of an image."""
-_COLMAP: dict[str, tuple[str, ...]] = {
+COLMAP_MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -137,9 +138,8 @@ def _entries(file: Path) -> Iterator[dict[str, Any]]:
         yield from _of_visp(file, text)
         return
     cells = next((line.split() for line in text.splitlines() if line[:1].isdecimal()), [])
-    names = _COLMAP.get(cells[1], ()) if len(cells) > 4 else ()
-    if names and len(cells) == 4 + len(names):
-        yield _of_colmap(cells, names)
+    if len(cells) > 4 and cells[1] in COLMAP_MODELS and len(cells) == 4 + len(COLMAP_MODELS[cells[1]]):
+        yield entry_of_colmap(cells[1], [*map(float, cells[2:])])
         return
     if "[camera matrix]" in text or "camera matrix" in text:
         yield from _of_ost(text)
@@ -221,19 +221,18 @@ def _flat(value: Any) -> list[float]:
     return flat if all(isinstance(cell, float) for cell in flat) else []
 
 
-def _of_colmap(cells: list[str], names: tuple[str, ...]) -> dict[str, Any]:
-    """Return the intrinsics of a line of COLMAP's cameras.txt; its pixel centres are at half integers."""
-    named = dict(zip(names, map(float, cells[4:]), strict=True))
-    focal = named.get("f")
-    fisheye = cells[1] == "OPENCV_FISHEYE"
-    order = COEFFICIENTS["fisheye" if fisheye else "rational"]
-    return {
-        "fx": named.get("fx", focal), "fy": named.get("fy", focal),
-        "cx": named["cx"] - 0.5, "cy": named["cy"] - 0.5,
-        "distortion": [named.get(name, 0.0) for name in order],
+def entry_of_colmap(model: str, numbers: Sequence[float]) -> dict[str, Any]:
+    """Return the entry (`intrinsics_of_entry`) of a camera of COLMAP, whose pixel centres are at half integers.
+
+    `model` is a key of COLMAP_MODELS; `numbers` are width, height and its parameters.
+    """
+    named = dict(zip(("width", "height", *COLMAP_MODELS[model]), numbers, strict=True))
+    focal, fisheye = named.get("f"), model == "OPENCV_FISHEYE"
+    centre = {key: named[key] - HALF_PIXEL for key in ("cx", "cy")}
+    return {"fx": focal, "fy": focal, **named, **centre} | {
+        "distortion": [named.get(name, 0.0) for name in COEFFICIENTS["fisheye" if fisheye else "rational"]],
         "model": "fisheye" if fisheye else "rational_polynomial",
-        "width": float(cells[2]), "height": float(cells[3]),
-    }  # fmt: skip
+    }
 
 
 def _of_ost(text: str) -> Iterator[dict[str, Any]]:

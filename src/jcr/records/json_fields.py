@@ -16,6 +16,8 @@ from pydantic import (
     PlainSerializer,
 )
 
+from jcr.geometry import HUGE
+
 
 class Part(BaseModel):
     """Base class of a JSON file's content: unknown keys and numbers that are not finite are errors."""
@@ -106,8 +108,6 @@ def _arrays(*counts: int | None, made: Any = np.array) -> GetPydanticSchema:
     )
 
 
-HUGE = 1e15
-"""Upper bound of the positive numbers in a file."""
 Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 Spread = Annotated[float, Field(ge=0)]
 """Standard deviation or size: a number that is not negative."""

@@ -6,20 +6,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jcr.camera import HALF_PIXEL
 from jcr.capture.images import read_image
+from jcr.capture.intrinsics import COLMAP_MODELS, entry_of_colmap, intrinsics_of_entry
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
-from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics, Reconstruction
-from jcr.records.capture_json import IntrinsicsEntry
-from jcr.records.json_file import validated_content
+from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.colmap import matched_database
 from jcr.sfm.model import poses_of, quiet_colmap, tracks_of, triangulated_model
 
 MIN_POINTS = 50
 """Least number of points of a reconstruction; with fewer in the model, features are triangulated."""
-_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-"""Camera models of COLMAP that a distortion model of jcr can represent."""
 
 
 def reconstruct_given(
@@ -120,18 +116,12 @@ def shared_intrinsics(
     does not support.
     """
     cameras = [model.camera(model.image(image_id).camera_id) for image_id in image_ids]
-    kinds = {(c.model.name, c.params_info, c.width, c.height, *map(float, c.params)) for c in cameras}
+    kinds = {(c.model.name, c.width, c.height, *map(float, c.params)) for c in cameras}
     if len(kinds) != 1:
         raise InputError(
             f"{where}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
         )
-    ((name, names_of_params, width, height, *params),) = kinds
-    if name not in _MODELS:
+    ((name, *numbers),) = kinds
+    if name not in COLMAP_MODELS:
         raise InputError(f"{where}: unknown camera model {name}; run colmap image_undistorter")
-    value = dict(zip(names_of_params.split(", "), params, strict=True))
-    kind: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(params[9:]) else "pinhole"
-    value = {"fx": value.get("f"), "fy": value.get("f"), "k1": value.get("k", 0.0)} | value
-    entry = {"fx": value["fx"], "fy": value["fy"], "width": width, "height": height, "model": kind}
-    entry |= {key: value[key] - HALF_PIXEL for key in ("cx", "cy")}
-    entry["distortion"] = [value.get(key, 0.0) for key in COEFFICIENTS[kind]]
-    return validated_content(IntrinsicsEntry, entry, where).record(size, f"{where}: cameras")
+    return intrinsics_of_entry(entry_of_colmap(name, numbers), size, where)
