@@ -23,7 +23,6 @@ import jcr
 from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.prepare import SCALES, pages
 from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.table import GROUPS, KindRow
@@ -300,11 +299,8 @@ def backends_page() -> str:
         "back end",
         "options of its own",
         "auto",
-        "scale",
-        "parameters",
         "download",
         "licence",
-        "measured",
     ]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for row in BACKENDS.values():
@@ -313,23 +309,14 @@ def backends_page() -> str:
             f"`{row.name}`",
             ", ".join(flags),
             "yes" if row.auto else "no",
-            SCALES[row.metric],
-            f"{row.parameters} M" if row.parameters else "",
             f"{row.download_gb:g} GB" if row.download_gb else "",
             row.licence,
-            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     written = (REFERENCE / "backends.md").read_text("utf-8")
     return re.sub(
         r"(?m)^\| back end \| options of its own(?:.*\n\|)*.*$", lambda _: "\n".join(lines), written
     )
-
-
-def _link(named: re.Match[str]) -> str:
-    """From the page of back ends to the one that a command prints."""
-    file = pages()[named[1]]
-    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
 
 
 FINDINGS = """\

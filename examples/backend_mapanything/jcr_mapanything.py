@@ -82,7 +82,6 @@ BACKEND = Backend(
     name="mapanything",
     reconstruct=reconstruct,
     licence="Apache-2.0",
-    metric=True,
     auto=True,
     tests_camera=False,
     options=("weights",),

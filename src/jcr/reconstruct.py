@@ -71,8 +71,6 @@ class Backend:
     """Function of capture, ReconstructOptions and progress; slow imports should be inside the function."""
     licence: str
     """Licence of the weights; of the code for a back end without weights."""
-    metric: bool | None = False
-    """Whether the unit of the reconstruction is the metre; None: the input of the back end states it."""
     auto: bool = False
     """Whether --backend auto may try this back end, if its package and its weights are on this machine."""
     tests_camera: bool = True
@@ -91,12 +89,8 @@ class Backend:
     """Command that installs `package`."""
     keeps_order: bool = False
     """Whether the images must keep the order of the capture, because the input refers to images by number."""
-    accuracy: str = ""
-    """Measured accuracy and the page with the measurement; empty: not measured here."""
     revision: str = ""
     """Commit of the weights that `jcr models get` downloads."""
-    parameters: int = 0
-    """Number of parameters of the network, in millions."""
     download_gb: float = 0.0
     """Size of the weights (GB)."""
     commercial: bool = True
@@ -126,7 +120,6 @@ _DUST3R = Backend(
     keeps_order=True,
     package="torch",
     install=install("networks"),
-    parameters=571,
     download_gb=2.3,
     commercial=False,
 )
@@ -141,7 +134,6 @@ _DA3 = Backend(
     revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
     package="depth_anything_3",
     install=INSTALL_DA3,
-    parameters=135,
     download_gb=0.5,
     sees_all_views=True,
 )
@@ -153,18 +145,15 @@ _FIRST = (
         auto=True,
         options=("features", "board"),
         selected_by="features",
-        accuracy="0.02 mm and 0.002° on the bundled capture (jcr docs results/speed)",
     ),
     # MASt3R is DUSt3R with points in metres and an additional head, which is not used.
     replace(
         _DUST3R,
         name="mast3r",
         licence=f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
-        metric=True,
         selected_by="",
         hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
         revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
-        parameters=689,
         download_gb=2.8,
     ),
     _DUST3R,
@@ -174,7 +163,6 @@ _FIRST = (
         name="da3-small",
         hub_id="depth-anything/DA3-SMALL",
         revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
-        parameters=34,
         download_gb=0.14,
     ),
 )
@@ -185,29 +173,23 @@ _LAST = (
         licence="Apache-2.0",
         auto=True,
         tests_camera=False,
-        accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
-        "(jcr docs plain-tables)",
     ),
     Backend(
         name=MARKER,
         reconstruct=_lazy("jcr.boards.marker:reconstruct_marker", "board"),
         licence="Apache-2.0",
-        metric=True,
         options=("board",),
         needs="board",
-        accuracy="a point 4.7 mm from its place by the reference in 8 real captures, median (jcr docs results/real)",
     ),
     Backend(
         name="predictions",
         reconstruct=_lazy("jcr.pointmaps.predictions:reconstruct_predictions", "predictions"),
         licence="your network's",
-        metric=None,
         tests_camera=False,
         options=("predictions",),
         selected_by="predictions",
         needs="predictions",
         keeps_order=True,
-        accuracy="1.20 mm and 0.048° from simulated predictions (jcr docs results/pointmaps)",
     ),
     Backend(
         name="given",

@@ -18,7 +18,6 @@ from jcr.reconstruct import BACKENDS, weights_command
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
 """Folders of the manual's pages; pages in `results`, whose names others have, are named with their folder."""
-SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
 @dataclass(frozen=True)
@@ -151,18 +150,15 @@ class ModelsCommand:
         for row in BACKENDS.values():
             missing = [] if row.is_installed() else [row.install]
             missing += [] if row.has_weights() else [f"jcr models get {row.name}"]
-            present, scale = f"no: {'; '.join(missing)}" if missing else "yes", SCALES[row.metric]
-            size = f", {row.parameters} M parameters" if row.parameters else ""
-            size += f", {row.download_gb:g} GB" if row.download_gb else ""
+            present = f"no: {'; '.join(missing)}" if missing else "yes"
+            size = f", {row.download_gb:g} GB" if row.download_gb else ""
             limited = not row.commercial and "non-commercial" not in row.licence
             lines += [
                 f"{row.name:<12} {row.hub_id or 'no weights needed'}{size}",
                 f"{'':<12} licence: {row.licence}{' (not for commercial use)' * limited}",
-                f"{'':<12} scale: {scale}; here: {present}",
-                *([f"{'':<12} accuracy: {row.accuracy}"] if row.accuracy else []),
+                f"{'':<12} here: {present}",
             ]
-            own = {name: getattr(row, name) for name in ("licence", "commercial", "accuracy", "download_gb")}
-            fact = {"backend": row.name, "weights": row.hub_id, "scale": scale, "present": present}
-            facts.append(fact | own | {"parameters_m": row.parameters})
+            own = {name: getattr(row, name) for name in ("licence", "commercial", "download_gb")}
+            facts.append({"backend": row.name, "weights": row.hub_id, "present": present} | own)
         self.output.result(lines, {"models": facts})
         return 0

@@ -48,25 +48,31 @@ class ExportFormat:
     """Attributes of `ExportedRun` that are passed to the writer, separated by spaces."""
 
 
-_TABLE = """
-ros2 | hand_eye.launch.xml | static_transform_publisher line and launch file | ros.ros2_launch | mount others
-moveit | hand_eye.launch.py | launch file as MoveIt Calibration saves it | ros.moveit_launch | mount
-urdf | hand_eye.urdf | camera link and fixed joint | ros.urdf | mount others
-easy_handeye2 | hand_eye.calib | .calib for its publisher | ros.easy_handeye2 | mount path.stem
-camera_info | camera_info.yaml | intrinsics for camera_info_manager | ros.camera_info | camera_frame
-ply | cloud.ply | points, colours, labels | views.write_cloud | cloud notes
-glb | map.glb | mesh of the seen surface with colours | volume.write_glb | scene map_notes
-octomap | map.bt | occupied, free and unknown voxels | volume.write_octomap | scene map_notes options
-esdf | esdf.npz | voxels of signed distance | volume.write_esdf | scene map_notes options
-spheres | spheres.npz | spheres that cover what is solid | volume.write_spheres | scene map_notes options
-nerfstudio | nerfstudio/ | transforms.json, images and first points for a splat or NeRF | views.write_nerfstudio | \
-    views cloud notes options
-colmap | colmap/ | COLMAP model in the base frame, binary and text | views.write_colmap | views notes options
-rerun | run.rrd | recording for the Rerun viewer | volume.write_rrd | views cloud scene map_notes
-"""
-FORMATS = tuple(
-    ExportFormat(*map(str.strip, row.split("|"))) for row in _TABLE.replace("\\\n", "").strip().splitlines()
+# fmt: off
+FORMATS = (
+    ExportFormat("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file",
+                 "ros.ros2_launch", "mount others"),
+    ExportFormat("moveit", "hand_eye.launch.py", "launch file as MoveIt Calibration saves it",
+                 "ros.moveit_launch", "mount"),
+    ExportFormat("urdf", "hand_eye.urdf", "camera link and fixed joint", "ros.urdf", "mount others"),
+    ExportFormat("easy_handeye2", "hand_eye.calib", ".calib for its publisher", "ros.easy_handeye2", "mount path.stem"),
+    ExportFormat("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager",
+                 "ros.camera_info", "camera_frame"),
+    ExportFormat("ply", "cloud.ply", "points, colours, labels", "views.write_cloud", "cloud notes"),
+    ExportFormat("glb", "map.glb", "mesh of the seen surface with colours", "volume.write_glb", "scene map_notes"),
+    ExportFormat("octomap", "map.bt", "occupied, free and unknown voxels",
+                 "volume.write_octomap", "scene map_notes options"),
+    ExportFormat("esdf", "esdf.npz", "voxels of signed distance", "volume.write_esdf", "scene map_notes options"),
+    ExportFormat("spheres", "spheres.npz", "spheres that cover what is solid",
+                 "volume.write_spheres", "scene map_notes options"),
+    ExportFormat("nerfstudio", "nerfstudio/", "transforms.json, images and first points for a splat or NeRF",
+                 "views.write_nerfstudio", "views cloud notes options"),
+    ExportFormat("colmap", "colmap/", "COLMAP model in the base frame, binary and text",
+                 "views.write_colmap", "views notes options"),
+    ExportFormat("rerun", "run.rrd", "recording for the Rerun viewer",
+                 "volume.write_rrd", "views cloud scene map_notes"),
 )
+# fmt: on
 
 
 def export_run(

@@ -11,7 +11,7 @@ from jcr.errors import InputError
 from jcr.extras import xfeat_is_installed
 from jcr.features.matchers import FeatureName
 from jcr.geometry import apply, inverse
-from jcr.pointmaps.global_alignment.align import PIXELS, global_align
+from jcr.pointmaps.global_alignment.align import global_align
 from jcr.pointmaps.grid import PreparedImages
 from jcr.pointmaps.pairs import PairPredictions
 from jcr.pointmaps.posed import FOCAL_STD, PosedPointmaps, fit_pinhole, published_covariance
@@ -35,17 +35,14 @@ BEND_STD = 0.03
 
 
 def align_pairs(
-    predictions: PairPredictions,
-    images: PreparedImages,
-    progress: Progress | None = None,
-    pixels: int = PIXELS,
+    predictions: PairPredictions, images: PreparedImages, progress: Progress | None = None
 ) -> PosedPointmaps:
     """Return pointmaps and camera poses in the first image's camera frame, from pairwise pointmaps by global alignment.
 
     The focal length is estimated from the pointmaps, even if the intrinsics are known. With another focal length, the
-    pointmaps do not fit each other, and the cameras move. `pixels` is the number of pixels used per image.
+    pointmaps do not fit each other, and the cameras move.
     """
-    alignment = global_align(replace(predictions, intrinsics=images.intrinsics), pixels, progress)
+    alignment = global_align(replace(predictions, intrinsics=images.intrinsics), progress=progress)
     return PosedPointmaps(
         grid=images.grid,
         recon_from_camera=alignment.recon_from_camera,

@@ -1,6 +1,8 @@
 """Test the calibration from aligned pairs: accuracy, calibrated covariance, scale of metric networks."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,6 +17,8 @@ from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
 from jcr.findings.finding import text
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.pointmaps import reconstruction
+from jcr.pointmaps.global_alignment.align import global_align
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions, complete_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
@@ -29,14 +33,16 @@ NOISE = (5e-4, float(np.radians(0.1)))
 
 
 @pytest.fixture(autouse=True, scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of black images, in which nothing matches."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folder of black images, in which nothing matches; the alignment uses a quarter of the pixels."""
     made = tmp_path_factory.getbasetemp() / "black"
     made.mkdir(exist_ok=True)
     for k in range(12):
         Image.new("RGB", SIZE).save(made / f"{k:02d}.png")
     Case.folder = made
-    return made
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruction, "global_align", partial(global_align, pixels=FEW_PIXELS))
+        yield made
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class Case:
 
     def reconstruction(self) -> Reconstruction:
         """Return the alignment as a reconstruction; the black images have no matches."""
-        maps = align_pairs(self.predictions, self.images, pixels=FEW_PIXELS)
+        maps = align_pairs(self.predictions, self.images)
         return reconstruct_pointmaps(self.capture, self.images, maps, "predictions")
 
     def error(self, found: Calibration) -> np.ndarray:

@@ -76,6 +76,11 @@ class Config:
                 raise ValueError(f"{name} = {getattr(self, name)!r} is not covered; it must be {remedy}")
 
 
+def mixed_precision(like: Tensor) -> torch.autocast:
+    """Return a context in which networks compute in bfloat16 if the tensor `like` is on CUDA."""
+    return torch.autocast(like.device.type, torch.bfloat16, enabled=like.is_cuda)
+
+
 class Dust3r(nn.Module):
     """Network of DUSt3R or MASt3R, built from the fields of a published configuration (`Config`).
 
@@ -88,8 +93,6 @@ class Dust3r(nn.Module):
         enc_dim, dec_dim = config.enc_embed_dim, config.dec_embed_dim
         self.rope_base = float(config.pos_embed.removeprefix("RoPE"))
         self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
-        self.mixed_precision: bool | None = None
-        """True if encoder, decoder and heads use bfloat16; None: only on CUDA."""
         self.is_metric = False
         """True if the predicted points are in metres."""
 
@@ -129,7 +132,7 @@ class Dust3r(nn.Module):
         """
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(f"images are {tuple(images.shape[-2:])}; both must be multiples of {PATCH}")
-        with self._autocast(images):
+        with mixed_precision(images):
             grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
             rotary = rotary_embedding(grid, self.head_dims[0], self.rope_base, images.device)
             # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
@@ -143,7 +146,7 @@ class Dust3r(nn.Module):
 
         Swapped arguments give other predictions.
         """
-        with self._autocast(features1.tokens):
+        with mixed_precision(features1.tokens):
             rotary1, rotary2 = (
                 rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
                 for f in (features1, features2)
@@ -165,10 +168,6 @@ class Dust3r(nn.Module):
     def device(self) -> torch.device:
         """Device of the weights."""
         return self.mask_token.device
-
-    def _autocast(self, like: Tensor) -> torch.autocast:
-        enabled = like.is_cuda if self.mixed_precision is None else self.mixed_precision
-        return torch.autocast(like.device.type, torch.bfloat16, enabled=enabled)
 
 
 def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: torch.device) -> Rotary:
