@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.camera import rays
 from jcr.depth.consistency import agreement, inverse_depth_evidence
 from jcr.depth.matched import Relative, grid, relative
-from jcr.depth.priors import ON_PLANE, evened, planar_prior
+from jcr.depth.priors import ON_PLANE, PlanarPrior, evened, planar_prior
 from jcr.depth.support import support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
@@ -79,20 +79,18 @@ def fused_depth(
         confidence = np.minimum(score, 1) * count
         if not priors or matched.sum() < FEWEST_MATCHED:
             return _chosen(inverse_depth, [matched], [confidence], [MATCHED], [std])
-        plane_depth, holds, confirms, agreeing, contradicts, plane_std = _priors(
-            pool, colors, inverse_depth, matched, views, recon_from_camera, pinhole
-        )
+        plane = _priors(pool, colors, inverse_depth, matched, views, recon_from_camera, pinhole)
         report(0.8)
-        plane_std = np.hypot(plane_std, PRIOR_FLOOR)
-        on_plane = confirms & (np.abs(plane_depth / inverse_depth - 1) < ON_PLANE)
+        plane_std = np.hypot(plane.std, PRIOR_FLOOR)
+        on_plane = plane.confirms & (np.abs(plane.inverse_depth / inverse_depth - 1) < ON_PLANE)
         pair = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION)
-        matched = (matched & ~contradicts) | (pair & on_plane)
+        matched = (matched & ~plane.contradicts) | (pair & on_plane)
         both = matched & on_plane
-        filled = holds & ~matched
-        inverse_depth = np.where(filled, plane_depth, inverse_depth)
+        filled = plane.holds & ~matched
+        inverse_depth = np.where(filled, plane.inverse_depth, inverse_depth)
         there = matched | filled
         _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
-        filled &= (count >= np.minimum(needed, agreeing)) & (count > 2 * through)
+        filled &= (count >= np.minimum(needed, plane.agreeing)) & (count > 2 * through)
         # Beside outlines, two images may agree on the nearer depth; a third image that sees the plane contradicts it.
         through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
         matched &= both | (through == 0)
@@ -136,8 +134,8 @@ def _priors(
     views: Sequence[Relative],
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
-) -> list[ndarray]:
-    """Return the six maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks.
+) -> PlanarPrior:
+    """Return the maps of `planar_prior` for all images, (m,h,w) each: planes of colour regions and their checks.
 
     The support plane that these need is fitted first, to `inverse_depth` (1/z) at the pixels of `matched`. `views` are
     the projections of each image into its neighbours (`relative`).
@@ -153,11 +151,12 @@ def _priors(
     smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
     surfaces = np.where(matched, inverse_depth, 0).astype(np.float32), smooth
 
-    def prior(i: int) -> tuple[ndarray, ...]:
+    def prior(i: int) -> PlanarPrior:
         image = surfaces, inverse_depth[i], matched[i], views[i]
         return planar_prior(i, *image, support, recon_from_camera[i], (grid(pinhole), ray))
 
-    return [np.stack(maps) for maps in zip(*pool.map(prior, range(len(colors))), strict=True)]
+    images = [vars(one) for one in pool.map(prior, range(len(colors)))]
+    return PlanarPrior(**{name: np.stack([one[name] for one in images]) for name in images[0]})
 
 
 def _chosen(

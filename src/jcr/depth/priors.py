@@ -6,6 +6,7 @@ table. A pixel takes its plane's depth where the other views show the point in t
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -97,6 +98,23 @@ def evened(
     ).astype(np.float32)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanarPrior:
+    """Maps of the planes of colour regions and of their checks, of one image or of m."""
+
+    inverse_depth: Float[ndarray, "*m h w"]
+    holds: Bool[ndarray, "*m h w"]
+    """Where two other images (on the support plane, one) show the same colour, and none sees through the plane."""
+    confirms: Bool[ndarray, "*m h w"]
+    """Where the plane confirms a match: it holds, or the only other image that sees the point shows the same colour."""
+    agreeing: UInt8[ndarray, "*m h w"]
+    """Number of images that must agree with the plane's depth, at most 1 on the support plane."""
+    contradicts: Bool[ndarray, "*m h w"]
+    """Wrong matches: 1.5 % or more off a plane that has 60 % of its region's matches."""
+    std: Float[ndarray, "*m h w"]
+    """Standard deviation of the inverse depth, relative to it."""
+
+
 def planar_prior(
     i: int,
     surfaces: tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w 3"]],
@@ -106,14 +124,8 @@ def planar_prior(
     support: Float[ndarray, "4"],
     recon_from_camera: Float[ndarray, "4 4"],
     camera: tuple[Float[ndarray, "4"], Float[ndarray, "h w 3"]],
-) -> tuple[ndarray, ...]:
-    """Fit a plane to the matched depth of each colour region of image i; return six maps (h,w) of these planes.
-
-    Map 0 is the plane's inverse depth (1/z). Map 1 marks where the plane holds: two other images (on the support plane,
-    one) show the same colour, and none sees through it. Map 2 marks where it confirms a match: it holds, or the only
-    other image that sees the point shows the same colour. Map 3 is the number of images that must agree with its depth,
-    at most 1 on the support plane. Map 4 marks wrong matches: 1.5 % or more off a plane that has 60 % of its region's
-    matches. Map 5 is the relative standard deviation of the inverse depth.
+) -> PlanarPrior:
+    """Fit a plane to the matched depth of each colour region of image i, and check it by the other images.
 
     `surfaces` are the matched inverse depths of all images (0: none) and their colours, corrected and slightly
     smoothed. `inverse_depth`, `matched` and `recon_from_camera` are those of image i; `view` is its projection into its
@@ -125,20 +137,21 @@ def planar_prior(
     # The support plane as p with p·x = 1 in the camera frame; 0 if it contains the camera centre.
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -recon_from_camera[:3, :3].T @ support[:3] / offset if offset else np.zeros(3)
-    planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
-        label, count, inverse_depth, matched, ray, plane, ON_PLANE, i
-    )
+    found = region_planes(label, count, inverse_depth, matched, ray, plane, ON_PLANE, i)
     # Mahalanobis distance from the pixels that support the region's plane.
-    u, v = np.arange(label.shape[1]) - middle[label, 0], np.arange(label.shape[0])[:, None] - middle[label, 1]
-    (uu, uv), (_, vv) = shape.transpose(1, 2, 0)
+    u, v = (axis[label] for axis in found.middle_px.T)
+    u, v = np.arange(label.shape[1]) - u, np.arange(label.shape[0])[:, None] - v
+    (uu, uv), (_, vv) = found.information.transpose(1, 2, 0)
     away = np.sqrt(np.maximum(uu[label] * u * u + 2 * uv[label] * u * v + vv[label] * v * v, 0))
     # Shadows and prints on the support plane are small regions without a plane of their own.
     size = np.bincount(label.ravel(), minlength=count)
-    lonely = _beside(label, on_support) & (inliers == 0) & (fixed < FEWEST) & (size < PATCH * label.size)
-    planes[lonely] = plane
-    predicted = np.einsum("hwi,hwi->hw", planes[label], ray).astype(np.float32)
-    carried = (inliers > 0) & (inliers >= CARRIED * fixed)
-    near = (on_support | lonely)[label] | (away < FARTHEST)
+    lonely = _beside(label, found.is_support) & (found.inliers == 0) & (found.matched < FEWEST)
+    lonely &= size < PATCH * label.size
+    found.plane[lonely] = plane
+    predicted = np.einsum("hwi,hwi->hw", found.plane[label], ray).astype(np.float32)
+    carried = (found.inliers > 0) & (found.inliers >= CARRIED * found.matched)
+    on_support, whole = found.is_support[label], (found.is_support | lonely)[label]
+    near = whole | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
     points = np.where(asked, predicted, np.float32(0))
     counts = np.zeros((3, *label.shape), np.float32)
@@ -146,13 +159,19 @@ def planar_prior(
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
     # Where only one other image sees the point, it must agree, and a match or the support plane must confirm it.
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)
-    holds |= alone & on_support[label]
+    holds |= alone & on_support
     # On top of an object the plane would lie too low, and colours would differ along its outline in other views.
     holds &= ~(lonely & (np.bincount(label.ravel(), holds.ravel()) / size < WHOLE))[label]
-    wrong = asked & (inliers >= STRONG * fixed)[label] & (np.abs(predicted / inverse_depth - 1) > OFF_PLANE)
-    std = rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))
-    agreeing = np.where(on_support[label], np.minimum(same, 1), same).astype(np.uint8)
-    return predicted, holds, holds | alone, agreeing, wrong & matched, std.astype(np.float32)
+    wrong = asked & (found.inliers >= STRONG * found.matched)[label]
+    wrong &= matched & (np.abs(predicted / inverse_depth - 1) > OFF_PLANE)
+    return PlanarPrior(
+        inverse_depth=predicted,
+        holds=holds,
+        confirms=holds | alone,
+        agreeing=np.where(on_support, np.minimum(same, 1), same).astype(np.uint8),
+        contradicts=wrong,
+        std=(found.std[label] * np.where(whole, 1.0, np.maximum(away, 1.0))).astype(np.float32),
+    )
 
 
 def _beside(label: Int[ndarray, "h w"], chosen: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:

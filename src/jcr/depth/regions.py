@@ -1,5 +1,6 @@
 """Segmentation of an image into regions of one colour, and planes fitted to the matched depth in each region."""
 
+from dataclasses import dataclass
 from typing import no_type_check
 
 import cv2
@@ -77,6 +78,25 @@ def _join(first, second, weight, parent, size, inner):
         parent[x] = _root(parent, x)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RegionPlanes:
+    """Planes of the r regions of an image and the matched pixels that support them; 0 for regions without a plane."""
+
+    plane: Float[ndarray, "r 3"]
+    """Plane p with p·ray = inverse depth."""
+    is_support: Bool[ndarray, " r"]
+    """Whether the plane is the scene's main plane."""
+    inliers: Int[ndarray, " r"]
+    matched: Int[ndarray, " r"]
+    """Number of matched pixels, on the plane or not."""
+    std: Float[ndarray, " r"]
+    """Root mean square of the inliers' residuals, relative to the inverse depth."""
+    middle_px: Float[ndarray, "r 2"]
+    """Mean of the inliers' pixels (u, v)."""
+    information: Float[ndarray, "r 2 2"]
+    """Inverse covariance of the inliers' pixels, px⁻²."""
+
+
 def region_planes(
     label: Int[ndarray, "h w"],
     count: int,
@@ -86,13 +106,8 @@ def region_planes(
     support: Float[ndarray, "3"],
     tolerance: float,
     seed: int,
-) -> tuple[ndarray, ...]:
+) -> RegionPlanes:
     """Fit to the matched pixels of each region a plane p with p·ray = inverse depth (RANSAC, then least squares).
-
-    Returns seven arrays with a row per region. The first four are plane p (count,3), whether it is the plane `support`,
-    number of inliers, and number of matched pixels. The fifth is the root mean square of the inliers' relative
-    residuals. The last two are mean (count,2) and inverse covariance (count,2,2) of the inliers' pixels (u, v). A
-    region without a plane has 0 inliers.
 
     `label` is each pixel's region from 0 to `count` - 1; `rays` have z = 1. `support` is the scene's main plane, as p
     in the camera frame. It is preferred where it has 80 % of the best plane's inliers or more. `tolerance` is the
@@ -106,9 +121,15 @@ def region_planes(
     size, n = fixed[regions], len(regions)
     start, of = np.cumsum(size) - size, np.repeat(np.arange(n), size)
     ray, depth = rays.reshape(-1, 3)[chosen], inverse_depth.ravel()[chosen].astype(float)
-    planes, on_support, inliers = np.zeros((count, 3)), np.zeros(count, bool), np.zeros(count, int)
-    rest, middle, shape = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
-    found = planes, on_support, inliers, fixed, rest, middle, shape
+    found = RegionPlanes(
+        plane=np.zeros((count, 3)),
+        is_support=np.zeros(count, bool),
+        inliers=np.zeros(count, int),
+        matched=fixed,
+        std=np.zeros(count),
+        middle_px=np.zeros((count, 2)),
+        information=np.zeros((count, 2, 2)),
+    )
     if n == 0:
         return found
 
@@ -125,9 +146,9 @@ def region_planes(
     narrow, wide = (np.linalg.eigvalsh(one)[:, 0] for one in (covariance, whole))
     good = (on | fitted) & (number >= FEWEST) & (narrow >= SPREAD * wide)
     kept = regions[good]
-    planes[kept], on_support[kept], inliers[kept] = best[good], on[good], number[good]
-    rest[kept] = np.sqrt(np.bincount(of[carries], off[carries] ** 2, n)[good] / number[good])
-    middle[kept], shape[kept] = mean[good], np.linalg.inv(covariance[good] + np.eye(2))
+    found.plane[kept], found.is_support[kept], found.inliers[kept] = best[good], on[good], number[good]
+    found.std[kept] = np.sqrt(np.bincount(of[carries], off[carries] ** 2, n)[good] / number[good])
+    found.middle_px[kept], found.information[kept] = mean[good], np.linalg.inv(covariance[good] + np.eye(2))
     return found
 
 
