@@ -63,7 +63,14 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory, small_capture: Path) ->
 
 def test_a_capture_is_calibrated_and_reported_as_with_torch(calibrated: Path, small_done: Path):
     names = {path.name for path in calibrated.iterdir()} - {".lock"}
-    assert names == {"calibration.json", "reconstruction.npz", "report.html", "log.txt", "run.json"}
+    assert names == {
+        "calibration.json",
+        "reconstruction.npz",
+        "report.html",
+        "log.txt",
+        "run.json",
+        "uncertainty.npz",
+    }
     compared = run_jcr("compare", calibrated, small_done, "--json")
     assert compared.returncode == 0, compared.stderr
     assert json.loads(compared.stdout)["translation_mm"] < 1e-3

@@ -17,7 +17,6 @@ import tyro
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
-from jcr.geometry import inverse
 from jcr.hub import HUB_ID, Weights, cached_files
 from jcr.progress import Progress
 from jcr.records import CameraEvidence, Capture, Reconstruction
@@ -251,9 +250,10 @@ def reconstruct(
     InputError for an unknown back end or a missing package, RejectedError if the reconstruction fails.
     """
     options = options or ReconstructOptions()
-    if (
-        capture.mount == "base"
-    ):  # in the frame of the carried object, a fixed camera moves as a wrist camera does
+    if capture.mount == "base":
+        from jcr.geometry import inverse  # SciPy, which help need not wait for
+
+        # In the frame of the carried object, a fixed camera moves as a wrist camera does.
         capture = replace(
             capture, mount="gripper", base_from_gripper=inverse(capture.base_from_gripper), joints=None
         )

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import signal
 import socket
 import sys
@@ -122,7 +123,9 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
     found = np.asarray(viewer._mark.position)
     assert abs(found[2] - (z + book.box_size[2] / 2)) < 0.01
     at = viewer.scene.query(found[None].astype(float))
-    assert f"<td>{at.occupancy[0]:.2f}</td>" in said and "images/" in said and "margin" in said
+    # The mark is in single precision, and the occupancy changes within a millimetre at the surface.
+    shown = float(re.findall(r"<td>([01]\.\d\d)(?:, unknown)?</td>", said)[0])
+    assert abs(shown - at.occupancy[0]) < 0.05 and "images/" in said and "margin" in said
     assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
     viewer.shown.value = "map"
     viewer.show_points()

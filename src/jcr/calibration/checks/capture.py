@@ -89,7 +89,7 @@ def check_remarks(case: Case) -> Case:
     """
     texts, every, used = case.reconstruction.warnings, len(case.capture), len(case.used)
     warnings = [Finding.of(FindingKind.RECONSTRUCTION, "warns", text=text) for text in texts]
-    if used < every / 2:
+    if used < every / 2 and not any(one.kind is FindingKind.FEW_USED for one in case.motions):
         registered = len(case.names)
         counts = {"of": float(every), "lost": float(every - registered), "wrong": float(registered - used)}
         kind = FindingKind.HALF_UNUSED
