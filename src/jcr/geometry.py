@@ -17,6 +17,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
+from jcr.rounding import HUGE
 
 Transform = Float[ndarray, "4 4"]
 Transforms = Float[ndarray, "*batch 4 4"]
@@ -24,8 +25,6 @@ Poses = Float[ndarray, "n 4 4"]
 Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
 
-HUGE = 1e15
-"""Largest accepted number; sums of squares of smaller ones cannot overflow."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of RᵀR − I accepted as rounding; transforms printed with four digits pass."""
 TINY = 1e-300

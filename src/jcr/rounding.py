@@ -2,6 +2,8 @@
 
 import numpy as np
 
+HUGE = 1e15
+"""Largest accepted number; sums of squares of smaller ones cannot overflow."""
 MOST_DECIMALS = 9
 """Largest number of decimals of a number with a standard deviation."""
 

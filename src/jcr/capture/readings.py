@@ -25,9 +25,9 @@ from jcr.capture.notations import (
 )
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
-from jcr.geometry import HUGE, inverse
+from jcr.geometry import inverse
 from jcr.records import Reading
-from jcr.rounding import significant
+from jcr.rounding import HUGE, significant
 
 Numbers = Float[ndarray, "n c"]
 Candidate = tuple[Reading, Float[ndarray, "n 4 4"]]

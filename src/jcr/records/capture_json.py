@@ -20,9 +20,10 @@ from pydantic import (
 )
 
 from jcr.errors import InputError, shown
-from jcr.geometry import HUGE, require_rigid
+from jcr.geometry import require_rigid
 from jcr.records.capture import COEFFICIENTS, DistortionModel, FrameNames, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
+from jcr.rounding import HUGE
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
 """Regular expression of valid names of cameras and arms."""

@@ -16,7 +16,7 @@ from pydantic import (
     PlainSerializer,
 )
 
-from jcr.geometry import HUGE
+from jcr.rounding import HUGE
 
 
 class Part(BaseModel):
