@@ -22,7 +22,7 @@ from jcr.capture.added import read_added
 from jcr.capture.formats import capture_json
 from jcr.capture.formats.lerobot import Info, read_episode
 from jcr.capture.images import read_image
-from jcr.capture.intrinsics import read_intrinsics
+from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
@@ -141,7 +141,9 @@ def captures(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, T
         write(place, capture)
         found[name] = Target(place / name, source(place))
     table = folder / "poses-csv"
-    found["camera_info.yaml"] = Target(table / "camera_info.yaml", lambda file: read_intrinsics(file, SIZE))
+    found["camera_info.yaml"] = Target(
+        table / "camera_info.yaml", lambda file: intrinsics_of_file(file, SIZE)
+    )
     samples = {"samples.yaml": writers.write_moveit, "wrist.samples": writers.write_easy_handeye2}
     for name, write in samples.items():
         file = write(folder / name.replace(".", "-"), capture.base_from_gripper, cameras)

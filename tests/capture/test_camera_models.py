@@ -8,7 +8,7 @@ import yaml
 from pydantic import TypeAdapter
 
 import jcr
-from jcr.capture.intrinsics import read_intrinsics
+from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.ros import intrinsics_of_ros
 from jcr.export import ros
 from jcr.records import Intrinsics
@@ -31,7 +31,7 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration(intrinsics:
         parent="tool0", child="optical", parent_from_child=np.eye(4), intrinsics=intrinsics
     )
     (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount))
-    assert read_intrinsics(tmp_path / "camera_info.yaml", SIZE) == intrinsics
+    assert intrinsics_of_file(tmp_path / "camera_info.yaml", SIZE) == intrinsics
     printed = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
     assert printed["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
     file = TypeAdapter(Intrinsics)
@@ -61,7 +61,7 @@ def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
 @pytest.mark.parametrize(
     ("model", "count", "words"),
     [
-        ("thin_prism", 12, "'thin_prism' with 12 coefficients; jcr knows plumb_bob"),
+        ("division", 1, "'division' with 1 coefficients; jcr knows plumb_bob"),
         ("rational_polynomial", 14, "with 14 coefficients"),
         ("plumb_bob", 8, "'plumb_bob' with 8"),
     ],

@@ -19,44 +19,18 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OTHER_IMAGES = {
     ".heic": "HEIC",
     ".heif": "HEIC",
-    ".dng": "raw",
-    ".cr2": "raw",
-    ".nef": "raw",
-    ".arw": "raw",
-    ".raw": "raw",
+    **dict.fromkeys((".dng", ".cr2", ".nef", ".arw", ".raw"), "raw"),
 }
 """Endings of pictures that are not read, and the names of their formats."""
 NOT_SCENE = {
-    "mask",
-    "masks",
-    "depth",
-    "depths",
-    "seg",
-    "segmentation",
-    "label",
-    "labels",
-    "disparity",
-    "confidence",
-}
+    "mask", "masks", "depth", "depths", "seg", "segmentation", "label", "labels", "disparity", "confidence",
+}  # fmt: skip
 """Words in names of files and folders with images that do not show the scene in colour."""
 USUAL = ("images", "image", "rgb", "color", "colour", "img", "imgs")
 """Names of folders with the images of a capture, the first ones preferred."""
 IGNORED = {
-    ".pyc",
-    ".py",
-    ".ipynb",
-    ".md",
-    ".pdf",
-    ".zip",
-    ".gz",
-    ".ply",
-    ".pcd",
-    ".stl",
-    ".urdf",
-    ".mp4",
-    ".avi",
-    ".svg",
-}
+    ".pyc", ".py", ".ipynb", ".md", ".pdf", ".zip", ".gz", ".ply", ".pcd", ".stl", ".urdf", ".mp4", ".avi", ".svg",
+}  # fmt: skip
 """Endings of files that hold no poses."""
 DEEPEST = 4
 """Largest number of folders below the capture's in which files are found."""

@@ -1,14 +1,15 @@
-"""Intrinsics from the files of OpenCV, ROS, Kalibr, RealSense, OpenICC, ViSP and COLMAP, or from a 3x3 matrix."""
+"""Intrinsics from the files of OpenCV, ROS, Kalibr, RealSense, OpenICC and COLMAP, or from a 3x3 matrix."""
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.documents import read_content, read_tables, root_of_xml
+from jcr.capture.documents import read_content, read_tables
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import numbers_of_table, words_of
@@ -26,7 +27,8 @@ CERTAIN = ("camera_info.yaml", "camera_info.yml", "camera_info.json")
 MODELS: dict[str, DistortionModel] = {
     "": "pinhole", "plumb_bob": "pinhole", "radtan": "pinhole", "brown_conrady": "pinhole", "opencv": "pinhole",
     "none": "pinhole", "pinhole": "pinhole", "inverse_brown_conrady": "pinhole", "rational_polynomial": "rational",
-    "full_opencv": "rational", "equidistant": "fisheye", "equi": "fisheye", "fisheye": "fisheye",
+    "full_opencv": "rational", "rational": "rational", "thin_prism": "thin_prism",
+    "equidistant": "fisheye", "equi": "fisheye", "fisheye": "fisheye",
     "opencv_fisheye": "fisheye", "kannala_brandt4": "fisheye",
 }  # fmt: skip
 """Distortion models by their names in ROS, Kalibr, librealsense and COLMAP."""
@@ -57,52 +59,55 @@ def intrinsics_of_capture(
     intrinsics for this size. The result is None without one. Raises InputError for an unusable file that was named.
     """
     if options.camera_info is not None:
-        return read_intrinsics(options.camera_info, size), ()
+        return intrinsics_of_file(options.camera_info, size), ()
     for file in documents:
         if file.name.lower() in CERTAIN and file.parent in (folder, folder / "images"):
-            return read_intrinsics(file, size), ()
-    found, notes = dict[Path, Intrinsics](), list[str]()
+            return intrinsics_of_file(file, size), ()
+    found = dict[Path, Intrinsics]()
     for file in (one for one in documents if NAMED.search(one.stem)):
-        try:
-            read = read_intrinsics(file, size, size_needed=True)
-        except InputError:
-            continue
-        if read is not None:
-            found[file] = read
+        with suppress(InputError):
+            entry = read_intrinsics(file)
+            if entry is not None and entry.width is not None:  # else it may be of another camera
+                found[file] = entry.record(size, str(file))
+    listed = ", ".join(str(file.relative_to(folder)) for file in found)
     if len({str(one) for one in found.values()}) == 1:
-        file, intrinsics = next(iter(found.items()))
-        return intrinsics, (f"intrinsics of {file.relative_to(folder)}",)
-    if found:
-        listed = ", ".join(str(file.relative_to(folder)) for file in found)
-        notes.append(f"intrinsics of {listed} differ and were not used; name one with --camera-info")
-    return None, tuple(notes)
+        return next(iter(found.values())), (f"intrinsics of {listed}",)
+    note = f"intrinsics of {listed} differ and were not used; name one with --camera-info"
+    return None, (note,) if found else ()
 
 
-def read_intrinsics(file: Path, size: tuple[int, int], size_needed: bool = False) -> Intrinsics | None:
-    """Read the intrinsics of a file for images of `size` (width, height); None if the camera was never calibrated.
+def intrinsics_of_file(file: Path, size: tuple[int, int]) -> Intrinsics | None:
+    """Return the intrinsics of a file for images of `size` (width, height); None if the camera was never calibrated.
 
-    `size_needed`: a file that does not state its images' size is no intrinsics. Raises InputError for a file without
-    intrinsics, an unknown distortion model, another size, a skew, or a distortion that folds over within the image.
+    Raises InputError as read_intrinsics, for another size, and for a distortion that folds over within the image.
+    """
+    entry = read_intrinsics(file)
+    return None if entry is None else entry.record(size, f"{file}: intrinsics")
+
+
+def read_intrinsics(file: Path) -> IntrinsicsEntry | None:
+    """Read the first intrinsics of a file; None if the camera was never calibrated.
+
+    Raises InputError for a file without intrinsics, an unknown distortion model, and a skew.
     """
     for entry in _entries(file):
-        if not entry["fx"] and not entry["fy"]:
-            return None
-        if size_needed and entry.get("width") is None:
-            break
-        return intrinsics_of_entry(entry, size, str(file))
+        return intrinsics_entry(entry, str(file)) if entry["fx"] or entry["fy"] else None
     raise InputError(
         f"{file}: no intrinsics were found in it; give those of OpenCV, ROS, Kalibr, RealSense or COLMAP, or a 3x3 "
         "matrix"
     )
 
 
-def intrinsics_of_entry(entry: dict[str, Any], size: tuple[int, int], where: str) -> Intrinsics:
-    """Return the intrinsics of an entry: fx, fy, cx, cy, skew, distortion, model by the name of a tool, width, height.
+def intrinsics_entry(stated: dict[str, Any], where: str) -> IntrinsicsEntry:
+    """Return the entry of stated fx, fy, cx, cy, skew, distortion, model by the name of a tool, width, height.
 
-    Raises InputError, begun with `where`, for what jcr's camera models cannot express, and for another image size.
+    Raises InputError, begun with `where`, for what jcr's camera models cannot express.
     """
-    model, coefficients = str(entry.get("model") or "").lower(), [*map(float, entry.get("distortion") or ())]
-    if abs(skew := float(entry.get("skew") or 0.0)) > SKEW * abs(entry["fx"]):
+    model, coefficients = (
+        str(stated.get("model") or "").lower(),
+        [*map(float, stated.get("distortion") or ())],
+    )
+    if abs(skew := float(stated.get("skew") or 0.0)) > SKEW * abs(stated["fx"]):
         raise InputError(
             f"{where}: a skew of {skew:.4g} px between the axes, which cameras do not have; calibrate without skew, or "
             "leave the intrinsics out: they are estimated"
@@ -120,28 +125,25 @@ def intrinsics_of_entry(entry: dict[str, Any], size: tuple[int, int], where: str
     if known == "rational" and not any(coefficients[5:]):
         known = "pinhole"
     count = len(COEFFICIENTS[known])
-    numbers = {key: float(entry[key]) for key in ("fx", "fy", "cx", "cy")}
-    sides = {key: int(entry[key]) for key in ("width", "height") if entry.get(key)}
+    numbers = {key: float(stated[key]) for key in ("fx", "fy", "cx", "cy")}
+    sides = {key: int(stated[key]) for key in ("width", "height") if stated.get(key)}
     distortion = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
-    content = numbers | sides | {"model": known, "distortion": distortion}
-    made = validated_content(IntrinsicsEntry, content, where).record(size, f"{where}: intrinsics")
-    return made
+    return validated_content(
+        IntrinsicsEntry, numbers | sides | {"model": known, "distortion": distortion}, where
+    )
 
 
 def _entries(file: Path) -> Iterator[dict[str, Any]]:
-    """Yield the intrinsics that a file may state, in the fields of `intrinsics_of_entry`."""
+    """Yield the intrinsics that a file may state, in the fields of `intrinsics_entry`."""
     if file.suffix.lower() in (".npy", ".npz", ".mat"):
         yield from _of_matrices(file)
         return
     text = decode_text(file, read_limited(file))
-    if "<model>" in text and "<px>" in text:
-        yield from _of_visp(file, text)
-        return
     cells = next((line.split() for line in text.splitlines() if line[:1].isdecimal()), [])
     if len(cells) > 4 and cells[1] in COLMAP_MODELS and len(cells) == 4 + len(COLMAP_MODELS[cells[1]]):
         yield entry_of_colmap(cells[1], [*map(float, cells[2:])])
         return
-    if "[camera matrix]" in text or "camera matrix" in text:
+    if "camera matrix" in text:
         yield from _of_ost(text)
     try:
         content = read_content(file)
@@ -222,7 +224,7 @@ def _flat(value: Any) -> list[float]:
 
 
 def entry_of_colmap(model: str, numbers: Sequence[float]) -> dict[str, Any]:
-    """Return the entry (`intrinsics_of_entry`) of a camera of COLMAP, whose pixel centres are at half integers.
+    """Return the entry (`intrinsics_entry`) of a camera of COLMAP, whose pixel centres are at half integers.
 
     `model` is a key of COLMAP_MODELS; `numbers` are width, height and its parameters.
     """
@@ -253,29 +255,6 @@ def _of_ost(text: str) -> Iterator[dict[str, Any]]:
         sides = {side: sections[side][0] for side in ("width", "height") if sections.get(side)}
         names = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5], "skew": matrix[1]}
         yield names | sides | {"distortion": sections.get("distortion", [])}
-
-
-def _of_visp(file: Path, text: str) -> Iterator[dict[str, Any]]:
-    """Yield the intrinsics of a camera.xml of ViSP: the model without distortion comes first."""
-    camera = root_of_xml(file, text).find(".//camera")
-    if camera is None:
-        return
-    for model in camera.findall("model"):
-        named = {one.tag: one.text for one in model} | {
-            one.tag: one.text for one in camera if one.tag.startswith("image")
-        }
-        names = {
-            "fx": "px",
-            "fy": "py",
-            "cx": "u0",
-            "cy": "v0",
-            "width": "image_width",
-            "height": "image_height",
-        }
-        try:
-            yield {ours: float(named[theirs] or "") for ours, theirs in names.items()}
-        except (KeyError, ValueError):
-            continue
 
 
 def _of_matrices(file: Path) -> Iterator[dict[str, Any]]:

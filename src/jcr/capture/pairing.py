@@ -4,7 +4,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import PurePosixPath
@@ -26,36 +26,14 @@ NEARLY = 0.75
 LEAST_TEXT = 6
 """Smallest length of a cell that is looked for inside the images' names; shorter ones occur by chance."""
 ROW_NAMES = {
-    "id",
-    "index",
-    "idx",
-    "no",
-    "num",
-    "nr",
-    "number",
-    "frame",
-    "record",
-    "pose",
-    "sample",
-    "shot",
-    "image",
-    "step",
-}
+    "id", "index", "idx", "no", "num", "nr", "number", "frame", "record", "pose", "sample", "shot", "image", "step",
+}  # fmt: skip
 """Words of the name of a column that counts images."""
 STAMP_NAMES = {
-    "timestamp",
-    "stamp",
-    "time",
-    "t",
-    "sec",
-    "secs",
-    "ts",
-    "datetime",
-    "date",
-    "nanosec",
-    "nsecs",
-    "nsec",
-}
+    "timestamp", "stamp", "time", "t", "sec", "secs", "ts", "datetime", "date", "nanosec", "nsecs", "nsec",
+}  # fmt: skip
+STAMP_PARTS = {"ns", "s", "ms", "us", "header", "ros"}
+"""Words of the name of a column of time stamps, and words that may stand beside them."""
 ZONE_NS = 900 * 10**9
 """Step (ns) of the differences between time zones, a quarter of an hour."""
 MOMENT_NS = 1_000_000
@@ -103,10 +81,10 @@ def pair(table: Table, images: Sequence[str]) -> Pairing:
 
     Names of images are surest, then time stamps in the names, numbers in names, and last the order of as many rows.
     """
+    skipped = frozenset(_counting_columns(table) | _stamp_columns(table).keys())
     for found in (_by_cells(table, images), _by_time(table, images), _by_number(table, images)):
         if found is not None:
-            return found
-    skipped = frozenset(_counting_columns(table) | _stamp_columns(table).keys())
+            return replace(found, skipped=found.skipped | skipped)
     if len(table.rows) == len(images):
         how = f"in order of the images' names: {images[0]} … {images[-1]}"
         return Pairing(how=how, row=np.arange(len(images)), skipped=skipped)
@@ -156,12 +134,8 @@ def _by_cells(table: Table, images: Sequence[str]) -> Pairing | None:
                 if column is None
                 else f"column {table.columns[column] or f'no. {column + 1}'}"
             )
-            skipped = (
-                frozenset(() if column is None else (column,))
-                | _counting_columns(table)
-                | _stamp_columns(table).keys()
-            )
-            best = Pairing(how=f"by the {name}", row=row, skipped=frozenset(skipped), is_by_name=True)
+            own_column = frozenset(() if column is None else (column,))
+            best = Pairing(how=f"by the {name}", row=row, skipped=own_column, is_by_name=True)
     return best
 
 
@@ -219,10 +193,7 @@ def _by_number(table: Table, images: Sequence[str]) -> Pairing | None:
             continue
         at = {number: r for r, number in enumerate(of_rows)}
         name = "the files' numbers" if column is None else f"column {table.columns[column]}"
-        skipped = frozenset(_counting_columns(table) | _stamp_columns(table).keys())
-        return Pairing(
-            how=f"by {name}", row=np.array([at[n] for n in of_images]), skipped=skipped, is_by_name=True
-        )
+        return Pairing(how=f"by {name}", row=np.array([at[n] for n in of_images]), is_by_name=True)
     return None
 
 
@@ -271,14 +242,7 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
     for k, name in enumerate(table.columns):
         cells = [row[k] for row in table.rows]
         words = set(re.findall(r"[a-z]+", (name or "").lower().replace("_ns", "")))
-        is_named = bool(words & STAMP_NAMES) and not words - STAMP_NAMES - {
-            "ns",
-            "s",
-            "ms",
-            "us",
-            "header",
-            "ros",
-        }
+        is_named = bool(words & STAMP_NAMES) and not words - STAMP_NAMES - STAMP_PARTS
         is_fraction = bool(words & {"nanosec", "nsecs", "nsec"})
         if len(set(map(str, cells))) < len(cells) / 2 and not is_fraction:
             continue  # a turn of an axis, such as KUKA's T
@@ -316,7 +280,6 @@ def _by_time(table: Table, images: Sequence[str]) -> Pairing | None:
     column = next(iter(columns))
     return Pairing(
         how=f"by time stamps, poses interpolated at those of the {len(images)} images' names",
-        skipped=frozenset(columns) | frozenset(_counting_columns(table)),
         is_by_name=True,
         stamp_ns=np.array(columns[column], dtype=np.int64),
         image_ns=image_ns,

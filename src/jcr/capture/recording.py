@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.checks import checked_capture
 from jcr.capture.images import BLURRED, encode_png, read_image, sharpness
-from jcr.capture.intrinsics import read_intrinsics
+from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.pose_track import NEVER
 from jcr.errors import InputError
@@ -120,7 +120,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     known = recording.intrinsics_of_size
     if options.camera_info is not None:
-        known = partial(read_intrinsics, options.camera_info)
+        known = partial(intrinsics_of_file, options.camera_info)
     capture, kept = checked_capture(into, images, poses[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *([] if fresh.all() else [f"{stale}left out"]))
     if faults:

@@ -1,4 +1,4 @@
-"""Intrinsics, images and depth from messages of ROS bags (rosbags) and nodes (rclpy), and from camera_info YAML."""
+"""Intrinsics, images and depth from messages of ROS bags (rosbags) and nodes (rclpy)."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
-from pydantic import AliasChoices, AliasPath, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 
 from jcr.capture.images import read_image, read_one_channel, require_pixels
-from jcr.capture.intrinsics import intrinsics_of_entry
+from jcr.capture.intrinsics import intrinsics_entry
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.records import Intrinsics
 from jcr.records.json_file import validated_content
@@ -22,14 +22,14 @@ _Numbers = Annotated[list[float], BeforeValidator(lambda it: list(it) if hasattr
 
 
 class CameraInfo(BaseModel):
-    """Content of a CameraInfo message or a camera_info YAML; ROS 1 names the matrices K, D and P."""
+    """Content of a CameraInfo message; ROS 1 names the matrices K, D and P."""
 
     model_config = ConfigDict(strict=True, from_attributes=True)
-    width: int = Field(validation_alias=AliasChoices("image_width", "width"))
-    height: int = Field(validation_alias=AliasChoices("image_height", "height"))
-    k: _Numbers = Field(validation_alias=AliasChoices(AliasPath("camera_matrix", "data"), "k", "K"))
+    width: int
+    height: int
+    k: _Numbers = Field(validation_alias=AliasChoices("k", "K"))
     distortion_model: str
-    d: _Numbers = Field(validation_alias=AliasChoices(AliasPath("distortion_coefficients", "data"), "d", "D"))
+    d: _Numbers = Field(validation_alias=AliasChoices("d", "D"))
     p: _Numbers = Field(default=[], validation_alias=AliasChoices("p", "P"))
 
 
@@ -38,7 +38,7 @@ def intrinsics_of_ros(
 ) -> Intrinsics | None:
     """Return the intrinsics of images of `size` (width, height); None if the camera was never calibrated.
 
-    `content` is a CameraInfo message or the content of a YAML file; an uncalibrated camera has a matrix of zeros.
+    `content` is a CameraInfo message; an uncalibrated camera has a matrix of zeros.
     Rectified images (`is_rectified`) have the intrinsics of the projection matrix P and no distortion. Raises
     InputError, begun with `where`, for an unknown distortion model, or intrinsics of another resolution.
     """
@@ -52,7 +52,7 @@ def intrinsics_of_ros(
         return None
     fx, skew, cx, _, fy, cy, *_ = matrix
     entry = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew, "width": info.width, "height": info.height}
-    return intrinsics_of_entry(entry | {"model": model, "distortion": coefficients}, size, where)
+    return intrinsics_entry(entry | {"model": model, "distortion": coefficients}, where).record(size, where)
 
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {

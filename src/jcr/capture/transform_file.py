@@ -8,11 +8,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.capture.documents import read_record_tables, read_tables, root_of_xml
+from jcr.capture.documents import read_record_tables, root_of_xml
 from jcr.capture.documents.table import decode_text, read_limited
-from jcr.capture.notations import poses_of_rows
 from jcr.capture.options import ReadOptions
-from jcr.capture.readings import numbers_of_table, readings_of
+from jcr.capture.readings import readings_of
 from jcr.errors import InputError
 from jcr.geometry import transform
 
@@ -28,9 +27,7 @@ def read_transform(file: Path) -> Float[ndarray, "4 4"]:
     or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several.
     """
     text = "" if file.suffix.lower() in ARRAYS else decode_text(file, read_limited(file))
-    found = [*_of_arguments(text), *_of_urdf(file, text)]
-    if not found:
-        found = [*_of_matrix(file), *_of_record(file)]
+    found = [*_of_arguments(text), *_of_urdf(file, text)] or _of_record(file)
     if not found:
         raise InputError(
             f"{file}: holds no transform; give translation and rotation, a 4x4 matrix, or what `jcr export` writes"
@@ -71,18 +68,8 @@ def _of_urdf(file: Path, text: str) -> list[Float[ndarray, "4 4"]]:
     return made
 
 
-def _of_matrix(file: Path) -> list[Float[ndarray, "4 4"]]:
-    """Return the transforms of the 4x4 matrices in a document."""
-    made = []
-    for table in read_tables(file):
-        numbers = numbers_of_table(table)
-        if numbers.shape in ((4, 4), (1, 16)) and np.allclose(numbers.reshape(4, 4)[3], (0, 0, 0, 1)):
-            made.append(poses_of_rows(numbers.reshape(1, 16), "matrix", where=str(file))[0])
-    return made
-
-
 def _of_record(file: Path) -> list[Float[ndarray, "4 4"]]:
-    """Return the transforms of a document that is one record, such as a translation and a quaternion."""
+    """Return the transform of a document that is one record: a 4x4 matrix, or a translation and a quaternion."""
     for table in read_record_tables([file]):
         readings = readings_of(table, ReadOptions(), str(file))[1]
         stated = [

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.formats.capture_json import camera_entries, read_intrinsics, with_cameras
+from jcr.capture.formats.capture_json import camera_entries, with_cameras
 from jcr.capture.images import read_image, size_of_all
+from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.errors import InputError
 from jcr.files import path_inside, read_bytes, write_bytes, write_text
 from jcr.records import Capture, CellCamera
@@ -38,17 +39,14 @@ def added_camera(
 ) -> CellCamera:
     """Return a fixed camera with images copied to `folder`; raise InputError if the files cannot be of one camera.
 
-    `files` are image files. `intrinsics` is a JSON file with the intrinsics as in capture.json, at the top level or
-    under "intrinsics". `taken` are the names of the other cameras.
+    `files` are image files. `intrinsics` is a file of intrinsics. `taken` are the names of the other cameras.
     """
     if not re.fullmatch(NAME, name):
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
     if name in taken:
         raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
     size = size_of_all({str(file): read_image(file).shape[1::-1] for file in files}, f"--name {name}")
-    known = None
-    if intrinsics is not None:
-        known = read_intrinsics(intrinsics).record(size, f"{files[0]}, {intrinsics}")
+    known = None if intrinsics is None else intrinsics_of_file(intrinsics, size)
     images = tuple(f"{name}/{k:03d}{file.suffix.lower()}" for k, file in enumerate(files))
     for image, file in zip(images, files, strict=True):
         write_bytes(folder / image, file.read_bytes())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jcr.capture.formats.capture_json import read_intrinsics
+from jcr.capture.intrinsics import read_intrinsics
 from jcr.cli.output import Output
 from jcr.errors import InputError, printable
 from jcr.estimation.arms import CHOICES, RobotName

@@ -42,6 +42,8 @@ SAME_ROW = 1e-3
 NO_ROBOT = float(2 * np.sqrt(3) * LIMIT[1])
 """Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
 have the largest error on three axes."""
+SHOWN = 10
+"""Number of readings that are fitted although none can be that of a robot, so that a message says how far off it is."""
 MOST_CHOICES = 3000
 """Largest number of choices of rows that are tried where rows and images differ in number."""
 
@@ -192,7 +194,9 @@ def _ranked(
     for gap, reading, poses, known in sorted(ranked, key=lambda one: one[0]):
         # Of two rotations that differ, each has half of the error.
         least_mm = MM_PER_DEG * float(np.degrees(gap)) / 2
-        is_hopeless = gap > NO_ROBOT and best < np.inf and not any(fit.misfit.is_of_robot for fit in fits)
+        is_hopeless = (
+            gap > NO_ROBOT and len(fits) >= SHOWN and not any(fit.misfit.is_of_robot for fit in fits)
+        )
         is_late = fitted is not None and len(fits) >= fitted
         if not least_mm < min(2 * BETTER * max(best, LEAST_MISFIT), most_mm) or is_hopeless or is_late:
             fits.append(_Fit(reading, poses, NO_FIT))

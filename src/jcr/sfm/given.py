@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 
 from jcr.capture.images import read_image
-from jcr.capture.intrinsics import COLMAP_MODELS, entry_of_colmap, intrinsics_of_entry
+from jcr.capture.intrinsics import COLMAP_MODELS, entry_of_colmap, intrinsics_entry
 from jcr.errors import InputError, RejectedError
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -116,7 +116,7 @@ def shared_intrinsics(
     does not support.
     """
     cameras = [model.camera(model.image(image_id).camera_id) for image_id in image_ids]
-    kinds = {(c.model.name, c.width, c.height, *map(float, c.params)) for c in cameras}
+    kinds = {(c.model.name, *map(float, (c.width, c.height, *c.params))) for c in cameras}
     if len(kinds) != 1:
         raise InputError(
             f"{where}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
@@ -124,4 +124,4 @@ def shared_intrinsics(
     ((name, *numbers),) = kinds
     if name not in COLMAP_MODELS:
         raise InputError(f"{where}: unknown camera model {name}; run colmap image_undistorter")
-    return intrinsics_of_entry(entry_of_colmap(name, numbers), size, where)
+    return intrinsics_entry(entry_of_colmap(name, numbers), where).record(size, where)

@@ -8,14 +8,13 @@ import warnings
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
-from jcr.capture.documents.nested import nested_tables, require_short
+from jcr.capture.documents.nested import require_short
 from jcr.capture.documents.plain import MAX_DEPTH
 from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
 from jcr.errors import InputError, shown
@@ -34,20 +33,9 @@ _REFUSED = {
 """First bytes of the files that are refused by name, and their remedy."""
 _COMPRESSED, _MATRIX = 15, 14
 _KINDS = {
-    1: "i1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-    17: "u2",
-    18: "u4",
-}
+    1: "i1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 17: "u2", 18: "u4",
+}  # fmt: skip
 """Kinds of elements of a .mat file, and types of their numbers; others are bytes (MathWorks, MAT-File Format)."""
-_OBJECT = object()
 _NPY, _ZIP, _MATLAB = b"\x93NUMPY", b"PK\x03\x04", b"MATLAB 5.0"
 
 
@@ -64,7 +52,7 @@ def array_tables(file: Path, data: bytes) -> list[Table] | None:
         raise InputError(f"{file}: {_PICKLE}")
     try:
         if data.startswith(_NPY):
-            arrays: dict[str, Any] = {"": _read_npy(file, data)}
+            arrays: dict[str, ndarray] = {"": _read_npy(file, data)}
         elif data.startswith(_ZIP):
             arrays = _read_npz(file, data)
         elif data.startswith(_MATLAB):
@@ -100,7 +88,7 @@ def _read_npy(file: Path, data: bytes) -> ndarray:
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
-def _read_npz(file: Path, data: bytes) -> dict[str, Any]:
+def _read_npz(file: Path, data: bytes) -> dict[str, ndarray]:
     """Return the arrays in the bytes of a .npz file by name; raise InputError for other archives."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {member.filename: member for member in archive.infolist()}
@@ -117,22 +105,21 @@ def _read_npz(file: Path, data: bytes) -> dict[str, Any]:
             for member in members.values()
         ):
             raise InputError(f"{file}: a compression that NumPy does not write; save it with numpy.savez")
-        arrays = dict[str, Any]()
+        arrays = dict[str, ndarray]()
         for name, member in members.items():
             with archive.open(member) as stream:  # its content may be longer than its stated size
                 arrays[name.removesuffix(".npy")] = _read_npy(file, stream.read(member.file_size))
         return arrays
 
 
-def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
-    """Return the variables in the bytes of a .mat file of version 5 by name, fields of a struct as "struct.field".
+def _read_mat(file: Path, data: bytes) -> dict[str, ndarray]:
+    """Return the arrays in the bytes of a .mat file of version 5 by name, fields of a struct as "struct.field".
 
-    The format is read here, because scipy.io.loadmat ends the process on damaged files.
+    The format is read here, because scipy.io.loadmat ends the process on damaged files, also behind a whole header.
     """
     if len(data) <= 128:
         raise ValueError("the file is cut off")
-    order, found, left, objects = "<" if data[126:128] == b"IM" else ">", dict[str, Any](), MAX_BYTES, False
-    items = 0
+    order, found, left = "<" if data[126:128] == b"IM" else ">", dict[str, ndarray](), MAX_BYTES
     for kind, content in _elements(data[128:], order):
         if kind == _COMPRESSED:
             unpacked = zlib.decompressobj().decompress(content, left + 1)
@@ -140,20 +127,11 @@ def _read_mat(file: Path, data: bytes) -> dict[str, Any]:
             if left < 0:
                 raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
             kind, content = next(_elements(unpacked, order))
-        name, value = _variable(content, order, 0) if kind == _MATRIX else ("", None)
-        objects = objects or value is _OBJECT
-        queue = [(name, value)] if name and value is not _OBJECT else []
-        while queue:
-            name, value = queue.pop()
-            if isinstance(value, dict):
-                queue += [(f"{name}.{field}", part) for field, part in value.items()]
-            else:
-                items += _count(value)
-                if items > MAX_ITEMS:
-                    raise InputError(f"{file}: more than {MAX_ITEMS:,} values; save the poses alone")
-                found[name] = value if isinstance(value, ndarray) else _plain(value)
-    if objects and not found:
+        if kind == _MATRIX:
+            found |= _variable(content, order, 0)
+    if found and not any(name for name in found):
         raise InputError(f"{file}: {_MATLAB_OBJECT}")
+    found.pop("", None)
     return found
 
 
@@ -172,67 +150,54 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         at += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
 
 
-def _variable(content: bytes, order: str, depth: int) -> tuple[str, Any]:
-    """Return name and value of a variable: array, list (cell array), dictionary (struct), text, or an object's mark."""
+def _variable(content: bytes, order: str, depth: int) -> dict[str, ndarray]:
+    """Return the arrays of a variable by their names, such as "struct.field"; an object is an array without name.
+
+    Arrays of one shape in a cell array, or in a field of an array of structs, are one array.
+    """
     parts = list(_elements(content, order))
-    if len(parts) > MAX_ITEMS:
-        raise ValueError(f"more than {MAX_ITEMS:,} values")
-    if not parts or depth > MAX_DEPTH:
-        return "", None
+    if not parts or depth > MAX_DEPTH or len(parts) > MAX_ITEMS:
+        return {}
     numbers = [np.frombuffer(part, order + _KINDS.get(kind, "u1")) for kind, part in parts]
     kind = content[8] if order == "<" else content[11]
     if kind in (3, 16, 17):
-        return "object", _OBJECT
-    shape, name = [int(side) for side in numbers[1]], parts[2][1].decode("latin-1")
-    inner = [_variable(part, order, depth + 1)[1] for at, part in parts[3:] if at == _MATRIX]
-    if kind == 1:
-        return name, inner
+        return {"": np.zeros(0)}
+    name = parts[2][1].decode("latin-1")
+    inner = [_variable(part, order, depth + 1) for at, part in parts[3:] if at == _MATRIX]
+    fields = [""]
     if kind == 2:
         width = int(numbers[3][0])
-        fields = [
-            parts[4][1][k : k + width].split(b"\0")[0].decode("latin-1")
-            for k in range(0, len(parts[4][1]), width)
-        ]
-        structs = [
-            dict(zip(fields, inner[k : k + len(fields)], strict=True))
-            for k in range(0, len(inner), len(fields))
-        ]
-        return name, structs[0] if len(structs) == 1 else structs
-    array = numbers[3].reshape(shape, order="F")
-    return name, [
-        "".join(map(chr, row)).strip() for row in array.reshape(len(array), -1)
-    ] if kind == 4 else array
+        texts = (parts[4][1][k : k + width] for k in range(0, len(parts[4][1]), width))
+        fields = [text.split(b"\0")[0].decode("latin-1") for text in texts]
+    if kind in (1, 2):
+        return {
+            f"{name}.{field}{path}".rstrip("."): array
+            for k, field in enumerate(fields)
+            for path, array in _stacked(inner[k :: len(fields)]).items()
+        }
+    array = numbers[3].reshape([int(side) for side in numbers[1]], order="F")
+    if kind == 4:
+        array = np.array(["".join(map(chr, row)).strip() for row in array.reshape(len(array), -1)])
+    return {name: array}
 
 
-def _count(value: Any) -> int:
-    """Return the number of numbers and texts in what a variable of MATLAB holds."""
-    if isinstance(value, dict | list):
-        return len(value) + sum(map(_count, value.values() if isinstance(value, dict) else value))
-    return value.size if isinstance(value, ndarray) else 1
+def _stacked(parts: Sequence[dict[str, ndarray]]) -> dict[str, ndarray]:
+    """Return the arrays of one name and shape as one, without their sides of length 1; others are left out."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [
+        name for name in parts[0] if len({part[name].shape if name in part else None for part in parts}) == 1
+    ]
+    return {name: np.stack([part[name].squeeze() for part in parts]) for name in names} if parts else {}
 
 
-def _plain(value: Any) -> Any:
-    """Return what a cell array or a struct array of MATLAB holds as nested lists and dictionaries."""
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, list):
-        texts = len(value) == 1 and isinstance(value[0], str)
-        return value[0] if texts else [_plain(part) for part in value]
-    if isinstance(value, ndarray):
-        return value.reshape([side for side in value.shape if side != 1]).astype(float).tolist()
-    return None if value is _OBJECT else value
-
-
-def _tables_of(file: Path, arrays: dict[str, Any]) -> list[Table]:
-    """Return the tables of arrays and nested lists by name: each alone, and those of equal length joined."""
+def _tables_of(file: Path, arrays: dict[str, ndarray]) -> list[Table]:
+    """Return the tables of arrays by name: each alone, and those of equal length joined."""
     tables, equal = list[Table | None](), defaultdict[int, dict[str, list[dict[str | int, Cell]]]](dict)
-    if sum(value.size for value in arrays.values() if isinstance(value, ndarray)) > MAX_ITEMS:
+    if sum(value.size for value in arrays.values()) > MAX_ITEMS:
         raise InputError(f"{file}: more than {MAX_ITEMS:,} values; save the poses alone")
     for name, value in arrays.items():
         require_short(file, name)
-        if not isinstance(value, ndarray):
-            tables += nested_tables(file, {name: value} if name else value)
-            continue
         for array in _row_views(value):
             rows = _rows(array)
             tables.append(table_of(file, rows, place=name))

@@ -17,12 +17,8 @@ from jcr.errors import InputError, shown
 MAX_DEPTH = 32
 """Largest depth of nested lists and maps; a pose in a message of ROS is at depth 6."""
 _SYNTAXES = {
-    ".json": "JSON",
-    ".jsonl": "JSON",
-    ".yaml": "YAML",
-    ".yml": "YAML",
-    ".calib": "YAML",
-    ".samples": "YAML",
+    **dict.fromkeys((".json", ".jsonl"), "JSON"),
+    **dict.fromkeys((".yaml", ".yml", ".calib", ".samples"), "YAML"),
     ".xml": "XML",
 }
 _STARTS = {

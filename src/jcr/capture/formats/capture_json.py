@@ -53,19 +53,6 @@ def read_capture_json(file: Path) -> CaptureFile:
     return validated_content(CaptureFile, content, str(file))
 
 
-def read_intrinsics(file: Path) -> IntrinsicsEntry:
-    """Read intrinsics from a JSON file that holds only them, or that holds them under the key "intrinsics".
-
-    Raises InputError if the file is missing or holds no valid intrinsics.
-    """
-    content = read_json(file)
-    if isinstance(content, dict):
-        content = content.get("intrinsics", content)
-    if not isinstance(content, dict):
-        raise InputError(f'{file}: holds no "intrinsics"; name a capture.json with some')
-    return validated_content(IntrinsicsEntry, content, str(file))
-
-
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return the validated frame `row` (from 0) of a capture.json; raise InputError that names its image if invalid."""
     where = f"{file}: frame {row} ({content.frames[row]['image']})"
