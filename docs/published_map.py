@@ -1,4 +1,4 @@
-"""Draws explanation/published-map.png: `python docs/published_map.py OUT_DEFAULT OUT_PAPER`, two run folders of one capture.
+"""Draws explanation/published-map.png: `python docs/published_map.py OUT_DEFAULT OUT_PAPER`, runs of one capture.
 
 Above, the surface of each map in the colour that it predicts, seen from one place; below, its occupancy on a horizontal
 plane: white free, blue solid, grey unknown.
