@@ -1,13 +1,14 @@
 """Exports read back by the tools that own the formats, against known transforms and the true scene."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 from xml.etree import ElementTree
 
@@ -24,14 +25,14 @@ from scipy.spatial.transform import Rotation
 
 import analytic_scene
 import jcr
-from jcr.camera import unproject
+from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
-from jcr.export import ros
+from jcr.export import ros, simulators
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.options import ExportOptions, provenance
-from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.geometry import Similarity, apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
@@ -189,6 +190,180 @@ def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path)
         np.testing.assert_allclose(robot.get_transform(child, parent), PARENT_FROM_CHILD, atol=1e-9)
 
 
+CAMERA = Intrinsics(610.0, 600.0, 340.0, 215.0, 640, 480)
+LOOKING = transform(rotation_exp(np.array([np.pi - 0.2, 0.1, 0.15])), np.array([0.1, -0.05, 0.8]))
+POINTS = np.array([[0.0, 0.0, 0.0], [0.1, -0.1, 0.03], [0.22, 0.03, -0.02], [-0.05, -0.04, 0.05]])
+"""In the frame of the gripper, and in view."""
+
+
+def looking(**more: Any) -> ros.CameraMount:
+    return ros.CameraMount(
+        parent="tool0", child="wrist", parent_from_child=LOOKING, intrinsics=CAMERA, **more
+    )
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_mujoco_renders_points_at_our_pixels(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
+    mujoco: Any = pytest.importorskip("mujoco")
+    balls = "".join(f'<geom type="sphere" size="0.004" pos="{" ".join(map(str, one))}"/>' for one in POINTS)
+    model = simulators.mjcf(looking()).replace("<worldbody>", f"<worldbody>{balls}")
+    model = mujoco.MjModel.from_xml_string(model)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, CAMERA.height, CAMERA.width) as renderer:
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(data, "wrist")
+        geom = renderer.render()[..., 0]
+    seen = [np.argwhere(geom == k).mean(0)[::-1] for k in range(len(POINTS))]
+    np.testing.assert_allclose(seen, project(CAMERA, apply(inverse(LOOKING), POINTS)), atol=0.3)
+
+
+def test_usd_camera_projects_points_to_our_pixels(tmp_path: Path):
+    pytest.importorskip("pxr", reason="usd-core is for tests: pip install usd-core")
+    from pxr import Usd, UsdGeom  # pyright: ignore[reportMissingImports]
+
+    (tmp_path / "camera.usda").write_text(simulators.usd(looking(doubt='a "quoted" \\ reason')))
+    stage = Usd.Stage.Open(str(tmp_path / "camera.usda"))
+    assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (1.0, "Z")
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/tool0/wrist")).GetCamera(Usd.TimeCode.Default())
+    both = np.array(camera.frustum.ComputeViewMatrix() * camera.frustum.ComputeProjectionMatrix())
+    ndc = np.column_stack([POINTS, np.ones(len(POINTS))]) @ both
+    x, y = (ndc[:, :2] / ndc[:, 3:]).T
+    found = np.column_stack([(x + 1) / 2 * CAMERA.width, (1 - y) / 2 * CAMERA.height]) - 0.5
+    np.testing.assert_allclose(found, project(CAMERA, apply(inverse(LOOKING), POINTS)), atol=1e-4)
+
+
+def test_simulators_state_what_a_pinhole_leaves_out():
+    assert simulators.residual_px(CAMERA) == (pytest.approx(0, abs=1e-9), pytest.approx(0, abs=1e-9))
+    bent = replace(CAMERA, distortion=(-0.2, 0.06, 0.0, 0.0, 0.0))
+    rms, largest = simulators.residual_px(bent)
+    corners = np.array([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0], [639.0, 479.0]])
+    straight = cv2.undistortPoints(
+        corners[:, None], CAMERA.matrix, np.array(bent.distortion), P=CAMERA.matrix
+    )[:, 0]
+    assert largest == pytest.approx(np.linalg.norm(straight - corners, axis=1).max(), rel=1e-2)
+    assert 0 < rms < largest
+    assert f"{rms:.2f} px (rms)" in simulators.mjcf(replace(looking(), intrinsics=bent))
+
+
+ROBOT = """<?xml version="1.0"?>
+<robot name="arm" xmlns:xacro="http://ros.org/wiki/xacro">
+  <!-- <joint name="old" type="fixed"><child link="optical"/><origin xyz="9 9 9"/></joint> -->
+  <xacro:property name="pi" value="3.14"/>\r
+  <joint name="first" type="revolute"><parent link="base"/><child link="tool0"/><origin xyz="1 2 3"/></joint>
+  <joint type="fixed"   name="camera">
+      <parent link="${prefix}tool0"/> <!-- keep -->
+      <child  link='optical' />
+      <origin   xyz="${a} 0 0"
+                rpy="0 0 0"/>   <!-- measured by hand -->
+  </joint>
+</robot>
+"""
+
+
+def test_the_joint_of_a_robots_own_urdf_is_replaced_and_all_else_kept(done: Path, tmp_path: Path, capsys):
+    file = tmp_path / "arm.urdf.xacro"
+    file.write_bytes(ROBOT.encode())
+    options = ["--into", file, "--parent-frame", "tool0", "--child-frame", "optical"]
+    path = export(done, "urdf", tmp_path / "new.xacro", *options)
+    new, x = (
+        path.read_bytes().decode(),
+        np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"]),
+    )
+    written = ros.urdf_origin(x)
+    assert new == ROBOT.replace('<origin   xyz="${a} 0 0"\n                rpy="0 0 0"/>', written)
+    plain = tmp_path / "plain.urdf"
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "tool0", "optical"))
+    plain.write_text(new.replace("${prefix}", "").replace("<xacro:property", f"{links}<xacro:property").replace(
+        '<xacro:property name="pi" value="3.14"/>', "").replace('type="revolute"', 'type="fixed"'))  # fmt: skip
+    np.testing.assert_allclose(yourdfpy.URDF.load(plain).get_transform("optical", "tool0"), x, atol=1e-9)
+    # A joint without an origin gets one; the user's own file is replaced with --overwrite alone.
+    file.write_bytes(ROBOT.replace('<origin   xyz="${a} 0 0"\n                rpy="0 0 0"/>', "").encode())
+    assert written in export(done, "urdf", tmp_path / "other.xacro", *options).read_text()
+    command = ["export", str(done), "urdf", str(file), *map(str, options)]
+    assert dispatch(command) == 2 and "--overwrite" in capsys.readouterr().err
+    assert dispatch([*command, "--overwrite"]) == 0 and written in file.read_text()
+    faults = {
+        "no joints have the child optical": ROBOT.replace("'optical'", "'lens'"),
+        "2 joints have the child": ROBOT.replace('"tool0"/><origin', '"optical"/><origin'),
+        "has the parent flange": ROBOT.replace("${prefix}tool0", "flange"),
+        "is not fixed": ROBOT.replace('type="fixed"   ', 'type="floating" '),
+    }
+    for words, text in faults.items():
+        file.write_text(text)
+        assert dispatch([*command, "--overwrite"]) == 2 and words in capsys.readouterr().err
+
+
+def test_depth_images_lie_on_the_scene(
+    done: Path, tabletop: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path
+):
+    folder = export(done, "depth", tmp_path / "depth")
+    metres = export(done, "depth", tmp_path / "metres", "--float-depth")
+    content = json.loads((folder / "cameras.json").read_text())
+    matrix, frame = np.array(content["K"]), content["frames"][3]
+    depth = cv2.imread(str(folder / frame["depth"]), cv2.IMREAD_UNCHANGED)
+    exact = np.load(metres / json.loads((metres / "cameras.json").read_text())["frames"][3]["depth"])
+    assert (
+        depth is not None
+        and depth.dtype == np.uint16
+        and depth.shape == (content["height"], content["width"])
+    )
+    np.testing.assert_allclose(depth / content["depth_scale"], exact, atol=5.1e-4)
+    rows = np.argwhere(depth > 0)[::211]
+    z = depth[tuple(rows.T)] / content["depth_scale"]
+    rays = np.column_stack([rows[:, ::-1], np.ones(len(rows))]) @ np.linalg.inv(matrix).T
+    in_base = apply(np.array(frame["base_from_camera"]), z[:, None] * rays)
+    _, distance, _ = trimesh.proximity.closest_point(true_mesh, in_base)
+    assert np.median(distance) < 1.5e-3 and len(rows) > 200
+    color = read_image(folder / frame["color"])
+    assert color.shape == (*depth.shape, 3)
+
+
+def test_open3d_fuses_the_depth_images(done: Path, tabletop: Path, tmp_path: Path):
+    o3d: Any = pytest.importorskip("open3d", reason="a wheel of 400 MB, tested where it is installed")
+    folder = export(done, "depth", tmp_path / "depth")
+    content = json.loads((folder / "cameras.json").read_text())
+    kinds, device = 3 * (o3d.core.float32,), o3d.core.Device("CPU:0")
+    names = ("tsdf", "weight", "color")
+    grid = o3d.t.geometry.VoxelBlockGrid(names, kinds, ((1), (1), (3)), 0.005, 16, 20_000, device)
+    matrix, scale = o3d.core.Tensor(np.array(content["K"])), content["depth_scale"]
+    for frame in content["frames"]:
+        depth, color = (o3d.t.io.read_image(str(folder / frame[kind])) for kind in ("depth", "color"))
+        camera_from_base = o3d.core.Tensor(np.linalg.inv(frame["base_from_camera"]))
+        blocks = grid.compute_unique_block_coordinates(depth, matrix, camera_from_base, scale, 3.0)
+        grid.integrate(blocks, depth, color, matrix, matrix, camera_from_base, scale, 3.0)
+    z = np.asarray(grid.extract_triangle_mesh().to_legacy().vertices)[:, 2]
+    height = read_truth(tabletop).table_height
+    assert np.median(z[np.abs(z - height) < 0.01]) == pytest.approx(height, abs=1e-3)
+
+
+def test_the_cameras_of_a_data_set_are_a_table_by_episode(done: Path, tmp_path: Path):
+    parquet: Any = pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "set/meta").mkdir(parents=True)
+    (tmp_path / "set/meta/info.json").write_text("{}")
+    for episode in (7, 3):
+        run = tmp_path / f"all/set-episode-{episode}"
+        (run / "capture").mkdir(parents=True)
+        for name in ("calibration.json", "uncertainty.npz"):
+            (run / name).symlink_to(done / name)
+        made_from = [
+            str(tmp_path / "set"),
+            "",
+            {"episode": [episode], "camera_topic": "observation.images.wrist"},
+        ]
+        (run / "capture/capture.json").write_text(json.dumps({"made_from": made_from}))
+    table = parquet.read_table(export_run(tmp_path / "all", "lerobot"))
+    rows = table.to_pylist()
+    assert [row["episode_index"] for row in rows] == [3, 7]
+    content = json.loads((done / "calibration.json").read_text())
+    found = np.reshape(rows[0]["gripper_from_camera"], (4, 4))
+    np.testing.assert_allclose(found, content["gripper_from_camera"])
+    assert rows[0]["camera"] == "observation.images.wrist" and rows[0]["fx"] == content["intrinsics"]["fx"]
+    assert json.loads(table.schema.metadata[b"jcr"])["unit"] == "m"
+
+
 def test_names_that_are_no_frames_are_refused():
     for name in ("", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"):
         with pytest.raises(InputError, match="frame"):
@@ -232,6 +407,7 @@ def views(tmp_path: Path) -> "PosedImages":
         intrinsics=INTRINSICS,
         tracks=tracks,
         points_in_base=points,
+        base_from_recon=Similarity(np.eye(4), 1.0),
     )
 
 
@@ -452,7 +628,14 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
 ):
     run = tmp_path / "run"
     run.mkdir()
-    for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json", "uncertainty.npz"):
+    for name in (
+        "cloud.ply",
+        "map.safetensors",
+        "reconstruction.npz",
+        "run.json",
+        "uncertainty.npz",
+        "depth.npz",
+    ):
         (run / name).symlink_to(done / name)
     content = json.loads((done / "calibration.json").read_text())
     findings = [
@@ -462,8 +645,8 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
     content |= {"converged": False, "verdict": "rejected", "findings": findings}
     (run / "calibration.json").write_text(json.dumps(content))
     for row in FORMATS:
-        if row.name == "rerun":
-            continue  # needs an extra; tested where it is
+        if row.name in ("rerun", "lerobot"):
+            continue  # needs an extra, or an episode; tested where they are
         path = run / "export" / row.file
         assert dispatch(["export", str(run), row.name]) == 3 and not path.exists()
         complaint = capsys.readouterr().err
@@ -473,7 +656,9 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
         assert dispatch(["export", str(run), row.name, "--force"]) == 0
         assert DOUBT in capsys.readouterr().err
         files = (
-            [path] if path.is_file() else [path / "README.txt", path / "transforms.json", path / "points.ply"]
+            [path]
+            if path.is_file()
+            else [path / name for name in ("README.txt", "transforms.json", "points.ply", "cameras.json")]
         )
         files = [file for file in files if file.exists()]
         assert files
@@ -496,6 +681,9 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
         (["urdf", "--child-frame", "tool0"], "different"),
         (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
         (["urdf", "--to-root", "a", "--root-from-optical", *"0000000"], "quaternion"),
+        (["mjcf", "--to-root", "a"], "camera itself"),
+        (["mjcf", "--into", "a.urdf"], "is for the format urdf"),
+        (["lerobot"], "no run of an episode"),
     ],
 )
 def test_what_cannot_be_exported_is_one_line(

@@ -86,7 +86,7 @@ class ExportCommand:
         ),
     ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None
-    """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
+    """File or (nerfstudio, colmap, depth) new folder to write; by default in OUT/export."""
     export: ExportOptions = field(default_factory=ExportOptions)
     output: Output = field(default_factory=Output)
 

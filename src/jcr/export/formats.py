@@ -28,7 +28,7 @@ from jcr.scene.map_file import load_map
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
     from jcr.export.views import PosedImages
-    from jcr.records import Intrinsics, PointCloud
+    from jcr.records import Intrinsics, PointCloud, Pointmaps
     from jcr.scene.scene_map import SceneMap
 
 
@@ -42,19 +42,21 @@ class ExportFormat:
     about: str
     writer: str
     """Module and function in jcr.export that write the format, as MODULE.FUNCTION. The module is imported on use,
-    because torch and pycolmap take seconds. Functions of `ros` return a text; the others take the path to write as
+    because torch and pycolmap take seconds. Functions of TEXTS return a text; the others take the path to write as
     first argument."""
     contents: str
     """Attributes of `ExportedRun` that are passed to the writer, separated by spaces."""
 
 
+TEXTS = ("ros", "simulators")
+"""Modules whose writers return a text."""
 # fmt: off
 FORMATS = (
     ExportFormat("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file",
                  "ros.ros2_launch", "mount others"),
     ExportFormat("moveit", "hand_eye.launch.py", "launch file as MoveIt Calibration saves it",
                  "ros.moveit_launch", "mount"),
-    ExportFormat("urdf", "hand_eye.urdf", "camera link and fixed joint", "ros.urdf", "mount others"),
+    ExportFormat("urdf", "hand_eye.urdf", "camera link and fixed joint", "ros.urdf", "mount others options"),
     ExportFormat("easy_handeye2", "hand_eye.calib", ".calib for its publisher", "ros.easy_handeye2", "mount path.stem"),
     ExportFormat("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager",
                  "ros.camera_info", "camera_frame"),
@@ -69,6 +71,12 @@ FORMATS = (
                  "views.write_nerfstudio", "views cloud notes options"),
     ExportFormat("colmap", "colmap/", "COLMAP model in the base frame, binary and text",
                  "views.write_colmap", "views notes options"),
+    ExportFormat("depth", "depth/", "depth and colour images with their cameras, for TSDF mappers",
+                 "views.write_depth", "pointmaps views notes options"),
+    ExportFormat("lerobot", "cameras.parquet", "cameras of a LeRobot data set, by episode",
+                 "dataset.write_lerobot", "episodes notes"),
+    ExportFormat("mjcf", "hand_eye.xml", "camera for MuJoCo", "simulators.mjcf", "mount"),
+    ExportFormat("usd", "hand_eye.usda", "camera for Isaac Sim and others that read USD", "simulators.usd", "mount"),
     ExportFormat("rerun", "run.rrd", "recording for the Rerun viewer",
                  "volume.write_rrd", "views cloud scene map_notes"),
 )
@@ -106,8 +114,14 @@ def write_run(
         raise InputError(f"{format}: no such format{did_you_mean(format, names)}; choose {', '.join(names)}")
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
-    path = path or out / "export" / row.file
-    run = ExportedRun(out, options, path)
+    if options.to_root and format in ("mjcf", "usd", "lerobot"):
+        raise InputError(f"--to-root: is for files of frames; {format} has the camera itself, leave it out")
+    if options.into is not None and format != "urdf":
+        raise InputError(f"--into {options.into}: is for the format urdf")
+    path = path or out / "export" / (row.file if options.into is None else options.into.name)
+    run = ExportedRun(
+        *_sound_runs(out, options) if format == "lerobot" else [out], options=options, path=path
+    )
     if run.doubt is not None and not options.force:
         raise RejectedError(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
@@ -122,8 +136,8 @@ def write_run(
         write(path, *values)
         return run, row, path
     with written_whole(path) as temporary:
-        if module == "ros":
-            temporary.write_text(write(*values), "utf-8")
+        if module in TEXTS:
+            temporary.write_text(write(*values), "utf-8", newline="")
         else:
             write(temporary, *values)
         if path.is_file() and not options.overwrite and path.read_bytes() != temporary.read_bytes():
@@ -134,11 +148,20 @@ def write_run(
     return run, row, path
 
 
+def _sound_runs(out: Path, options: ExportOptions) -> list[Path]:
+    """Return the runs of a batch that are not rejected (with `options.force` all), or the run `out` alone."""
+    from jcr.export.dataset import runs_in
+
+    folders = runs_in(out)
+    sound = [one for one in folders if options.force or RunResult(one).calibration.doubt is None]
+    return sound or folders[:1]
+
+
 class ExportedRun:
     """Contents of a run folder for export; each property reads its data from the folder when it is used."""
 
-    def __init__(self, out: Path, options: ExportOptions, path: Path) -> None:
-        self.options, self.run, self.path = options, RunResult(out), path
+    def __init__(self, out: Path, *others: Path, options: ExportOptions, path: Path) -> None:
+        self.options, self.run, self.path, self.folders = options, RunResult(out), path, (out, *others)
         self.calibration = self.run.calibration
         if self.calibration.parent_from_camera is None:
             raise InputError(
@@ -309,6 +332,20 @@ class ExportedRun:
         )
 
     @property
+    def episodes(self) -> list[dict[str, Any]]:
+        """Row of each run of an episode of a LeRobot data set."""
+        from jcr.export.dataset import episodes_of
+
+        return episodes_of(self.folders)
+
+    @property
+    def pointmaps(self) -> "Pointmaps":
+        """Dense depth of the registered images; raises InputError for a run without depth."""
+        if (found := self.run.reconstruction.pointmaps) is None:
+            raise InputError(f"{self.run.out}: has no dense depth; make it with `jcr map {self.run.out}`")
+        return found
+
+    @property
     def views(self) -> "PosedImages":
         """Registered images with their camera poses, tracks and points in the base frame (m).
 
@@ -328,4 +365,5 @@ class ExportedRun:
             intrinsics=found.intrinsics,
             tracks=found.tracks,
             points_in_base=base_from_recon(found.tracks.points_in_recon),
+            base_from_recon=base_from_recon,
         )

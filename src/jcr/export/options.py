@@ -1,6 +1,7 @@
 """Export formats, their options and the notes in exported files, without the writers, so that help loads fast."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -9,7 +10,7 @@ from jcr import __version__
 
 ExportName = Literal[
     "ros2", "moveit", "urdf", "easy_handeye2", "camera_info", "ply", "glb", "octomap", "esdf", "spheres",
-    "nerfstudio", "colmap", "rerun",
+    "nerfstudio", "colmap", "depth", "lerobot", "mjcf", "usd", "rerun",
 ]  # fmt: skip
 
 
@@ -44,6 +45,11 @@ class ExportOptions:
     """State of unseen space: by default occupied in esdf, free (left out) in spheres."""
     excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres by which spheres may extend into free space; by default two cells of the map."""
+    into: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """urdf: a copy of this URDF or xacro of a robot, in which the origin of the camera's joint is replaced, and all else
+    is kept. The joint is the one whose child is the camera's frame (--child-frame, --to-root)."""
+    float_depth: bool = False
+    """Depth images of `depth` as .npy in metres (float32) instead of 16-bit PNG in millimetres."""
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     force: bool = False

@@ -6,6 +6,7 @@ Every text contains the names of its frames, its units, the intrinsics of the ca
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from jcr import __version__
 from jcr.errors import InputError
+from jcr.export.options import ExportOptions
+from jcr.files import read_bytes
 from jcr.geometry import inverse, roll_pitch_yaw, transform
 from jcr.records import COEFFICIENTS, FRAME_NAME, Intrinsics
 
@@ -136,11 +139,14 @@ def generate_launch_description() -> LaunchDescription:
 '''
 
 
-def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
+def urdf(mount: CameraMount, others: Sequence[CameraMount] = (), options: ExportOptions | None = None) -> str:
     """Return a URDF with a fixed joint for each camera and each other arm, and with a single root link.
 
     If there are cameras on a gripper and fixed cameras, a floating joint stands for the arm between base and gripper.
+    With `options.into`, that robot description is returned, with the origin of the camera's joint replaced.
     """
+    if options is not None and options.into is not None:
+        return _into_robot(options.into, mount)
     every = (mount, *others)
     fixed = [_joint(one.parent, one.child, urdf_origin(one.parent_from_child)) for one in every]
     joints = [f"{_xml_comment(*notes(one))}\n{joint}" for one, joint in zip(every, fixed, strict=True)]
@@ -159,6 +165,64 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
 {fixed[0]}  -->
 </robot>
 """
+
+
+_COMMENT, _JOINT = (
+    re.compile(r"<!--.*?-->", re.DOTALL),
+    re.compile(r"<joint\b[^>]*>.*?</joint\s*>", re.DOTALL),
+)
+_ORIGIN = re.compile(r"<origin\b[^>]*?(?:/>|>\s*</origin\s*>)", re.DOTALL)
+
+
+def _into_robot(file: Path, mount: CameraMount) -> str:
+    """Return a URDF or xacro file with the transform of a mount as origin of the joint whose child is the mount's child.
+
+    All other text is kept. Expressions of xacro in the names of links are ignored. Raises InputError unless there is one
+    such joint, fixed and below the parent of the mount.
+    """
+    try:
+        text = read_bytes(file).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{file}: cannot be read as UTF-8 text ({error}); name the URDF or xacro of a robot"
+        ) from None
+    # Comments keep their place and length, so that places are those of the text.
+    plain = _COMMENT.sub(lambda found: " " * len(found[0]), text)
+    joints = {found: _links_of(found[0]) for found in _JOINT.finditer(plain)}
+    own = [found for found, (_, child) in joints.items() if child == mount.child]
+    if len(own) != 1:
+        children = ", ".join(sorted({child for _, child in joints.values()})) or "none"
+        raise InputError(
+            f"{file}: {len(own) or 'no'} joints have the child {mount.child}; name one of its links by --child-frame or "
+            f"--to-root: {children}"
+        )
+    (joint,) = own
+    if (parent := joints[joint][0]) != mount.parent:
+        raise InputError(
+            f"{file}: the joint of {mount.child} has the parent {parent}, the transform is from {mount.parent}; give "
+            "poses of that link, or change the joint"
+        )
+    if not re.match(r"""<joint\b[^>]*\btype\s*=\s*["']fixed["']""", joint[0]):
+        raise InputError(f"{file}: the joint of {mount.child} is not fixed; make it fixed")
+    origin = _ORIGIN.search(joint[0])
+    if origin is not None:
+        start, end = joint.start() + origin.start(), joint.start() + origin.end()
+        return text[:start] + urdf_origin(mount.parent_from_child) + text[end:]
+    start = joint.start() + joint[0].index(">") + 1
+    space = re.match(r"\s*", plain[start:])
+    assert space is not None
+    return text[:start] + space[0] + urdf_origin(mount.parent_from_child) + text[start:]
+
+
+def _links_of(joint: str) -> tuple[str, str]:
+    """Return the names of the parent and child link in the text of a URDF joint, without expressions of xacro."""
+    names = [
+        re.search(rf"""<{kind}\b[^>]*\blink\s*=\s*["']([^"']*)["']""", joint) for kind in ("parent", "child")
+    ]
+    parent, child = (
+        "" if name is None else re.sub(r"\$\{[^}]*\}|\$\([^)]*\)", "", name[1]) for name in names
+    )
+    return parent, child
 
 
 def _joint(parent: str, child: str, origin: str | None = None) -> str:

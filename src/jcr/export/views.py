@@ -17,8 +17,8 @@ from jcr.camera import is_distorted, pinhole_inside, project, undistortion, unpr
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
-from jcr.geometry import inverse
-from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Tracks
+from jcr.geometry import Similarity, apply, inverse
+from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Pointmaps, Tracks
 from jcr.scene.cloud import write_cloud
 from jcr.sfm.model import colmap_camera
 
@@ -40,6 +40,7 @@ class PosedImages:
     tracks: Tracks
     points_in_base: Float[ndarray, "p 3"]
     """Positions (m) of the p points of `tracks`."""
+    base_from_recon: Similarity
 
 
 def write_nerfstudio(
@@ -120,6 +121,49 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
         model.write_text(str(sparse))
         about = "".join(f"{name}: {text}\n" for name, text in notes.items())
         (made / "README.txt").write_text(f"{about}The world is that frame; cameras are world to camera.\n")
+
+
+def write_depth(
+    folder: Path, pointmaps: Pointmaps, views: PosedImages, notes: dict[str, str], options: ExportOptions
+) -> None:
+    """Write depth and colour images without distortion, and cameras.json with K and base_from_camera, into a new folder.
+
+    Depth is z along the optical axis: 16-bit PNG in mm, or .npy in m (float32) with `options.float_depth`; 0 where there
+    is none. Pixel (0, 0) is the centre of the first pixel. `notes` are stored in cameras.json.
+    """
+    camera, frames = pointmaps.intrinsics, []
+    with _new_folder(folder) as made:
+        names = _file_names(views.images, ".png")
+        for kind in ("color", "depth"):
+            (made / kind).mkdir()
+        for k, name in enumerate(names):
+            in_base = views.base_from_recon(pointmaps.points_in_recon[k].reshape(-1, 3))
+            z = apply(inverse(views.base_from_camera[k]), in_base)[:, 2].reshape(camera.height, camera.width)
+            z = np.where((pointmaps.confidence[k] > 0) & (z > 0), z, 0.0)
+            file = f"depth/{name}" if not options.float_depth else f"depth/{Path(name).stem}.npy"
+            if options.float_depth:
+                np.save(made / file, z.astype(np.float32))
+            else:
+                (made / file).write_bytes(encode_png((1e3 * z).round().clip(0, 65535).astype(np.uint16)))
+            (made / f"color/{name}").write_bytes(encode_png(pointmaps.colors[k]))
+            frames.append(
+                {
+                    "depth": file,
+                    "color": f"color/{name}",
+                    "image": views.images[k],
+                    "base_from_camera": views.base_from_camera[k].tolist(),
+                }
+            )
+        content = {
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.matrix.tolist(),
+            "depth_scale": 1.0 if options.float_depth else 1000.0,
+            "frames": frames,
+            "about": notes
+            | {"axes": "camera x right, y down, z forward; depth z = value / depth_scale, metres"},
+        }
+        (made / "cameras.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
 
 
 def _place_images(folder: Path, views: PosedImages, options: ExportOptions) -> tuple[list[str], Intrinsics]:

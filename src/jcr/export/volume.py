@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MAX_VOXELS = 50_000_000
 _GRIPPER_AXES_M = 0.05
-_SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
+_SIGN = "positive outside of what is solid, negative inside, metres"
 
 
 def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
@@ -53,7 +53,7 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
     """Write the signed distance (m) at the centres of voxels in the base frame as .npz, positive outside of solids.
 
     The side of a voxel is `options.voxel_size` m, by default the map's cell. Unseen space counts as occupied by
-    default. The arrays follow cuRobo except for the sign: `values` (nx,ny,nz), x slowest; `origin` (3,), the centre of
+    default. The arrays follow cuRobo's VoxelGrid: `values` (nx,ny,nz), x slowest; `origin` (3,), the centre of
     the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and quaternion w x y z.
     The texts `sign` and `unknown` follow, and those of `notes` (frame, unit and others).
     """
