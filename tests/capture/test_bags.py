@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -55,6 +55,19 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
             files = got.folder / name, capture.folder / capture.images[k]
             image, original = (read_image(file).astype(int) for file in files)
             assert kind != "sqlite3" or np.abs(image - original).max() <= 1  # raw; the bag adds noise
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "images"), [("ros1", 1), ("sqlite3", 2)])
+def test_a_camera_that_is_triggered_has_a_view_at_each_stop(
+    tmp_path: Path, capture: Capture, kind: Literal["ros1", "sqlite3"], images: int
+):
+    """One image at each stop, and another one on the way."""
+    bag = write_bag(
+        tmp_path / ("scan.bag" if kind == "ros1" else "scan"), capture, kind, 12.0, fps=images, tf_hz=20.0
+    )
+    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
+    assert sorted(nearest_view(got.base_from_gripper, capture.base_from_gripper)[2]) == list(range(12))
 
 
 def test_depth_messages_are_read_in_every_encoding():

@@ -7,19 +7,22 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 import jcr
-from capture_writers import rows_as
+from capture_writers import rows_as, write_easy_handeye2, write_moveit
 from in_process import run_jcr
+from jcr.calibration.checks.convention import better_reading
 from jcr.capture.discovery import find_images
 from jcr.capture.documents import Table
 from jcr.capture.notations import numbers_of
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import readings_of
 from jcr.estimation.pose_misfit import Misfit, pose_misfit
+from jcr.findings import sentence
 from jcr.geometry import inverse, transform
 from jcr.pipeline.decision import decide
 from jcr.records import Capture
@@ -105,6 +108,24 @@ def test_folders_are_read_without_options(layout: str, tmp_path: Path):
     fitting = [got.base_from_gripper] if got.reading else [poses for _, poses in got.candidates]
     assert any(np.allclose(poses, POSES, rtol=0, atol=1e-9) for poses in fitting)
     assert any("paired with the images" in note for note in got.notes)
+
+
+@pytest.mark.parametrize("name", ["poses.yml", "poses.xml", "poses.json"])
+def test_a_file_storage_of_opencv_is_read(name: str, tmp_path: Path):
+    """Matrices beside intrinsics, and the rows of one matrix."""
+    storage = cv2.FileStorage(str(draw(tmp_path) / name), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array([[30.0, 0, 15], [0, 30, 12], [0, 0, 1]]))
+    storage.write("image_width", 32)
+    storage.write("image_height", 24)
+    if name == "poses.json":
+        storage.write("tcp", POSES.reshape(COUNT, 16))
+    for k, pose in enumerate(POSES if name != "poses.json" else ()):
+        storage.write(f"T_base_gripper_{k}", pose)
+    storage.release()
+    got = jcr.read_capture(tmp_path, {"camera_info": tmp_path / name})
+    assert got.intrinsics is not None and got.intrinsics.fx == 30
+    fitting = [got.base_from_gripper] if got.reading else [poses for _, poses in got.candidates]
+    assert any(np.allclose(poses, POSES, rtol=0, atol=1e-9) for poses in fitting)
 
 
 def test_names_in_another_unicode_form_and_rows_in_another_order(tmp_path: Path):
@@ -363,19 +384,61 @@ def test_an_inverted_marker_is_never_accepted(way: tuple[str, ...], tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("case", "way", "option"),
+    ("inverted", "write", "way"),
+    [("marker", write_moveit, ()), ("gripper", write_easy_handeye2, ("--pose-inverted",))],
+)
+def test_pairs_with_an_inverse_are_never_accepted(
+    inverted: str, write: Callable[..., Path], way: tuple[str, ...], tmp_path: Path
+):
+    gripper, marker = PROBLEM.base_from_gripper, PROBLEM.recon_from_camera
+    pairs = (inverse(gripper), marker) if inverted == "gripper" else (gripper, inverse(marker))
+    done = run_jcr("calibrate", write(tmp_path / "in", *pairs), tmp_path / "out", *way)
+    assert done.returncode == 3 and "either the gripper poses or the marker poses are inverted" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case", "convention", "option"),
     [
-        ("zyz", (), "ZYZ"),
-        ("euler_as_vector", ("--pose-convention", "xarm-axis-angle"), "euler:xyz"),
-        ("vector_as_euler", ("--pose-convention", "yaskawa"), "rotvec"),
+        ("zyz", "auto", "euler:ZYZ"),
+        ("euler_as_vector", "xarm-axis-angle", "euler:xyz"),
+        ("vector_as_euler", "yaskawa", "rotvec"),
     ],
 )
-def test_the_convention_that_fits_is_found(case: str, way: tuple[str, ...], option: str, tmp_path: Path):
+def test_the_convention_that_fits_is_found(case: str, convention: str, option: str, tmp_path: Path):
+    """Read as jcr check does, with the true cameras of the bundled images in place of a reconstruction."""
     folder = SHARED / "inputs" / "cases" / "convention_not_found" / case
     if not folder.is_dir():
         pytest.skip(f"the inputs of others are not at {folder}")
     shutil.copytree(folder, tmp_path / "a")
     shutil.copytree(ROOT / "examples/tabletop/images", tmp_path / "a/images", dirs_exist_ok=True)
-    done = run_jcr("check", tmp_path / "a", *way)
-    assert option in done.stdout + done.stderr and "check the pairing" not in done.stdout, done.stdout
-    assert done.returncode == (3 if way else 0)
+    capture = jcr.read_capture(tmp_path / "a", {"pose_convention": convention})
+    true = jcr.read_capture(ROOT / "examples/tabletop").base_from_gripper
+    x = np.array(json.loads((ROOT / "examples/tabletop/reference.json").read_text())["gripper_from_camera"])
+    if convention == "auto":
+        reading = decide(capture, true @ x, np.arange(12)).reading
+        assert reading is not None and reading.notation == option
+    else:
+        (found,) = better_reading(
+            capture.base_from_gripper, true @ x, True, capture.images, np.arange(12), capture.untaken
+        )
+        assert f"give --pose-convention {option}" in sentence(found)
+
+
+@pytest.mark.slow
+def test_the_images_decide_once_and_the_run_keeps_the_reading(tmp_path: Path):
+    """Seven bundled images, and a listing in the notation of Doosan without any name."""
+    capture = jcr.read_capture(ROOT / "examples/tabletop")
+    (tmp_path / "a").mkdir()
+    for name in capture.images[:7]:
+        shutil.copy(capture.folder / name, tmp_path / "a")
+    poses = capture.base_from_gripper[:7]
+    angles = np.degrees(numbers_of(poses[:, :3, :3], "euler:ZYZ"))
+    np.savetxt(tmp_path / "a/list.txt", np.hstack([1e3 * poses[:, :3, 3], angles]), "%.6f")
+    done = run_jcr("calibrate", tmp_path / "a", tmp_path / "out")
+    assert done.returncode == 0 and "angles ZYZ in degrees" in done.stdout, done.stdout + done.stderr
+    assert "decided by the images" in done.stdout
+    kept = jcr.read_capture(tmp_path / "out/capture")
+    assert kept.reading is not None and kept.reading.decided_by == "images" and len(kept) == 7
+    np.testing.assert_allclose(kept.base_from_gripper, poses, atol=1e-8)
+    assert "unchanged" in run_jcr("calibrate", tmp_path / "a", tmp_path / "out").stderr

@@ -11,6 +11,7 @@ import pytest
 
 import capture_writers as writers
 import jcr
+from jcr.capture.formats.lerobot import Feature, _poses
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.records import Capture
@@ -125,6 +126,44 @@ def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: P
         jcr.read_capture(path, options, into=tmp_path / "more")
     with pytest.raises(jcr.InputError, match="pan, lift, roll, grip are no pose; give --urdf"):
         jcr.read_capture(path, into=tmp_path / "more")
+
+
+JOINTS = [f"joint_{k}" for k in range(7)]
+
+
+@pytest.mark.parametrize(
+    ("names", "notation"),
+    [
+        (["gripper", *XYZRPY], "rpy"),
+        ([*JOINTS, "gripper", "x", "y", "z", "qx", "qy", "qz", "qw"], "quat:xyzw"),
+        ([f"ee.{name}" for name in ("x", "y", "z", "wx", "wy", "wz")], "rotvec"),
+    ],
+)
+@pytest.mark.parametrize("option", ["auto", "asked"])
+def test_a_pose_is_found_by_its_names_whatever_option_is_given(
+    problem: HandEyeProblem, names: list[str], notation: str, option: str
+):
+    numbers = writers.rows_as(notation, problem.base_from_gripper)
+    others = np.random.default_rng(0).uniform(-1, 1, (12, len(names)))
+    others[:, len(names) - numbers.shape[1] :] = numbers
+    options = ReadOptions(pose_convention="auto" if option == "auto" else notation)
+    got, joints = _poses(others, "observation.state", Feature(names=names), options, Path("set"), None)
+    assert joints is None and np.allclose(got, problem.base_from_gripper, atol=1e-9)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("path", [None, "absent"])
+def test_a_set_of_images_has_no_path_of_videos(
+    tmp_path: Path, tabletop: Path, version: str, path: str | None
+):
+    states = np.zeros((4, 6)) + 0.05 * np.arange(4)[:, None]
+    episode = pictured(tabletop, 4), walked(states)
+    folder = writers.write_lerobot(tmp_path / "set", [episode], version, DROID, XYZRPY, codec=None)
+    content = json.loads((folder / "meta/info.json").read_text()) | {"video_path": None}
+    if path == "absent":
+        del content["video_path"]
+    (folder / "meta/info.json").write_text(json.dumps(content))
+    assert len(jcr.read_capture(folder, ReadOptions(frames=4), into=tmp_path / "frames")) == 4
 
 
 @pytest.fixture(scope="module")
