@@ -106,9 +106,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         about = f"{len(capture)} images of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     undecided = isinstance(capture, Capture) and bool(capture.candidates)
-    outcome = {"accepted": "good to calibrate", "rejected": "a calibration would be rejected"}.get(
-        found.verdict, "take more images first, or calibrate with another --require"
-    )
+    outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
+    if found.verdict not in ("accepted", "rejected") and command.require != "none":
+        outcome = f"a calibration would miss {command.require[0]:g} mm and {command.require[1]:g}°"
     verdict = verdict_in_words(found.findings)
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"

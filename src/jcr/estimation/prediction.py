@@ -75,6 +75,9 @@ class Assumptions:
     """Camera whose images are simulated; None: the camera poses are given and exact."""
     scale_std: float | None = None
     """Relative standard deviation of a known scale; None: the scale is unknown."""
+    shifts: tuple[Float[ndarray, " k"], ...] = ()
+    """Changes of the calibration that found faults explain, in COVARIANCE_ORDER and then of the intrinsics, which more
+    images do not reduce."""
 
 
 def assumed(
@@ -160,6 +163,9 @@ def predict(
         images.information[np.diag_indices(len(images.information))] += UNCONNECTED
         found = with_covariance(problem, state, images, expected=noise)
         uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
+    for shift in assumptions.shifts:
+        shift = shift if uncertainty.joint is not None else shift[:7]
+        uncertainty = uncertainty.with_error(np.outer(shift, shift))
     return replace(uncertainty, seen=seen_points(x, uncertainty, intrinsics, assumptions.distance_m))
 
 

@@ -235,6 +235,11 @@ def assumptions_of(case: Case) -> Assumptions:
         noise=case.calibration.robot_noise,
         scale_std=case.reconstruction.metric_std,
         camera=None if case.solution is None or distance_m is None else PredictedCamera.of(case.solution),
+        shifts=tuple(
+            np.array([*one.shift, *(one.intrinsics_shift or ())])
+            for one in case.calibration.findings
+            if one.shift is not None
+        ),
     )
 
 
