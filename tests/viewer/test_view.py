@@ -70,21 +70,22 @@ def viewer(done: Path, capture: Capture, gantry: Path) -> "Iterator[Viewer]":
 
     server = module.open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MAP_POINTS", 15_000)  # drawn without a graphics card
+        patch.setattr(module, "MOST_POINTS", 15_000)  # drawn without a graphics card
         yield module.Viewer(server, RunResult(done, capture=capture), gantry)
     server.stop()
 
 
 def test_points_are_those_of_the_map_or_of_the_cloud(viewer: "Viewer"):
-    from jcr.viewer.viewer import CLOUD
+    from jcr.report.scene3d import MEASURED
 
+    first = viewer.shown.value
     assert viewer.scene is not None and viewer.cloud is not None
     assert 5000 < len(viewer.points) <= 15_000
     assert np.percentile(np.abs(viewer.scene.query(viewer.points).distance), 95) < viewer.scene.cell / 2
-    viewer.shown.value = CLOUD
+    viewer.shown.value = MEASURED
     viewer.show_points()
-    assert len(viewer.points) == len(viewer.cloud.points_in_base)
-    viewer.shown.value = "map"
+    assert len(viewer.points) == 15_000 and np.isin(viewer.points, viewer.cloud.points_in_base).all()
+    viewer.shown.value = first
     viewer.show_points()
 
 
@@ -113,11 +114,12 @@ def test_sphere_becomes_red_in_an_object_and_where_nobody_looked(viewer: "Viewer
 
 
 def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", truth: Truth):
-    from jcr.viewer.viewer import CLOUD
+    from jcr.report.scene3d import MEASURED
 
+    first = viewer.shown.value
     book = next(thing for thing in truth.objects if thing.name == "book")
     x, y, z = book.base_from_box[:3, 3]
-    viewer.shown.value = CLOUD
+    viewer.shown.value = MEASURED
     viewer.show_points()
     said = viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, -1.0]))
     found = np.asarray(viewer._mark.position)
@@ -127,7 +129,7 @@ def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", t
     shown = float(re.findall(r"<td>([01]\.\d\d)(?:, unknown)?</td>", said)[0])
     assert abs(shown - at.occupancy[0]) < 0.05 and "images/" in said and "margin" in said
     assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
-    viewer.shown.value = "map"
+    viewer.shown.value = first
     viewer.show_points()
 
 

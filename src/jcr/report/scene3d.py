@@ -3,24 +3,28 @@
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.geometry import inverse, scale_translation
-from jcr.records import Intrinsics
+from jcr.records import Intrinsics, PointCloud
 from jcr.report.images import image_numbers, shown_names
 from jcr.report.render import TRACK_COLOR, Content, label_colors
 from jcr.result import RunResult
 from jcr.scene.surface import point_size, sample_surface
 
+if TYPE_CHECKING:
+    from jcr.scene.scene_map import SceneMap
+
 POINTS = 60_000
 """Largest number of points of a layer."""
 TRACK_SIZE = 0.006
 """Side (m) of the squares as which tracked features are drawn."""
-
+BY_LABEL, MEASURED = "map, predicted label", "points as measured"
+"""Names of layers."""
 
 PointLayer = tuple[str, Float[ndarray, "_ 3"], UInt8[ndarray, "_ 3"], float]
 """Layer of points that can be shown or hidden: name, points (m, base frame), RGB, and side (m) of their squares."""
@@ -33,18 +37,7 @@ def scene_section(result: RunResult) -> Content:
     base_from_camera = base_from_recon.rigid @ scale_translation(
         reconstruction.recon_from_camera, base_from_recon.scale
     )
-    layers, labels = [], []
-    if result.scene is not None:
-        (at, color, label), names = sample_surface(result.scene, POINTS), result.scene.label_names
-        layers.append(("map, predicted colour", at, color, size := point_size(at)))
-        if len(names) > 1:
-            palette = label_colors(len(names))
-            labels = list(zip(names, palette.tolist(), strict=True))
-            layers.append(("map, predicted label", at, palette[label], size))
-    if (cloud := result.cloud) is not None:
-        some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
-        at = cloud.points_in_base[some]
-        layers.append(("points as measured", at, cloud.color[some], point_size(at)))
+    layers, labels = point_layers(result.scene, result.cloud, POINTS)
     tracked = base_from_recon(reconstruction.tracks.points_in_recon)
     row_of, images = {int(row): k for k, row in enumerate(result.image_index)}, result.calibration.images
     views = [
@@ -77,6 +70,28 @@ def scene_section(result: RunResult) -> Content:
         "labels": labels,
         "data": data,
     }
+
+
+def point_layers(
+    scene: "SceneMap | None", cloud: PointCloud | None, most: int
+) -> tuple[list[PointLayer], list[tuple[str, list[int]]]]:
+    """Return the layers of a map and a cloud with at most `most` points each, and the name and RGB of each label.
+
+    There are no labels if the map has only one.
+    """
+    layers, labels = list[PointLayer](), []
+    if scene is not None:
+        (at, color, label), names = sample_surface(scene, most), scene.label_names
+        layers.append(("map, predicted colour", at, color, size := point_size(at)))
+        if len(names) > 1:
+            palette = label_colors(len(names))
+            labels = list(zip(names, palette.tolist(), strict=True))
+            layers.append((BY_LABEL, at, palette[label], size))
+    if cloud is not None:
+        some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:most]
+        at = cloud.points_in_base[some]
+        layers.append((MEASURED, at, cloud.color[some], point_size(at)))
+    return layers, labels
 
 
 def track_layer(name: str, points_in_base: Float[ndarray, "n 3"]) -> PointLayer:

@@ -27,11 +27,11 @@ from jcr.geometry import scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.report.images import image_numbers
-from jcr.report.render import TRACK_COLOR, label_colors, render
+from jcr.report.render import render
+from jcr.report.scene3d import BY_LABEL, point_layers, track_layer
 from jcr.report.verdict import head
 from jcr.result import RunResult
 from jcr.scene.scene_map import SceneMap, Unknown
-from jcr.scene.surface import sample_surface
 from jcr.segments.measure import Measurement
 
 if TYPE_CHECKING:
@@ -43,16 +43,14 @@ FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
 """RGB of the free and of the colliding sphere, and of occupied space in a slice."""
 GREY = (110, 110, 110)
 """RGB of unknown space."""
-CLOUD, MAP = "points as measured", "map"
-"""Names of the two kinds of points that can be drawn."""
-MAP_POINTS = 150_000
-"""Number of points that are drawn of the map's surface."""
+MOST_POINTS = 150_000
+"""Largest number of points that are drawn of a layer."""
 UNKNOWN_CELLS = 300_000
 """Number of cells for which the map is queried to find the border of unknown space."""
 IMAGE_PX = 160
 """Longer side (px) of the images that are drawn in the cameras."""
-FRUSTUM_M, POINT_M = 0.05, 0.005
-"""Distance from a camera to its drawn image plane, and size of a drawn point (m)."""
+FRUSTUM_M = 0.05
+"""Distance from a camera to its drawn image plane (m)."""
 CLICK_RAD = 0.006
 """Largest angle (rad) between the ray of a click and a point that it selects."""
 FAR_M, SLICE_PIXELS = 0.2, 240
@@ -159,11 +157,11 @@ class Viewer:
             server.scene.add_frame("/robot", show_axes=False)
             self.robot = ViserUrdf(server, robot, root_node_name="/robot")
         report("view", 0.3)
+        layers, self._labels = point_layers(self.scene, self.cloud, MOST_POINTS)
+        self._layers = {layer[0]: layer for layer in layers}
+        self._solid = layers[0][1] if layers else self.tracks_in_base
         self._add_points()
-        self._solid = self.tracks_in_base if self.cloud is None else self.cloud.points_in_base
         if self.scene is not None:
-            self._surface = sample_surface(self.scene, MAP_POINTS)
-            self._palette, self._solid = label_colors(len(self.scene.label_names)), self._surface[0]
             report("view", 0.6)
             self._add_map(self.scene, run.measured)
         self.show_points()
@@ -216,14 +214,12 @@ class Viewer:
 
     def _add_points(self) -> None:
         """Add the controls that select the drawn points and their colours, and the values at a clicked point."""
-        names = [MAP] * (self.scene is not None) + [CLOUD] * (self.cloud is not None) + ["none"]
-        gui, several = self.server.gui, self.scene is not None and len(self.scene.label_names) > 1
+        gui, names = self.server.gui, [*self._layers, "none"]
         with gui.add_folder("Points", expand_by_default=False):
             self.shown = gui.add_dropdown("show", names, initial_value=names[0])
-            self.by_label = gui.add_checkbox("coloured by label", False, visible=several)
             self._legend = gui.add_html("")
             self.show_tracks = gui.add_checkbox("features", len(names) == 1, hint="tracked, red")
-        for control in (self.shown, self.by_label, self.show_tracks):
+        for control in (self.shown, self.show_tracks):
             control.on_update(lambda _: self.show_points())
         with gui.add_folder("Click a point", expand_by_default=False):
             self.clicked = gui.add_html(_lines(("", "Click a point to see its values.")))
@@ -302,24 +298,17 @@ class Viewer:
     def show_points(self) -> None:
         """Draw the selected points (surface of the map, measured cloud, or none) and, if switched on, the features."""
         with self._lock:
-            x, color, legend = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
-            if self.shown.value == CLOUD and self.cloud is not None:
-                x, color = self.cloud.points_in_base, self.cloud.color
-            elif self.shown.value == MAP and self.scene is not None:
-                x, color, label = self._surface
-                if self.by_label.value:
-                    color = self._palette[label]
-                    labels = list(zip(self.scene.label_names, self._palette.tolist(), strict=True))
-                    legend = render("labels.html", {"labels": labels}, "jcr.viewer")
-            self.points, self._legend.content = x, legend
-            tracks = self.tracks_in_base if self.show_tracks.value else np.zeros((0, 3))
-            red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracks), 1))
+            name, nothing = self.shown.value, track_layer("", np.zeros((0, 3)))
+            layer = self._layers.get(name, nothing)
+            legend = render("labels.html", {"labels": self._labels}, "jcr.viewer") if name == BY_LABEL else ""
+            self.points, self._legend.content = layer[1], legend
+            tracks = track_layer("", self.tracks_in_base) if self.show_tracks.value else nothing
             draw = partial(self.server.scene.add_point_cloud, point_shape="circle", precision="float32")
-            for name, points, rgb, size in (("/points", x, color, POINT_M), ("/tracks", tracks, red, 0.004)):
-                if len(points):
-                    draw(name, points, rgb, point_size=size, point_shading="flat")
+            for path, (_, x, color, size) in {"/points": layer, "/tracks": tracks}.items():
+                if len(x):
+                    draw(path, x, color, point_size=size, point_shading="flat")
                 else:
-                    self.server.scene.remove_by_name(name)
+                    self.server.scene.remove_by_name(path)
 
     def show_slice(self) -> None:
         """Draw the horizontal slice of the map with the selected property and height (base z), or hide it.
@@ -377,7 +366,7 @@ class Viewer:
         with self._lock:
             along = (self.points - origin_in_base) @ direction
             aside = np.linalg.norm(self.points - origin_in_base - along[:, None] * direction, axis=1)
-            near = np.flatnonzero((along > 0.02) & (aside < np.maximum(CLICK_RAD * along, POINT_M / 2)))
+            near = np.flatnonzero((along > 0.02) & (aside < CLICK_RAD * along))
             self._mark.visible = len(near) > 0
             if len(near) == 0:
                 self.clicked.content = _lines(("", "No point there."))
