@@ -1,11 +1,15 @@
 """Recordings of robots: ROS 1, sqlite3 and MCAP bags give the frames at which the arm stood still."""
 
+import base64
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
@@ -133,6 +137,129 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
     for name, pose in zip(got.images, got.base_from_gripper, strict=True):
         assert np.allclose(pose, expected[(got.folder / name).read_bytes()], atol=1e-6)
     writers.assert_joints(got, angles)
+
+
+@pytest.mark.slow
+def test_a_topic_of_poses_stands_in_for_tf(tmp_path: Path, capture: Capture):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    kinds = {"/ee_pose": "geometry_msgs/msg/PoseStamped", "/image": "sensor_msgs/msg/CompressedImage"}
+    with Writer(tmp_path / "poses", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {name: writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()}
+
+        def write(topic: str, at: int, frame: str, *content: Any) -> None:
+            time = types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)
+            message = types[kinds[topic]](types["std_msgs/msg/Header"](time, frame), *content)
+            writer.write(topics[topic], at, store.serialize_cdr(message, message.__msgtype__))
+
+        for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
+            quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            at = types["geometry_msgs/msg/Point"](*pose[:3, 3]), types["geometry_msgs/msg/Quaternion"](*quat)
+            for step in range(5):
+                stamp = 10**18 + k * 10**9 + step * 10**8
+                write("/ee_pose", stamp, "base_link", types["geometry_msgs/msg/Pose"](*at))
+            data = np.frombuffer((capture.folder / name).read_bytes(), np.uint8)
+            write("/image", 10**18 + k * 10**9 + 2 * 10**8, "lens", "jpeg", data)
+    got = jcr.read_capture(tmp_path / "poses", {"frames": 12}, into=tmp_path / "frames")
+    np.testing.assert_allclose(got.base_from_gripper, capture.base_from_gripper, atol=1e-9)
+    assert got.frame_names == FrameNames(base="base_link", camera="lens")
+
+
+def foxglove_stream(capture: Capture) -> Iterator[tuple[str, str, int, dict[str, Any]]]:
+    """Topic, schema, time and content of the messages of a recording at the poses of a capture."""
+    intrinsics = capture.intrinsics
+    assert intrinsics is not None
+    start = 10**18
+    matrices = {"K": intrinsics.matrix.ravel().tolist(), "D": list(intrinsics.distortion)}
+    size = {"width": intrinsics.width, "height": intrinsics.height}
+    yield (
+        "/lens",
+        "CameraCalibration",
+        start,
+        {"frame_id": "lens", "distortion_model": "plumb_bob", **size, **matrices},
+    )
+    static = {"translation": [0.0, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
+    yield "/tf", "FrameTransform", start, {"parent_frame_id": "tool0", "child_frame_id": "lens", **static}
+    for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
+        moved = {"parent_frame_id": "base", "child_frame_id": "tool0", "translation": pose[:3, 3].tolist()}
+        moved |= {"rotation": Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()}
+        for step in range(5):
+            yield "/tf", "FrameTransform", start + k * 10**9 + step * 10**8, moved
+        at, data = start + k * 10**9 + 2 * 10**8, (capture.folder / name).read_bytes()
+        yield "/wrist", "CompressedImage", at, {"frame_id": "lens", "format": "jpeg", "data": data}
+
+
+def write_foxglove_json(file: Path, capture: Capture, video: str | None = None) -> None:
+    writing: Any = pytest.importorskip("mcap.writer")
+    channels = dict[str, int]()
+    with file.open("wb") as stream:
+        writer = writing.Writer(stream)
+        writer.start()
+        for topic, schema, at, content in foxglove_stream(capture):
+            schema = video if video and schema == "CompressedImage" else schema
+            if topic not in channels:
+                number = writer.register_schema(f"foxglove.{schema}", "jsonschema", b"{}")
+                channels[topic] = writer.register_channel(topic, "json", number)
+            axes = {"translation": "xyz", "rotation": "xyzw"}
+            message = {name: dict(zip(axes[name], value, strict=True)) if name in axes else value
+                       for name, value in content.items()}  # fmt: skip
+            if "data" in message:
+                message["data"] = base64.b64encode(message["data"]).decode()
+            message["timestamp"] = {"sec": at // 10**9, "nsec": at % 10**9}
+            writer.add_message(channels[topic], at, json.dumps(message).encode(), at)
+        writer.finish()
+
+
+def write_foxglove_protobuf(file: Path, capture: Capture) -> None:
+    foxglove: Any = pytest.importorskip("foxglove", reason="foxglove-sdk is for this test alone")
+    from foxglove import channels, messages  # pyright: ignore[reportMissingImports]
+
+    with foxglove.open_mcap(str(file)):
+        made = dict[str, Any]()
+        for topic, schema, at, content in foxglove_stream(capture):
+            made[topic] = made.get(topic) or getattr(channels, f"{schema}Channel")(topic)
+            kinds = {"translation": messages.Vector3, "rotation": messages.Quaternion}
+            message = {name: kinds[name](**dict(zip("xyzw", value, strict=False))) if name in kinds else value
+                       for name, value in content.items()}  # fmt: skip
+            message["timestamp"] = messages.Timestamp(at // 10**9, at % 10**9)
+            made[topic].log(getattr(messages, schema)(**message), log_time=at)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [write_foxglove_json, write_foxglove_protobuf])
+def test_messages_of_foxglove_are_read(
+    write: Callable[[Path, Capture], None], tmp_path: Path, capture: Capture
+):
+    write(tmp_path / "scan.mcap", capture)
+    options = {"frames": 12, "base_frame": "base", "gripper_frame": "tool0"}
+    got = jcr.read_capture(tmp_path / "scan.mcap", options, into=tmp_path / "frames")
+    np.testing.assert_allclose(got.base_from_gripper, capture.base_from_gripper, atol=1e-9)
+    assert got.intrinsics == capture.intrinsics and got.frame_names == FrameNames(
+        base="base", gripper="tool0", camera="lens"
+    )
+    for name, original in zip(got.images, capture.images, strict=True):
+        assert (got.folder / name).read_bytes() == (capture.folder / original).read_bytes()
+    # A frame that is published once, as the mount of the camera, does not move.
+    wrist = jcr.read_capture(
+        tmp_path / "scan.mcap", options | {"gripper_frame": "lens"}, into=tmp_path / "lens"
+    )
+    np.testing.assert_allclose(wrist.base_from_gripper, capture.base_from_gripper, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_video_topic_is_named_with_the_command_that_converts_it(tmp_path: Path, capture: Capture):
+    write_foxglove_json(tmp_path / "scan.mcap", capture, video="CompressedVideo")
+    with pytest.raises(
+        jcr.InputError, match="/wrist is a video; .*in_transport:=foxglove .*in/foxglove:=/wrist"
+    ):
+        jcr.read_capture(tmp_path / "scan.mcap", into=tmp_path / "frames")
+    cut = (tmp_path / "scan.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(cut[: len(cut) // 2])
+    with pytest.raises(jcr.InputError, match="not a readable bag"):
+        jcr.read_capture(tmp_path / "cut.mcap", into=tmp_path / "frames")
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,8 @@ class ReadOptions:
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
-    """Bags: topic of the joint states, read when --urdf is given. LeRobot: key of the state."""
+    """Bags: topic of the joint states, read when --urdf is given, or of the gripper's PoseStamped. LeRobot: key of the
+    state."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Robot description, for recordings with joint angles instead of gripper poses."""
     max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0

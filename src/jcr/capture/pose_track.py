@@ -145,7 +145,7 @@ class TfTree:
             text = "holds a transform that is none; record again"
             raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
         poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
-        if child in self._static:
+        if child in self._static or len(stamps) == 1:
             latest = poses[stamps.argmax()]
             return lambda at: (np.tile(latest, (len(at), 1, 1)), np.zeros(len(at), np.int64))
         return partial(interpolated_poses, stamps, poses)

@@ -1,8 +1,9 @@
-"""ROS 1 bags, ROS 2 sqlite3 and MCAP: images of one camera, with gripper poses from tf or from joint states."""
+"""Bags of ROS and MCAP files of Foxglove: images of a camera, and gripper poses from tf, poses or joint states."""
 
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -10,21 +11,30 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from jcr.capture.documents import read_content
+from jcr.capture.formats import foxglove
 from jcr.capture.options import ReadOptions, chosen_name
-from jcr.capture.pose_track import Stamps, TfTree, speed
+from jcr.capture.pose_track import PosesAt, Stamps, TfTree, interpolated_poses, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.extras import extra
+from jcr.geometry import transform
 from jcr.progress import Progress
 from jcr.records import Capture, FrameNames, Intrinsics
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSE = "geometry_msgs/msg/PoseStamped"
+VIDEOS = {
+    "foxglove_msgs/msg/CompressedVideo": "foxglove",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "ffmpeg",
+}
+"""Types of video messages, and the transport of image_transport that decodes each."""
 SUFFIXES = (".bag", ".mcap", ".db3")
 LATEST_NS = 2**62
 """Largest time stamp (ns): in the year 2116, far enough from the largest int64 for differences of two."""
@@ -45,7 +55,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
         stamps, joints, base = bag.stamp_ns, None, options.base_frame
-        if options.urdf is None:
+        if bag.poses:
+            poses_at, base = bag.poses_at(), base or bag.pose_frame
+        elif options.urdf is None:
             poses_at = bag.tree.poses_at(options.base_frame, options.gripper_frame, path)
         else:
             arm = read_arm(options)
@@ -89,13 +101,20 @@ class _Bag:
         stamps, recorded = list[int](), list[int]()
         self.joints = dict[str, dict[int, float]]()
         """Positions of each joint: from the joint's name to a dictionary from time stamp (ns) to position."""
+        self.poses = dict[int, tuple[float, ...]]()
+        """Pose of the gripper (x, y, z, qx, qy, qz, qw) by time stamp (ns), from a topic of poses."""
+        self.pose_frame: object = None
+        """Frame in the header of the first pose."""
         self.camera_info: Any = None
         self.frame_id: object = None
         """Frame in the header of the first image."""
         self.topic = topic = _camera_topic(reader, options, path)
         self.images = [c for c in reader.connections if c.topic == topic]
         infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
-        info = [c for name in infos for c in reader.connections if c.topic == name and c.msgtype == INFO][:1]
+        every = [c for c in reader.connections if c.msgtype == INFO]
+        info = [c for name in infos for c in every if c.topic == name][:1]
+        if not info and len({c.topic for c in reader.connections if c.msgtype in IMAGES}) == 1 == len(every):
+            info = every  # the names of Foxglove's topics are free
         span = max(reader.end_time - reader.start_time, 1)
         wanted = [*self.images, *info, *_pose_connections(reader, options, path)]
         for connection, at, message in self.messages(wanted):
@@ -108,6 +127,11 @@ class _Bag:
                         if not isinstance(name, str):
                             raise TypeError("a joint whose name is no text")
                         self.joints.setdefault(name, {}).setdefault(_stamp(message, at), float(value))
+                elif kind == POSE:
+                    at_m, q = message.pose.position, message.pose.orientation
+                    numbers = (at_m.x, at_m.y, at_m.z, q.x, q.y, q.z, q.w)
+                    self.poses.setdefault(_stamp(message, at), tuple(map(float, numbers)))
+                    self.pose_frame = self.pose_frame or message.header.frame_id
                 elif kind == INFO:
                     self.camera_info = self.camera_info or message
                 else:
@@ -124,6 +148,14 @@ class _Bag:
         """Ascending time stamps (ns) of the images."""
         self.log_ns = np.array(recorded)[order]
         """Times (ns) at which the images were recorded."""
+
+    def poses_at(self) -> PosesAt:
+        """Return the function from time stamps (ns) to the poses of the pose topic and the gaps (ns) of its samples."""
+        stamps, numbers = np.array([*self.poses]), np.array([*self.poses.values()])
+        if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
+            raise InputError(f"{self.path}: a topic of poses holds one that is none; record again")
+        poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
+        return partial(interpolated_poses, stamps, poses)
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
         """Yield the connection, time of recording (ns) and decoded content of each message of `connections`.
@@ -173,7 +205,9 @@ def _require_plain(file: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a bag and yield its rosbags AnyReader; raise InputError if the path is no bag or the bag is damaged."""
+    """Open a bag and yield its reader (rosbags' AnyReader); raise InputError if the path is no bag or it is damaged."""
+    if is_foxglove := foxglove.recognises(path):
+        extra("mcap", "ros", "an MCAP file of Foxglove")
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
     try:
@@ -186,8 +220,10 @@ def _opened(path: Path) -> Iterator[Any]:
             _require_plain(file)
         # Older sqlite3 bags hold no message definitions; the standard messages have not changed since.
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-        reader = highlevel.AnyReader([path], default_typestore=standard)
-        reader.open()
+        reader = foxglove.FoxgloveReader(path) if is_foxglove else None
+        if reader is None or not reader.connections:
+            reader = highlevel.AnyReader([path], default_typestore=standard)
+            reader.open()
         if not all(isinstance(name, str) for c in reader.connections for name in (c.topic, c.msgtype)):
             raise ValueError("its metadata has a topic without a name")
     except Exception as error:  # each storage raises its own errors, SQLite, YAML and struct among them
@@ -205,6 +241,14 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
     one does not exist, or if several have colour images.
     """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
+    videos = {c.topic: VIDEOS[c.msgtype] for c in reader.connections if c.msgtype in VIDEOS}
+    asked = options.camera_topic or (next(iter(videos), "") if not topics else "")
+    if (transport := videos.get(asked)) is not None:
+        raise InputError(
+            f"{path}: {asked} is a video; play the recording and record its images: ros2 run image_transport republish "
+            f"--ros-args -p in_transport:={transport} -p out_transport:=compressed -r in/{transport}:={asked} -r "
+            f"out/compressed:={asked}/images/compressed"
+        )
     # A topic /compressed repeats the images of its raw topic.
     repeats = {f"{topic}/compressed" for topic in topics}
     colour = [topic for topic in topics if "depth" not in topic.lower() and topic not in repeats]
@@ -213,15 +257,24 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
 
 
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
-    """Return the reader's connections (topics) with the robot's poses: tf, or joint states if `options.urdf` is given.
+    """Return the reader's connections (topics) with the robot's poses: tf, a PoseStamped topic, or joint states.
 
+    Joint states are read if `options.urdf` is given; a topic of poses if the options name it, or without tf.
     `reader` is the open bag (AnyReader), `path` its path for messages. Raises InputError if there are none, or if
     several topics have joint states and the options choose none.
     """
     if options.urdf is None:
         found = [c for c in reader.connections if c.msgtype in TF]
+        poses = sorted({c.topic for c in reader.connections if c.msgtype == POSE})
+        if poses and (options.joint_topic in poses or not found):
+            topic = chosen_name(
+                poses, options.joint_topic, poses, f"{path}: the gripper's poses", "--joint-topic"
+            )
+            return [c for c in reader.connections if c.topic == topic]
         if not found:
-            raise InputError(f"{path}: no /tf; give --urdf for joint states, or record tf as well")
+            raise InputError(
+                f"{path}: no /tf and no poses; give --urdf for joint states, or record tf as well"
+            )
         return found
     topics = sorted({c.topic for c in reader.connections if c.msgtype == JOINTS})
     topic = chosen_name(topics, options.joint_topic, topics, f"{path}: the joint states", "--joint-topic")
