@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 from jcr.allocator import give_back
 from jcr.calibration.checks.capture import as_causes, view_findings
@@ -65,7 +66,7 @@ class Trial:
     """Record of the attempt for run.json and calibration.json."""
     reconstruction: Reconstruction | None
     """Reconstruction; None if the back end failed."""
-    hand_eye: Calibration | None
+    hand_eye: Calibration | PublishedCalibration | None
     """Calibration; None if the reconstruction or the calibration failed."""
     failure: InputError | RejectedError | None
     """Error of the reconstruction or the calibration; None without one."""
@@ -150,8 +151,12 @@ def select_reconstruction(
         """Return the findings of the images alone (blur, one view, repetition), computed once."""
         return view_findings(capture)
 
+    def calibrate(capture: Capture, made: Reconstruction) -> Calibration:
+        """Calibrate a reconstruction with the options of the run."""
+        return calibrate_reconstruction(capture, made, options.calibrate)
+
     if before is not None:
-        trials.append(_try(capture, before, options, progress))
+        trials.append(_try(capture, before, reconstruct, calibrate, progress))
     candidates = tries(options.reconstruct) if before is None or goes_on else []
     for one in candidates:
         reason, goes_on = _why_untried(one, trials, len(capture), of_images) if trials else (None, True)
@@ -160,7 +165,7 @@ def select_reconstruction(
             break
         if reason is None:
             reported = keep if len(candidates) == 1 and not trials else None
-            trial = _try(capture, one, options, progress, reported)
+            trial = _try(capture, one, reconstruct, calibrate, progress, reported)
             is_own = not BACKENDS[one.backend].hub_id or one.weights is not None
             if isinstance(trial.failure, InputError) and is_own:
                 raise trial.failure
@@ -201,29 +206,8 @@ def select_published(
     # Torch and pycolmap take seconds to import, and torch may be absent.
     from jcr.paper.run import calibrate_published, reconstruct_published
 
-    start, made = time.perf_counter(), before
-    try:
-        made = reconstruct_published(capture, options.reconstruct, progress) if made is None else made
-        reconstructed = time.perf_counter()
-        hand_eye = calibrate_published(capture, made)
-    except RejectedError as error:
-        account = Attempt(
-            backend=options.reconstruct.backend if made is None else made.backend,
-            images_registered=None if made is None else len(made.image_index),
-            reconstruct_s=round(time.perf_counter() - start, 3),
-            calibrate_s=0.0,
-            why_not=str(error),
-        )
-        raise NothingFoundError(error, (account,)) from None
-    give_back()
-    account = Attempt(
-        backend=made.backend,
-        images_registered=len(made.image_index),
-        reconstruct_s=round(reconstructed - start, 3),
-        calibrate_s=round(time.perf_counter() - reconstructed, 3),
-        why_not=None,
-    )
-    return made, replace(hand_eye, attempts=(account,), timings_s=timings_of((account,)))
+    source = options.reconstruct if before is None else before
+    return _select([_try(capture, source, reconstruct_published, calibrate_published, progress)], [], ())
 
 
 def _why_untried(
@@ -266,7 +250,7 @@ def _why_untried(
 
 def _select(
     trials: Sequence[Trial], notes: list[str], of_images: tuple[Finding, ...]
-) -> tuple[Reconstruction, Calibration]:
+) -> tuple[Reconstruction, Any]:
     """Return reconstruction and calibration of the trial of highest rank, with `notes` and the findings `of_images`.
 
     Raises NothingFoundError if no trial has a calibration. The InputError of an only trial is raised unchanged.
@@ -308,40 +292,42 @@ def timings_of(attempts: Sequence[Attempt]) -> dict[str, float]:
 def _try(
     capture: Capture,
     source: ReconstructOptions | Reconstruction,
-    options: RunOptions,
+    reconstructing: Callable[..., Reconstruction],
+    calibrating: Callable[..., Calibration | PublishedCalibration],
     progress: Progress | None,
     keep: Callable[[Reconstruction], None] | None = None,
 ) -> Trial:
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
-    `source` is the options of the back end, or a reconstruction made before. `keep` receives the reconstruction before
-    the calibration. An InputError of the calibration is raised, because it would occur with every back end.
+    `source` is the options of the back end, or a reconstruction made before. `reconstructing` and `calibrating` are the
+    functions of the method. `keep` receives the reconstruction before the calibration. An InputError of the calibration
+    is raised, because it would occur with every back end.
     """
     start, report = time.perf_counter(), progress or silent
     own = source if isinstance(source, ReconstructOptions) else None
     made = failure = hand_eye = why_not = None
     try:
-        made = source if isinstance(source, Reconstruction) else reconstruct(capture, source, progress)
+        made = source if isinstance(source, Reconstruction) else reconstructing(capture, source, progress)
     except (InputError, RejectedError) as error:
         failure = error.with_traceback(None)
     give_back()  # return the memory of the back end to the system
     if made is not None and keep is not None:
         keep(made)
-    calibrating = time.perf_counter()
+    reconstructed = time.perf_counter()
     if made is not None:
         report("calibrate", 0.0)
         try:
-            hand_eye = calibrate_reconstruction(capture, made, options.calibrate)
+            hand_eye = calibrating(capture, made)
             why_not = f"rejected: {hand_eye.doubt}"
         except RejectedError as error:
             failure = error.with_traceback(None)
         give_back()
         report("calibrate", 1.0)
     account = Attempt(
-        backend=own.backend if own is not None else made.backend if made is not None else "",
+        backend=made.backend if made is not None else own.backend if own is not None else "",
         images_registered=None if made is None else len(made.image_index),
-        reconstruct_s=round(calibrating - start, 3),
-        calibrate_s=round(time.perf_counter() - calibrating, 3),
+        reconstruct_s=round(reconstructed - start, 3),
+        calibrate_s=round(time.perf_counter() - reconstructed, 3),
         why_not=why_not if failure is None else str(failure),
         features=None if own is None or own.features == "auto" else own.features,
     )
