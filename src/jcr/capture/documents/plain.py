@@ -95,7 +95,7 @@ def _parse_json(file: Path, text: str) -> list[Any]:
         for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
             require_depth(part, depth + 1)
 
-    _limit(file, sum(map(text.count, ",[{")), 0)
+    _limit(file, max(sum(map(text.count, ",[{")), text.count("\n")), 0)
     decoder = json.JSONDecoder(object_pairs_hook=to_map, parse_int=cell_of, parse_float=cell_of)
     values, end, text = list[Any](), 0, text.strip()
     while end < len(text):
