@@ -366,7 +366,7 @@ def _measured_heights(place: Path, seed: int, images: int) -> list[tuple[TrueObj
     hand_eye = calibrate_reconstruction(capture, reconstruction)
     given = read_labels(capture, reconstruction)
     assert given is not None  # copied above
-    masked = point_cloud(capture, reconstruction, hand_eye, given[0])
+    masked = point_cloud(capture, reconstruction, hand_eye, given[0], label_names=given[1])
     cloud = label_tabletop(masked)
     measured = measure_objects(cloud, float(np.sqrt(hand_eye.covariance[6, 6]))).objects
     sizes = {size.label: size for size in measured}
