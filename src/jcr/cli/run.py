@@ -184,7 +184,7 @@ class AddCameraCommand:
     name: str | None = None
     """Name of the camera; by default the file name of the first image."""
     intrinsics: Path | None = None
-    """JSON with fx, fy, cx, cy and distortion as in capture.json, in pixels of these images; unset: estimated."""
+    """File with the intrinsics, as for --camera-info, in pixels of these images; unset: estimated."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
