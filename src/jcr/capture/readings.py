@@ -149,15 +149,13 @@ def pose_columns(table: Table, skipped: frozenset[int] = frozenset()) -> list[Po
     named = [k for k in usable if table.columns[k] is not None]
     if len(named) < 3:
         return _unnamed_poses(usable, numbers, "")
-    groups: dict[tuple[str, str], dict[str, int]] = {}
-    units: dict[int, str | None] = {}
+    groups, units = dict[tuple[str, str], tuple[dict[str, int], set[str]]](), dict[int, str | None]()
     for k in named:
         stem, last, units[k] = _split(table.columns[k] or "")
-        kind = _half(stem, last)
         pose = "_".join(one for one in stem if one not in POSITION | ROTATION)
-        groups.setdefault((pose, kind), {}).setdefault(last, k)
-        texts = "_".join(stem)
-        groups[pose, kind].setdefault(f"words:{texts}", -1)
+        cells, words = groups.setdefault((pose, _half(stem, last)), ({}, set()))
+        cells.setdefault(last, k)
+        words.update(stem)
     return [replace(one, **_stated_units(one, units)) for one in _of_groups(groups, numbers)]
 
 
@@ -170,15 +168,16 @@ def _half(stem: Sequence[str], last: str) -> str:
     return "rotation"
 
 
-def _of_groups(groups: dict[tuple[str, str], dict[str, int]], numbers: Numbers) -> Iterator[PoseColumns]:
-    """Yield poses from columns grouped by pose and half; a lone position joins a lone rotation of another name."""
-    positions, rotations = (
-        dict[str, tuple[int, ...]](),
-        dict[str, list[tuple[tuple[int, ...], tuple[str, ...]]]](),
-    )
-    for (pose, half), columns in groups.items():
-        words = set("_".join(one[6:] for one in columns if one.startswith("words:")).split("_"))
-        cells = {last: k for last, k in columns.items() if not last.startswith("words:")}
+def _of_groups(
+    groups: dict[tuple[str, str], tuple[dict[str, int], set[str]]], numbers: Numbers
+) -> Iterator[PoseColumns]:
+    """Yield poses from columns grouped by pose and half, each group with its last parts of names and its words.
+
+    A lone position joins a lone rotation of another name.
+    """
+    positions = dict[str, tuple[int, ...]]()
+    rotations = dict[str, list[tuple[tuple[int, ...], tuple[str, ...]]]]()
+    for (pose, half), (cells, words) in groups.items():
         if half == "position" and {"x", "y", "z"} <= cells.keys():
             positions[pose] = tuple(cells[axis] for axis in "xyz")
         elif half == "position" and (ordered := _numbered(cells)) and len(ordered) == 3:
@@ -210,11 +209,12 @@ def _numbered(cells: dict[str, int]) -> list[int] | None:
 
 def _rotations(cells: dict[str, int], words: set[str]) -> Iterator[tuple[tuple[int, ...], tuple[str, ...]]]:
     """Yield the columns of each rotation among columns of one half of a pose, and the notations that it may have."""
+    three = ("rotvec",) if words & VECTOR else EULERS if "euler" in words else ("rotvec", *EULERS)
+    three = ("euler:xyz",) if "rpy" in words else three
     if {"x", "y", "z", "w"} <= cells.keys():
         yield tuple(cells[axis] for axis in "xyzw"), ("quat:xyzw",)
     elif {"x", "y", "z"} <= cells.keys():
-        notations = ("rotvec",) if words & VECTOR else EULERS if words & {"euler"} else ("rotvec", *EULERS)
-        yield tuple(cells[axis] for axis in "xyz"), ("euler:xyz",) if "rpy" in words else notations
+        yield tuple(cells[axis] for axis in "xyz"), three
     for names, notations in ROTATION_NAMES.items():
         if set(names) <= cells.keys():
             yield tuple(cells[name] for name in names), notations
@@ -225,8 +225,7 @@ def _rotations(cells: dict[str, int], words: set[str]) -> Iterator[tuple[tuple[i
         stated = tuple(f"quat:{order}" for order in ("xyzw", "wxyz") if order in words)
         yield tuple(ordered), stated or ("quat:xyzw", "quat:wxyz")
     elif ordered and len(ordered) == 3:
-        notations = ("rotvec",) if words & VECTOR else EULERS if words & {"euler"} else ("rotvec", *EULERS)
-        yield tuple(ordered), ("euler:xyz",) if "rpy" in words else notations
+        yield tuple(ordered), three
 
 
 def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[PoseColumns]:
@@ -298,11 +297,8 @@ def _layouts(n: int) -> Iterator[Sequence[_Layout]]:
 def _stated_units(columns: PoseColumns, units: dict[int, str | None]) -> dict[str, str | None]:
     """Return the units of length and angle that the names of the columns state, as fields of PoseColumns."""
     found = {}
-    for field, places, known in (
-        ("length", columns.position, ("m", "mm", "cm")),
-        ("angle", columns.rotation, ("deg", "rad")),
-    ):
-        stated = {units.get(k) for k in places} & set(known)
+    for field, places in (("length", columns.position), ("angle", columns.rotation)):
+        stated = {units.get(k) for k in places} & ({"m", "mm", "cm"} if field == "length" else {"deg", "rad"})
         found[field] = stated.pop() if len(stated) == 1 else None
     return found
 
