@@ -3,21 +3,26 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import jcr
 from conftest import shrunk_capture
 from dying_process import copies_a_run, dies_on_bad
 from jcr.calibration.options import CalibrateOptions
+from jcr.capture.formats.lerobot import episodes_of
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError
+from jcr.geometry import transform
 from jcr.pipeline import batch as module
 from jcr.pipeline.batch import BatchRow, batch, run_one
 from jcr.pipeline.options import BatchOptions
+from jcr.pipeline.placements import agreement
 from jcr.result import RunOptions
 
 pytestmark = pytest.mark.slow
@@ -53,6 +58,8 @@ def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys)
     assert rows["broken"].status == "failed" and "not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
+    found = jcr.load_run(out / "b").calibration
+    assert (rows["b"].x_m, rows["b"].fx) == (found.gripper_from_camera[0, 3], found.intrinsics.fx)
     with (out / "summary.csv").open() as file:
         table = list(csv.DictReader(file))
     assert len(table) == 4 and table[-1]["status"] == "failed"
@@ -122,7 +129,52 @@ def test_a_moved_episode_camera_is_named(monkeypatch: pytest.MonkeyPatch, tmp_pa
     moved = {Path(row.out).name[-1]: row for row in rows}
     assert [round(moved[k].moved_mm or 0.0, 6) for k in "012"] == [0.0, 0.0, 20.0]
     assert not moved["0"].reason and "differs by 20.0 mm" in moved["2"].reason
-    assert "differs by 20.0 mm" in (tmp_path / "out" / "summary.html").read_text()
+    page = (tmp_path / "out" / "summary.html").read_text()
+    for words in (
+        "differs by 20.0 mm",
+        "A: episodes 0 to 1",
+        "B: episode 2",
+        "moved by 20.0 mm and 0.00° between episodes 1 and 2",
+    ):
+        assert words in page
+    assert [moved[k].camera for k in "012"] == ["A", "A", "B"]
+
+
+def test_all_episodes_are_named_and_of_many_some(tmp_path: Path):
+    (tmp_path / "meta").mkdir()
+    info = {"features": {}, "fps": 10, "data_path": "x", "total_episodes": 5}
+    for total, count in ((5, 5), (5000, 200)):
+        (tmp_path / "meta/info.json").write_text(json.dumps(info | {"total_episodes": total}))
+        episodes, meant = episodes_of(tmp_path, ReadOptions(episode=("all",)))
+        assert (len(episodes), meant) == (count, total) and episodes[0] == 0 and episodes[-1] == total - 1
+    assert episodes_of(tmp_path, ReadOptions(episode=(3, 1))) == ([3, 1], 2)
+    (tmp_path / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 0}))
+    with pytest.raises(InputError, match="total_episodes"):
+        episodes_of(tmp_path, ReadOptions(episode=("all",)))
+    with pytest.raises(InputError, match="LeRobot"):
+        episodes_of(tmp_path / "meta", ReadOptions(episode=("all",)))
+
+
+def test_episodes_form_groups_of_one_pose_and_intrinsics_that_differ_are_named(small_done: Path):
+    one = jcr.load_run(small_done).found
+    std = 1e-3 * max(one.uncertainty.translation_std_mm)
+    camera = one.intrinsics
+    assert camera is not None
+    camera = replace(camera, std=(0.5,) * 4 + (0.01,) * (len(camera.distortion)))
+
+    def moved(shift: float, focal: float = 0.0) -> jcr.Calibration:
+        x = one.gripper_from_camera @ transform(np.eye(3), np.array([0.0, 0.0, shift]))
+        return replace(
+            one, on_gripper=x, intrinsics=replace(camera, fx=camera.fx + focal, fy=camera.fy + focal)
+        )
+
+    shifts = (0.0, 0.5 * std, 30 * std, 0.0, 30 * std)
+    agreed = agreement((2, 4, 6, 8, 10), [moved(shift, 8.0 * (k == 3)) for k, shift in enumerate(shifts)])
+    assert agreed.group == [0, 0, 1, 0, 1]
+    assert agreed.sentences[:2] == ["A: episodes 2 to 4, 8", "B: episodes 6, 10"]
+    assert [words.split(" between ")[1] for words in agreed.sentences[2:5]] == [
+        "episodes 4 and 6", "episodes 6 and 8", "episodes 8 and 10"]  # fmt: skip
+    assert agreed.sentences[5] == "the intrinsics differ from those of most episodes in 8"
 
 
 def test_a_capture_that_falls_short_of_what_is_required_is_not_accepted(tmp_path: Path, captures: list[Path]):

@@ -88,6 +88,8 @@ class Change(Part):
     """Index of the capture with which the change was found."""
     motion: Numbers = Field(default_factory=lambda: np.zeros(6))
     """Step of gripper_from_camera (gripper axes) or base_from_scene (base axes): m, rad. Zero for the robot."""
+    size: Spread = 0.0
+    """Size σ_s (rad) of a change of the robot's systematic errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,9 +361,9 @@ def _explained(data: _Data, sizes: Sequence[LogSizes], log_factors: Float[ndarra
         made[cause] = Change(cause=cause, first=first, named=last, motion=motion)
     first = made[max(evidence, key=evidence.__getitem__)].first
     own = model.columns("robot") * (model.capture >= first)[:, None]
-    at = [_Solved.of(model, one, own, size) for one in sizes for size in ROBOT_SIZES]
-    changed = Change(cause="robot", first=first, named=last)
-    evidence["robot"], made["robot"] = _total(at) - float(np.log(len(ROBOT_SIZES))), changed
+    each = [_total([_Solved.of(model, one, own, size) for one in sizes]) for size in ROBOT_SIZES]
+    evidence["robot"] = float(logsumexp(each) - np.log(len(each)))
+    made["robot"] = Change(cause="robot", first=first, named=last, size=float(ROBOT_SIZES[np.argmax(each)]))
     if len(each := _image_evidence(data, sizes)):
         evidence["image"] = float(logsumexp(each) - np.log(len(each)))
         made["image"] = Change(cause="image", first=int(each.argmax()), named=last)
@@ -482,7 +484,7 @@ def _model(
     model = _Model(equations, np.repeat(capture, 6), np.zeros((len(is_new), 0)), by_camera, by_scene)
     columns = [model.nuisance]
     for change in changes:
-        size = ROBOT_SIZES[-1] if change.cause == "robot" else np.repeat(WEAK, 3)
+        size = change.size if change.cause == "robot" else np.repeat(WEAK, 3)
         columns.append(model.columns(change.cause) * (model.capture >= change.first)[:, None] * size)
     return model._replace(nuisance=np.concatenate(columns, axis=1))
 

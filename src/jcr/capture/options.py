@@ -54,9 +54,9 @@ class ReadOptions:
     """Robot description, for recordings with joint angles instead of gripper poses."""
     max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0
     """Recordings: largest gap between two poses across which one is interpolated; beyond it the image is left out."""
-    episode: tuple[int, ...] = (0,)
-    """LeRobot: the episode to take frames from. `jcr batch` takes several, each as a capture of its own, and names those
-    whose camera moved."""
+    episode: tuple[int | Literal["all"], ...] = (0,)
+    """LeRobot: the episode to take frames from. `jcr batch` and `jcr verify` take several, or all (of many, 200 at even
+    steps), each as a capture of its own."""
 
 
 def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:

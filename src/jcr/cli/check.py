@@ -359,17 +359,18 @@ def read_captures(
 
     A data set has a capture for each episode that `read` names. Images of recordings are extracted into `scratch`.
     """
+    from jcr.capture.formats import lerobot
     from jcr.capture.read import read_capture
 
     captures = dict[str, Capture]()
     for path in paths:
         inside = sorted(file.parent for file in path.glob("*/capture.json")) if path.is_dir() else []
         for one in inside if inside and not (path / "capture.json").is_file() else [path]:
-            for episode in read.episode:
+            for episode in (episodes := lerobot.episodes_of(one, read)[0]):
                 into, own = scratch / str(len(captures)), replace(read, episode=(episode,))
                 found = read_capture(one, own, into=into, progress=progress, at_least=1)
                 name = (one.parent if one.name == "capture.json" else one).absolute().name
-                name += f" episode {episode}" if len(read.episode) > 1 else ""
+                name += f" episode {episode}" if len(episodes) > 1 else ""
                 numbered = (name if k == 1 else f"{name} {k}" for k in range(1, len(captures) + 2))
                 captures[next(name for name in numbered if name not in captures)] = found
     return captures

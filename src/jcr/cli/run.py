@@ -123,7 +123,7 @@ class BatchCommand:
       jcr batch captures/* out/all
       jcr batch captures/* out/all --processes 4 --calibrate-only
       jcr batch /shared/captures/* /shared/out --ray auto --gpus-per-task 0.25
-      jcr batch droid/ out/episodes --calibrate-only --episode 0 1 2 3 4 5
+      jcr batch droid/ out/episodes --calibrate-only --episode all
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]

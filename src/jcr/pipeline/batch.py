@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jcr.calibration.difference import compare
+from jcr.calibration.record import AnyCalibration, FailedCalibration
+from jcr.capture.formats import lerobot
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
@@ -24,8 +26,8 @@ from jcr.extras import extra
 from jcr.files import locked, write_text
 from jcr.findings import Verdict, sentence, verdict_of
 from jcr.pipeline.options import BatchOptions
+from jcr.pipeline.placements import agreement, letter
 from jcr.pipeline.run import run
-from jcr.pipeline.verify import ALPHA
 from jcr.progress import Progress, silent
 from jcr.report.render import render
 from jcr.result import CAPTURE, RunOptions, load_run
@@ -67,6 +69,24 @@ class BatchRow:
     """Distance of the camera from its pose in most episodes of the data set; None with fewer than MIN_EPISODES."""
     moved_deg: float | None = None
     """Rotation angle of the camera from its pose in most episodes."""
+    episode: int | None = None
+    """Number of the episode, for a LeRobot data set."""
+    camera: str = ""
+    """Letter of the group of episodes with one pose of the camera; empty with fewer than MIN_EPISODES."""
+    x_m: float | None = None
+    """Position of the camera in the gripper frame, with y_m and z_m."""
+    y_m: float | None = None
+    z_m: float | None = None
+    qx: float | None = None
+    """Rotation gripper_from_camera as quaternion qx, qy, qz, qw."""
+    qy: float | None = None
+    qz: float | None = None
+    qw: float | None = None
+    fx: float | None = None
+    """Focal lengths and principal point (px), with fy, cx and cy."""
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
     seconds: float = 0.0
     """Duration of the run."""
     reason: str = ""
@@ -102,13 +122,16 @@ def batch(
         raise InputError("batch: no captures; name one or more")
     report, read = progress or silent, read or ReadOptions()
     run_options = replace(run_options, map=None) if options.calibrate_only else run_options
-    tasks, names = list[Task](), set[str]()
+    tasks, names, notes = list[Task](), set[str](), list[str]()
     for path in captures:
         own = (path.parent if path.is_file() else path).resolve().name or "capture"
         numbered = (own if k == 1 else f"{own}-{k}" for k in range(1, len(captures) + 1))
         names.add(name := next(name for name in numbered if name not in names))
-        for episode in read.episode:
-            folder = out.resolve() / (name if len(read.episode) == 1 else f"{name}-episode-{episode}")
+        episodes, total = lerobot.episodes_of(path, read)
+        if len(episodes) < total:
+            notes.append(f"{name}: {len(episodes)} of {total} episodes, evenly")
+        for episode in episodes:
+            folder = out.resolve() / (name if len(episodes) == 1 else f"{name}-episode-{episode}")
             tasks.append((path.resolve(), folder, run_options, replace(read, episode=(episode,))))
     out.mkdir(parents=True, exist_ok=True)
     report("captures", 0.0)
@@ -117,10 +140,10 @@ def batch(
     for new in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
         rows.append(new)
         rows.sort(key=lambda row: (order.index(row.status), row.offset_std_mm or np.inf, row.capture))
-        _write_summary(out, rows)
+        _write_summary(out, rows, notes)
         report("captures", len(rows) / len(tasks))
-    rows = _with_moved_cameras(rows)
-    _write_summary(out, rows)
+    rows, sentences = _with_compared_cameras(rows)
+    _write_summary(out, rows, [*notes, *sentences])
     return rows
 
 
@@ -128,6 +151,8 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
     """Run all stages for one capture in `out`, unless finished already; return its row, which reports an error."""
     start, reason = time.perf_counter(), ""
     row = BatchRow(capture=str(capture), out=str(out), status="failed")
+    if lerobot.recognises(capture) and isinstance(number := read.episode[0], int):
+        row = replace(row, episode=number)
     try:
         with locked(out):
             found = read_capture(capture, read, into=out / CAPTURE)
@@ -154,32 +179,46 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
         held_out_deg=None if held_out is None else held_out.rotation_deg,
         seconds=round(time.perf_counter() - start, 2),
         reason=reason or named,
+        **_camera_cells(content),
     )
 
 
-def _with_moved_cameras(rows: Sequence[BatchRow]) -> list[BatchRow]:
-    """Return the rows with the camera's motion between episodes, and a reason where the motion is significant.
+def _camera_cells(content: AnyCalibration) -> dict[str, float]:
+    """Return the cells of a row with the pose of the wrist camera and its intrinsics, as far as they are known."""
+    cells = dict[str, float]()
+    if not isinstance(content, FailedCalibration) and content.mount == "gripper":
+        x = content.gripper_from_camera
+        numbers = [*x[:3, 3].tolist(), *Rotation.from_matrix(x[:3, :3]).as_quat(canonical=True).tolist()]
+        cells |= dict(zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), numbers, strict=True))
+    if (camera := content.intrinsics) is not None:
+        cells |= {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    return cells
 
-    `moved_mm` and `moved_deg` are relative to the sound episode of the same capture with the smallest median χ² to
-    all its sound episodes. χ² is the squared difference of two hand-eye transforms, weighted by its inverse
-    covariance. Significant is a p-value below 0.001. Captures with fewer than three sound episodes are unchanged.
+
+def _with_compared_cameras(rows: Sequence[BatchRow]) -> tuple[list[BatchRow], list[str]]:
+    """Return the rows with the cameras of the episodes of each capture compared, and the agreement in words.
+
+    `moved_mm` and `moved_deg` are relative to the most exact episode of the largest group. Captures with fewer than
+    MIN_EPISODES sound episodes are unchanged.
     """
-    found = list(rows)
-    for capture in {row.capture for row in rows}:
+    found, sentences = list(rows), list[str]()
+    for capture in dict.fromkeys(row.capture for row in rows):
         members = [k for k, row in enumerate(rows) if row.capture == capture and row.is_sound]
+        members.sort(key=lambda k: (rows[k].episode or 0, rows[k].out))
         if len(members) < MIN_EPISODES:
             continue
-        results = [load_run(Path(rows[k].out)).calibration for k in members]
-        differences = [[compare(one, other) for other in results] for one in results]
-        nearest = min(differences, key=lambda row: float(np.median([one.chi2 or 0.0 for one in row])))
-        for k, apart in zip(members, nearest, strict=True):
+        numbers = [k if (own := rows[at].episode) is None else own for k, at in enumerate(members)]
+        agreed = agreement(numbers, [load_run(Path(rows[k].out)).solved for k in members])
+        sentences += agreed.sentences
+        most = max(set(agreed.group), key=agreed.group.count)
+        for k, group, apart in zip(members, agreed.group, agreed.apart, strict=True):
             mm = float(1e3 * np.linalg.norm(apart.translation_m))
             deg = float(np.degrees(np.linalg.norm(apart.rotation_vector)))
-            found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg)
-            if apart.p_value is not None and apart.p_value < ALPHA:
+            found[k] = replace(rows[k], moved_mm=mm, moved_deg=deg, camera=letter(group))
+            if group != most:
                 reason = f"the camera differs by {mm:.1f} mm and {deg:.2f}° from that of most episodes"
                 found[k] = replace(found[k], reason=reason)
-    return found
+    return found, sentences
 
 
 def _failed(task: Task, reason: str) -> BatchRow:
@@ -253,8 +292,8 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[BatchRow]:
         ray.shutdown()
 
 
-def _write_summary(out: Path, rows: Sequence[BatchRow]) -> None:
-    """Write the table as summary.csv and as the page summary.html, with links to the reports."""
+def _write_summary(out: Path, rows: Sequence[BatchRow], sentences: Sequence[str]) -> None:
+    """Write the table as summary.csv and as the page summary.html, with these sentences and links to the reports."""
     text, content = io.StringIO(), [asdict(row) for row in rows]
     table = csv.DictWriter(text, list(content[0]), lineterminator="\n")
     table.writeheader()
@@ -263,4 +302,5 @@ def _write_summary(out: Path, rows: Sequence[BatchRow]) -> None:
     folders = [Path(row.out) for row in rows]
     reports = {folder.name for folder in folders if (folder / "report.html").is_file()}
     lines = list(zip([folder.name for folder in folders], rows, strict=True))
-    write_text(out / "summary.html", render("batch.html", {"table": lines, "reports": reports}))
+    content = {"table": lines, "reports": reports, "sentences": sentences}
+    write_text(out / "summary.html", render("batch.html", content))

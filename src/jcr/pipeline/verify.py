@@ -16,6 +16,7 @@ from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.distributions import chi2
 from jcr.errors import InputError, RejectedError
+from jcr.estimation.robot_noise import REACH
 from jcr.files import locked
 from jcr.findings import Verdict
 from jcr.geometry import Transform, retract, step_between
@@ -221,7 +222,9 @@ def _judged(run: RunResult, history: History, index: int, tolerance: tuple[float
         first = own[0].first
         shown = None if cause == "robot" else step
         move = Move((cause, *own[-1].rivals), first, history.captures[first].name, shown)
-        if cause == "robot" or _exceeds(step, tolerance):
+        # Errors of the joints turn the gripper, and move it by their typical lever.
+        size = sum(one.size for one in own)
+        if exceeds(step if cause != "robot" else np.array([REACH * size, 0, 0, size, 0, 0]), tolerance):
             moves.append(move)
         else:
             notes.append(f"{_in_words(move)}, which is significant and below the tolerance")
@@ -239,7 +242,7 @@ def _judged(run: RunResult, history: History, index: int, tolerance: tuple[float
     )
 
 
-def _exceeds(step: Float[ndarray, "6"], tolerance: tuple[float, float]) -> bool:
+def exceeds(step: Float[ndarray, "6"], tolerance: tuple[float, float]) -> bool:
     """Test whether translation or rotation of a step (m, rad) is larger than in `tolerance` (mm, degrees)."""
     sizes = 1e3 * np.linalg.norm(step[:3]), np.degrees(np.linalg.norm(step[3:]))
     return bool(sizes[0] > tolerance[0] or sizes[1] > tolerance[1])
@@ -321,7 +324,7 @@ def of_two_poses(
         covariance=covariance,
         p_value=p_value,
         detectable=noticed,
-        moved=p_value < ALPHA and _exceeds(offset, tolerance),
+        moved=p_value < ALPHA and exceeds(offset, tolerance),
         images=tuple(images),
         notes=(*notes, *_blindness(noticed)),
     )

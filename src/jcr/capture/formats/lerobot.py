@@ -35,6 +35,8 @@ USUAL_BYTES, PACKED = 200_000_000, 20
 images hardly pack, and a file of LeRobot has 100 MB. Zeros pack to a thousandth."""
 MOST_FRAMES = 500_000
 """Largest number of frames of an episode: five hours at 30 Hz."""
+MOST_EPISODES = 200
+"""Largest number of episodes that "all" takes: a set of thousands has a camera that moves a few times, if at all."""
 LATEST_S = 9e9
 """Largest time stamp (s), about that of the largest int64 in ns (9.2e9); time since 1970 is 1.8e9."""
 
@@ -64,6 +66,7 @@ class Info(BaseModel):
     fps: Annotated[float, Field(gt=0, le=1e6)]
     codebase_version: str = ""
     chunks_size: Annotated[int, Field(ge=1)] = 1000
+    total_episodes: Annotated[int, Field(ge=0)] = 0
     data_path: Annotated[str, Field(max_length=1000)]
     video_path: Annotated[str, Field(max_length=1000)] | None = None
 
@@ -89,6 +92,23 @@ def recognises(path: Path) -> bool:
     return (path / INFO).is_file()
 
 
+def episodes_of(path: Path, options: ReadOptions) -> tuple[list[int], int]:
+    """Return the episodes that the options name, at most MOST_EPISODES for "all", and the number that were meant.
+
+    Raises InputError for "all" unless the path is a data set that states its number of episodes.
+    """
+    named = [one for one in options.episode if one != "all"]
+    if len(named) == len(options.episode):
+        return named, len(named)
+    if not recognises(path):
+        raise InputError(f"{path}: --episode all is for LeRobot data sets; leave it out")
+    info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
+    if not (total := info.total_episodes):
+        raise InputError(f"{path / INFO}: states no total_episodes; name the episodes")
+    steps = np.linspace(0, total - 1, min(total, MOST_EPISODES)).round().astype(int)
+    return sorted({*named, *steps.tolist()}), total
+
+
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Extract the sharpest frames at rest from the episode that the options name; return them as a capture.
 
@@ -107,7 +127,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         raise InputError(
             f"{path}: {len(options.episode)} episodes; read one, or several one by one with jcr batch"
         )
-    episode = read_episode(path, info, camera, key, options.episode[0])
+    ((index, *_), _) = episodes_of(path, options)
+    episode = read_episode(path, info, camera, key, index)
     arm = None if options.urdf is None else read_arm(options)
     poses, joints = _poses(episode.state, key, features[key], options, path, arm)
     stamps = np.round(1e9 * episode.time_s).astype(np.int64)
