@@ -59,8 +59,8 @@ class CaptureCommand:
     """Port of the live page and of samples on this machine; 0: any free one. The key is random, or that of the
     environment variable JCR_TOKEN."""
     intrinsics_from: Path | None = None
-    """File with the camera's intrinsics, as for --camera-info, or a capture.json or calibration.json; unset: those of the
-    camera (RealSense), otherwise estimated."""
+    """File with the camera's intrinsics, as for --camera-info, or a capture.json or calibration.json; unset: those of
+    the camera (RealSense), otherwise estimated."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
     """Verify this run with the images (default: 5) instead of calibrating them: at the end, and at each POST /verify."""
     session: SessionOptions = field(default_factory=SessionOptions)
