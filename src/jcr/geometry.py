@@ -31,6 +31,8 @@ TINY = 1e-300
 """Lower bound of denominators, against 0 / 0."""
 ARM = 0.3
 """Lever (m) by which an angle (rad) is multiplied to compare it with a length: 0.1 mm counts like 0.02°."""
+ROOT_FROM_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Transform from a camera's optical frame (z forward, x right) to its root link (x forward, z up), as in REP-103."""
 PARALLEL = 1e-6
 """Weight that keeps the point nearest to parallel lines finite."""
 

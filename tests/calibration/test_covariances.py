@@ -13,7 +13,7 @@ from jcr.calibration.record import Calibration, read_calibration
 from jcr.calibration.words import mixed_pair_mm, summary
 from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
-from jcr.geometry import retract, rotation_exp, transform
+from jcr.geometry import ROOT_FROM_OPTICAL, inverse, retract, rotation_exp, transform
 from jcr.rounding import significant
 from places import ROOT
 
@@ -63,6 +63,47 @@ def test_the_error_of_a_mixed_pair_is_that_of_the_rays():
     assert mixed_pair_mm(found) == pytest.approx(expected)
     assert f"a point is up to {significant(expected)} mm off" in summary(found)
     assert mixed_pair_mm(replace(found, with_given_intrinsics=None)) is None
+
+
+HAND_EYE = transform(rotation_exp(np.array([0.1, -0.05, 0.8])), np.array([0.05, 0.02, 0.06]))
+TOOL = transform(rotation_exp(np.array([0.0, 0.0, np.pi / 4])), np.array([0.0, 0.0, -0.1034]))
+CAUSES = {
+    "camera_from_gripper": inverse(HAND_EYE),
+    "root link": HAND_EYE @ inverse(ROOT_FROM_OPTICAL) @ transform(np.eye(3), np.array([0.0, 0.015, 0.0])),
+    "OpenGL": HAND_EYE @ np.diag([1.0, -1.0, -1.0, 1.0]),
+    "millimetres": HAND_EYE + 999 * np.pad(HAND_EYE[:3, 3:], ((0, 1), (3, 0))),
+    "103 mm along z of this one's and rotated by 45° about it": inverse(TOOL) @ HAND_EYE,
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_another_frame_is_named_as_the_cause_of_a_difference(cause: str, tmp_path: Path, capsys):
+    found = compare(HAND_EYE, CAUSES[cause])
+    assert found.likely_cause is not None and cause in found.likely_cause
+    for name, matrix in (("a", HAND_EYE), ("b", CAUSES[cause])):
+        (tmp_path / f"{name}.json").write_text(json.dumps({"gripper_from_camera": matrix.tolist()}))
+    dispatch(["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")])
+    assert f"Remedy      compare first {found.likely_cause}" in capsys.readouterr().out
+
+
+def test_other_intrinsics_are_named_where_they_explain_a_difference_and_a_slip_is_not():
+    ours = read_calibration(ACCEPTED)
+    assert isinstance(ours, Calibration) and ours.with_given_intrinsics is not None
+    joint = ours.uncertainty.joint
+    assert joint is not None and ours.intrinsics is not None
+    by = joint.covariance[:6, 7:] @ np.linalg.pinv(joint.covariance[7:, 7:], rcond=1e-12, hermitian=True)
+    off = np.r_[6.0, 6.0, 4.0, -3.0, np.zeros(len(by[0]) - 4)]
+    moved = retract(ours.gripper_from_camera, by @ off)
+    found = compare(ours, moved)
+    assert found.p_value is not None and found.p_value < 1e-3 and found.likely_cause is not None
+    assert f"the intrinsics: fx {ours.intrinsics.fx + 6:.1f}" in found.likely_cause
+    other = replace(ours, on_gripper=moved, intrinsics=replace(ours.intrinsics, fx=ours.intrinsics.fx + 1))
+    assert compare(ours, other).likely_cause is None, (
+        "the intrinsics of the other are known, and do not explain it"
+    )
+    slipped = retract(ours.gripper_from_camera, np.array([0.004, -0.003, 0.001, 0.01, 0.002, -0.02]))
+    assert compare(ours, slipped).likely_cause is None
+    assert compare(HAND_EYE, retract(HAND_EYE, np.array([1e-3, 1e-3, 0, 0.002, 0, 0]))).likely_cause is None
 
 
 def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -32,7 +32,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.export import ros, simulators
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.options import ExportOptions, provenance
-from jcr.geometry import Similarity, apply, inverse, rotation_exp, transform
+from jcr.geometry import ROOT_FROM_OPTICAL, Similarity, apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
@@ -567,12 +567,12 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMa
 
 def test_command_gives_the_asked_root_link(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     # Looking forward (x of the root), the optical frame has z there, x to the right (-y) and y down (-z).
-    np.testing.assert_array_equal(ros.ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    np.testing.assert_array_equal(ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     gripper_from_camera = np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"])
     options = ["--to-root", "camera_link", "--parent-frame", "flange"]
     path = export(done, "urdf", tmp_path / "a.urdf", *options)
     found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")
-    np.testing.assert_allclose(found @ ros.ROOT_FROM_OPTICAL, gripper_from_camera, atol=1e-9)
+    np.testing.assert_allclose(found @ ROOT_FROM_OPTICAL, gripper_from_camera, atol=1e-9)
     root_pose = [0.0, 0.015, -0.002, -0.4977, 0.5023, -0.4977, 0.5023]
     path = export(done, "urdf", tmp_path / "b.urdf", *options, "--root-from-optical", *root_pose)
     found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")

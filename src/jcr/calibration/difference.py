@@ -11,6 +11,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from jcr.calibration.likely_cause import UNLIKELY, likely_cause
 from jcr.calibration.record import (
     AnyCalibration,
     Calibration,
@@ -37,6 +38,8 @@ class StatedTransform:
     Empty: the covariance is unknown."""
     doubt: str | None = None
     """Reason why the calibration is rejected; None if it is accepted, or if it is a reference without a verdict."""
+    calibration: Calibration | None = None
+    """Calibration that the transform is of; None for a reference."""
 
 
 if TYPE_CHECKING:
@@ -68,6 +71,9 @@ class Difference:
     p_value: float | None = None
     explained_by: dict[str, float] = field(default_factory=dict)
     """Share of χ² by cause of error, largest first; the sum is 1. Empty if both transforms are equal."""
+    likely_cause: str | None = None
+    """Other intrinsics or another frame that explain a difference beyond the reported errors, or of transforms without
+    errors; None without such a cause."""
 
 
 class _Reference(BaseModel):
@@ -99,21 +105,26 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
         for cause in ours.parts | others.parts
     }
     together = sum(parts.values(), nothing)
+    pair = ours.gripper_from_camera, others.gripper_from_camera
+    calibrations = ours.calibration, others.calibration
     if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
-        return Difference(translation_m=step[:3], rotation_vector=step[3:], doubts=doubts)
+        cause = likely_cause(*pair, None, calibrations)
+        return Difference(translation_m=step[:3], rotation_vector=step[3:], doubts=doubts, likely_cause=cause)
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
     shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items() if squared}
     if abs(shares.get(OTHER, 1.0)) <= NOTHING:
         del shares[OTHER]
+    p_value = float(chi2.sf(squared, 6))
     return Difference(
         translation_m=step[:3],
         rotation_vector=step[3:],
         doubts=doubts,
+        likely_cause=None if p_value >= UNLIKELY else likely_cause(*pair, together, calibrations),
         sigmas=np.abs(step) / std,
         chi2=squared,
-        p_value=float(chi2.sf(squared, 6)),
+        p_value=p_value,
         explained_by=dict(sorted(shares.items(), key=lambda item: -item[1])),
     )
 
@@ -137,7 +148,7 @@ def _stated(one: Comparable, name: str) -> StatedTransform:
         causes = {} if budget is None else vars(budget)
         rest = record.covariance - sum(causes.values(), np.zeros((7, 7)))
         parts = {cause: part[:6, :6] for cause, part in (causes | {OTHER: rest}).items()}
-        return StatedTransform(record.gripper_from_camera, parts, record.doubt)
+        return StatedTransform(record.gripper_from_camera, parts, record.doubt, record)
     matrix = np.asarray(one, float)
     if matrix.shape != (4, 4):
         raise InputError(f"a transform of shape {matrix.shape}; give a 4×4 gripper_from_camera")

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 MOST_POSES = 5
 """Number of poses that `jcr verify --check-poses` prints; more images than that add little."""
-UNLIKELY = 1e-3
-"""p-value below which the reported errors do not explain a difference."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +204,7 @@ class CompareCommand:
         Return the exit status: 3 if the reported errors do not explain it or a calibration is rejected, else 0.
         """
         from jcr.calibration.difference import compare
+        from jcr.calibration.likely_cause import UNLIKELY
 
         paths, found = (self.out, self.reference), compare(self.out, self.reference)
         rejected = {str(path): doubt for path, doubt in zip(paths, found.doubts, strict=True) if doubt}
@@ -214,6 +213,7 @@ class CompareCommand:
             "translation_mm": float(np.linalg.norm(mm)),
             "rotation_deg": float(np.linalg.norm(deg)),
             "translation_xyz_mm": mm,
+            "likely_cause": found.likely_cause,
             "rejected": rejected,
         }
         offset, explained = f"{numbers(mm, 3)} mm (gripper axes)", "; neither file states its errors"
@@ -227,6 +227,8 @@ class CompareCommand:
         if is_contradiction:
             explained = "; more than the reported errors explain"
             remedy = ["find out what moved between the two, or which error they do not report"]
+        if found.likely_cause is not None:
+            remedy = [f"compare first {found.likely_cause}", *(f"otherwise {one}" for one in remedy)]
         verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"
         apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
         lines = [f"{verdict}: {apart}{explained}", *labelled("Remedy", *remedy)]
@@ -436,6 +438,7 @@ class TouchCommand:
 
         Return the exit status: 3 if the errors are larger than the reported uncertainty explains, else 0.
         """
+        from jcr.calibration.likely_cause import UNLIKELY
         from jcr.pipeline.touch import touch
 
         found = touch(self.out, self.points)

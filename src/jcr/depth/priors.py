@@ -104,9 +104,9 @@ class PlanarPrior:
 
     inverse_depth: Float[ndarray, "*m h w"]
     holds: Bool[ndarray, "*m h w"]
-    """Where two other images (on the support plane, one) show the same colour, and none sees through the plane."""
+    """Pixels where two other images (one on the support plane) show the same colour and none sees through the plane."""
     confirms: Bool[ndarray, "*m h w"]
-    """Where the plane confirms a match: it holds, or the only other image that sees the point shows the same colour."""
+    """Pixels where the plane confirms a match: it holds, or the only other image with the point has the same colour."""
     agreeing: UInt8[ndarray, "*m h w"]
     """Number of images that must agree with the plane's depth, at most 1 on the support plane."""
     contradicts: Bool[ndarray, "*m h w"]

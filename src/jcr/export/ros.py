@@ -19,7 +19,7 @@ from jcr import __version__
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
 from jcr.files import read_bytes
-from jcr.geometry import inverse, roll_pitch_yaw, transform
+from jcr.geometry import ROOT_FROM_OPTICAL, inverse, roll_pitch_yaw
 from jcr.records import COEFFICIENTS, FRAME_NAME, Intrinsics
 
 PARENT, CHILD, BASE = "GRIPPER_FRAME", "camera_color_optical_frame", "base"
@@ -31,8 +31,6 @@ _DISTORTIONS = {
     "thin_prism": "rational_polynomial",
     "fisheye": "equidistant",
 }
-ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
-"""Transform from a camera's optical frame (z forward, x right) to its root link (x forward, z up), as in REP-103."""
 
 
 @dataclass(frozen=True, kw_only=True)
