@@ -36,7 +36,7 @@ from jcr.capture.read import read_source
 from jcr.capture.ros import read_ros_depth, read_ros_image
 from jcr.cli import dispatch
 from jcr.errors import InputError, shown
-from jcr.geometry import transform
+from jcr.geometry import Similarity, transform
 from jcr.records import Intrinsics, Reading, Tracks
 from jcr.records.npz import read_reconstruction
 from jcr.scene.cloud import read_cloud, write_cloud
@@ -537,7 +537,7 @@ def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
     poses = np.stack([transform(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(3)])
     views = PosedImages(
         folder=tmp_path, images=images, base_from_camera=poses, base_from_gripper=poses, intrinsics=CAMERA,
-        tracks=NO_TRACKS, points_in_base=np.zeros((0, 3)),
+        tracks=NO_TRACKS, points_in_base=np.zeros((0, 3)), base_from_recon=Similarity(np.eye(4), 1.0),
     )  # fmt: skip
     write_nerfstudio(
         tmp_path / "out", views, cloud_of(np.zeros((1, 3))), {}, ExportOptions(undistort=undistort)
@@ -878,6 +878,7 @@ MARKUP = "<img src=x onerror=alert(1)>{1+1}**b**[a](javascript:x).png"
 @pytest.mark.slow
 def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
     from jcr.result import load_run
+    from jcr.report.scene3d import BY_LABEL
     from jcr.viewer.viewer import Viewer, open_server
 
     run = load_run(small_done)
@@ -896,7 +897,7 @@ def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
         viewer = Viewer(server, run)
         viewer.calibration = replace(viewer.calibration, images=images)
         viewer.choose_image()
-        viewer.by_label.value = True
+        viewer.shown.value = BY_LABEL
         viewer.show_points()
         cloud = viewer.points
         viewer.click(cloud.mean(0) + [0, 0, 1.0], np.array([0.0, 0.0, -1.0]))
