@@ -877,8 +877,8 @@ MARKUP = "<img src=x onerror=alert(1)>{1+1}**b**[a](javascript:x).png"
 
 @pytest.mark.slow
 def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
-    from jcr.result import load_run
     from jcr.report.scene3d import BY_LABEL
+    from jcr.result import load_run
     from jcr.viewer.viewer import Viewer, open_server
 
     run = load_run(small_done)
