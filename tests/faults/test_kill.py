@@ -75,6 +75,7 @@ class Run:
 
 READERS = {
     "calibration.json": read_calibration,
+    "uncertainty.npz": lambda path: [np.load(path)[name] for name in np.load(path).files],
     "reconstruction.npz": read_reconstruction,
     "depth.npz": lambda path: RunResult(path.parent).reconstruction,
     "cloud.ply": read_cloud,

@@ -24,7 +24,7 @@ from pydantic import (
 import jcr
 from jcr.errors import InputError, RejectedError, first_fault, shown
 from jcr.estimation.point_uncertainty import point_in_base
-from jcr.files import write_text
+from jcr.files import written_whole
 from jcr.findings import (
     Finding,
     FindingKind,
@@ -442,13 +442,15 @@ def write_calibration(path: Path, content: Outcome) -> None:
     made, arrays = content.as_json(), dict[str, ndarray]()
     if (uncertainty := made.get("uncertainty")) is not None:
         _take_arrays(uncertainty, arrays)
-    file = path.with_name(UNCERTAINTY)
     if arrays:
-        write_npz(file, {"format": ARRAYS}, arrays)
         made["uncertainty"]["arrays"] = digest_of(arrays)
-    else:
-        file.unlink(missing_ok=True)
-    write_text(path, as_text(made) + "\n")
+    # Both files are replaced when both are written.
+    with written_whole(path) as temporary:
+        temporary.write_bytes(f"{as_text(made)}\n".encode())
+        if arrays:
+            write_npz(path.with_name(UNCERTAINTY), {"format": ARRAYS}, arrays)
+        else:
+            path.with_name(UNCERTAINTY).unlink(missing_ok=True)
 
 
 def _take_arrays(uncertainty: dict[str, Any], arrays: dict[str, ndarray]) -> None:
