@@ -43,6 +43,10 @@ def test_blur_is_measured_by_the_image_itself(tabletop: Path):
         assert edge_width(np.asarray(blurred, np.uint8)) > BLURRED_EDGE
     assert edge_width(RNG.normal(120, 4, sharp[0].shape).astype(np.uint8)) == 0.0
     assert edge_width(sharp[0][:16, :16]) == 0.0, "too small to be measured"
+    few = np.full((480, 640, 3), 60, np.uint8)
+    few[180:300, 220:400] = 200
+    assert edge_width(few) < 0.6 * BLURRED_EDGE, "an image with few edges is not blurred"
+    assert edge_width(cv2.GaussianBlur(few, (0, 0), 5)) > BLURRED_EDGE
 
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():

@@ -5,6 +5,7 @@ Poses of planar bodies come from estimation/absolute_pose.py.
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
 from jcr.estimation.problem import wrist_arm, wrist_problem
 from jcr.geometry import apply, inverse
 from jcr.progress import Progress, silent
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.records import Boards, Body, Capture, Intrinsics, Reconstruction, Tracks
 
 WORST_PX = 3.0
 """Largest rms reprojection error of a body's points; above it the board is bent, or another one."""
@@ -69,11 +70,14 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
         notes.append(f"the board is not seen, or not sharply, in {', '.join(missing)}")
     sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
-    cameras, tracks = np.stack([recon_from_camera[row] for row in rows]), _tracks(sightings, recon_from_body)
+    cameras = np.stack([recon_from_camera[row] for row in rows])
+    stated = Boards(spec=board.name, side=board.side, size_std=board.size_std, bodies=())
+    tracks = _tracks(sightings, recon_from_body, stated)
     if len(recon_from_body) > 1:
         # Images are adjusted alone: the arm's poses, which a problem has, are not used.
         start, camera = (np.eye(4), 1.0, np.eye(4)), camera_with_prior(intrinsics, FIXED)
-        problem, state = wrist_problem(wrist_arm(cameras), start, cameras, camera, tracks)
+        free = replace(tracks, boards=None)
+        problem, state = wrist_problem(wrist_arm(cameras), start, cameras, camera, free)
         cameras = adjust_images(problem, state).world_from_rig
     return Reconstruction(
         image_index=rows,
@@ -158,16 +162,28 @@ def locate_cameras_and_bodies(
     return cameras, placed
 
 
-def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:
+def _tracks(
+    sightings: Sequence[Sequence[Sighting]], recon_from_body: dict[int, Float[ndarray, "4 4"]], board: Boards
+) -> Tracks:
+    """Return the tracks of the corners detected in each image; their shape is a prior of the adjustment.
+
+    `board` names the board or tags. A body that one image shows has no prior.
+    """
     seen = [(row, s) for row, shown in enumerate(sightings) for s in shown]
     names = [(s.body, index) for _, s in seen for index in s.index]
     place = {name: k for k, name in enumerate(dict.fromkeys(names))}
     point = np.array([place[name] for name in names])
-    x_in_recon = np.concatenate([apply(bodies[s.body], s.x_in_body) for _, s in seen])
+    x_in_body = np.concatenate([s.x_in_body for _, s in seen])[np.unique(point, return_index=True)[1]]
+    body = np.array([number for number, _ in place])
+    images = Counter(s.body for _, s in seen)
+    corners = {number: np.flatnonzero(body == number) for number in sorted(images) if images[number] > 1}
     return Tracks(
         image=np.repeat([row for row, _ in seen], [len(s.index) for _, s in seen]),
         x_px=np.concatenate([s.x_px for _, s in seen]),
         point=point,
-        points_in_recon=x_in_recon[np.unique(point, return_index=True)[1]],
+        points_in_recon=np.stack(
+            [apply(recon_from_body[n], x) for n, x in zip(body.tolist(), x_in_body, strict=True)]
+        ),
         from_board=True,
+        boards=replace(board, bodies=tuple(Body(n, own, x_in_body[own]) for n, own in corners.items())),
     )

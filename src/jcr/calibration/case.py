@@ -200,11 +200,12 @@ class Case:
 
         It needs MIN_OBSERVATIONS observations and MIN_IMAGES used images. Camera poses with a covariance (`evidence`)
         are not adjusted. Cases with a known scale or height (`priors`) are not adjusted either, because the bundle
-        adjustment does not model these.
+        adjustment does not model these; it models the size of a board.
         """
+        is_board = self.model.tracks.boards is not None and self.reconstruction.metric_std is not None
         return (
             self.reconstruction.evidence is None
-            and not self.priors
+            and len(self.priors) <= is_board
             and len(self.model.observations.image) >= MIN_OBSERVATIONS
             and len(self.used) >= MIN_IMAGES
         )

@@ -187,8 +187,8 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
             continue
         near, far = (np.abs(along[n:] - along[:-n]) for n in (2, FAR_PX))
         steepest = cv2.dilate(near, window)[FAR_PX // 2 - 1 :][: len(far)]
-        is_edge = far >= max(float(np.quantile(far, 0.99)), LEAST_CONTRAST)
-        if is_edge.any():
+        if (strong := float(np.quantile(far, 0.99))) > LEAST_CONTRAST:
+            is_edge = far >= strong
             widths.append(float(np.median(2 * far[is_edge] / np.maximum(steepest[is_edge], 1.0))) / EDGES_AT)
     return max(widths)
 

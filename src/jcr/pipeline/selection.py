@@ -26,7 +26,7 @@ from jcr.findings import (
     text,
 )
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BACKENDS, ReconstructOptions, reconstruct, tries
+from jcr.reconstruct import BACKENDS, MARKER, ReconstructOptions, reconstruct, tries
 from jcr.records import Attempt, Capture, PosePairs, Reconstruction
 from jcr.result import RunOptions
 
@@ -158,6 +158,10 @@ def select_reconstruction(
     if before is not None:
         trials.append(_try(capture, before, reconstruct, calibrate, progress))
     candidates = tries(options.reconstruct) if before is None or goes_on else []
+    if capture.mount == "base":
+        # A board that the gripper carries before a fixed camera is small in the images, as all that moves: corners are
+        # more accurate there than features, and found in a fifth of the time.
+        candidates.sort(key=lambda one: one.backend != MARKER)
     for one in candidates:
         reason, goes_on = _why_untried(one, trials, len(capture), of_images) if trials else (None, True)
         notes += filter(None, [reason])
