@@ -23,6 +23,7 @@ from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.verdict import appended, judged, with_shifts, with_uncertainty
+from jcr.camera import usable_intrinsics
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import ONE_AXIS
@@ -120,6 +121,9 @@ def fitted_case(
     registered images.
     """
     evidence, rows = reconstruction.evidence, reconstruction.image_index
+    if reconstruction.intrinsics not in (capture.intrinsics, usable_intrinsics(capture.intrinsics)[0]):
+        # The reconstruction estimated intrinsics, because none were given or the given ones did not fit the images.
+        capture = replace(capture, intrinsics=None, intrinsics_std=None)
     if len(rows) < 2:
         raise RejectedError(
             f"{len(rows)} of {len(capture)} images registered",

@@ -27,6 +27,7 @@ from jcr.camera import (
     guessed_intrinsics,
     resized,
     usable_intrinsics,
+    without_distortion,
 )
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
@@ -88,17 +89,43 @@ def reconstruct_colmap(
     """Reconstruct camera poses and tracks of a capture; frame and unit are arbitrary, and a seed fixes every bit.
 
     The gripper poses check the matches (`features.stage`). The images are reduced to a long side of `working_size_px`.
-    Known intrinsics are held, unknown ones are estimated. Raises RejectedError when fewer than three images register,
+    Known intrinsics are held, unknown ones are estimated. Known ones with which fewer than half of the images register
+    are estimated too, if most images register then. Raises RejectedError when fewer than three images register,
     with their number, the likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     all_intrinsics, known, warnings = starting_intrinsics(capture)
-    like = all_intrinsics[0]
     with quiet_colmap():
-        cameras = working_cameras(all_intrinsics, known, working_size_px)
-        matcher = matcher_of(images, cameras[0], known, features, seed, report)
-        matched, model = map_images(matcher, capture.base_from_gripper, like, cameras, capture.images, report)
+        matcher = matcher_of(
+            images,
+            working_cameras(all_intrinsics, known, working_size_px)[0],
+            known,
+            features,
+            seed,
+            report,
+        )
+
+        def mapped(
+            start: list[Intrinsics], matcher: Matcher
+        ) -> tuple[MatchedPairs, pycolmap.Reconstruction | None]:
+            """Match and map the images with the intrinsics `start`, which are tried in turn."""
+            cameras = working_cameras(start, matcher.known, working_size_px)
+            return map_images(matcher, capture.base_from_gripper, start[0], cameras, capture.images, report)
+
+        matched, model = mapped(all_intrinsics, matcher)
+        like, registered = all_intrinsics[0], 0 if model is None else model.num_reg_images()
+        if known and 2 * registered < len(images):
+            # Wrong intrinsics spoil the matches' verification and the map; their focal length is nearly right mostly.
+            start = [without_distortion(like), *starting_intrinsics(replace(capture, intrinsics=None))[0]]
+            free = Matcher(matcher.features, working_cameras(start, False, working_size_px)[0], False, seed)
+            other = mapped(start, free)
+            if other[1] is not None and other[1].num_reg_images() > max(2 * registered, len(images) // 2):
+                (matched, model), matcher, like, known = other, free, start[0], False
+                warnings = (
+                    f"the given intrinsics are not used: with them {registered} of {len(images)} images register, with "
+                    f"estimated ones {model.num_reg_images()}; calibrate the camera again, or leave them out",
+                )
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
         made = _adjusted(model, images, like, known, seed)
