@@ -12,6 +12,7 @@ from PIL import Image
 
 import jcr
 from capture_writers import write_colmap
+from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture
@@ -118,6 +119,21 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
     assert "folds over at" in warning and "not used" in warning and not result.notes
     assert result.intrinsics == capture.intrinsics
     np.testing.assert_array_equal(result.recon_from_camera, four.recon_from_camera)
+
+
+@pytest.mark.long
+def test_given_distortion_with_which_no_image_registers_is_estimated_and_named(tabletop: Path) -> None:
+    """The coefficients are those of a real capture: its images register without them only."""
+    capture = read_capture(tabletop)
+    assert capture.intrinsics is not None
+    wrong = replace(capture.intrinsics, distortion=(0.218, -1.083, -0.0016, 0.0022, 2.239))
+    given = replace(capture, intrinsics=wrong)
+    made = reconstruct_colmap(given)
+    assert len(made.image_index) == len(capture)
+    assert "the given intrinsics are not used" in made.warnings[0]
+    found = calibrate_reconstruction(given, made)
+    assert found.verdict == "accepted" and found.with_given_intrinsics is None
+    assert found.intrinsics is not None and abs(found.intrinsics.fx / capture.intrinsics.fx - 1) < 1e-3
 
 
 def test_unknown_intrinsics_is_found(capture: Capture) -> None:
