@@ -33,6 +33,7 @@ BENCHES = {
     "features": (ROBOTS, "Features on real captures"),
     "cameras": (ROBOTS, "Several cameras"),
     "inputs": (ROBOTS, "Files as people hold them"),
+    "verified": (ROBOTS, "Real captures verified"),
     "coverage": (HONEST, "Is ± true?"),
     "faults": (HONEST, "Faults"),
     "shuffled": (HONEST, "Effects of the order, in random orders"),

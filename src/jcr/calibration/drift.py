@@ -181,13 +181,15 @@ def check_series(
     at = [_Solved.of(model, log_sizes, columns) for log_sizes in sizes]
     share = np.array([one.log_weight for one in at])
     share -= logsumexp(share)
-    log_factors = np.full((2, n), -np.inf)
+    log_factors, likely = np.full((2, n), -np.inf), share
     for cause, k in product(range(2), range(max(begin, 0), n)):
         # A change before capture k: the sum of the columns of the captures from k on.
         each = [one.summed(np.r_[6 * (n * cause + k) : 6 * n * (cause + 1)]).log_factor for one in at]
         log_factors[cause, k] = logsumexp(share + each)
+        # The sizes with a change count, too: a change is no noise.
+        likely = np.logaddexp(likely, share + each)
     log_odds = float(logsumexp(log_factors) - np.log(2))
-    newest = at[int(share.argmax())].summed(np.r_[6 * (n - 1) : 6 * n])
+    newest = at[int(likely.argmax())].summed(np.r_[6 * (n - 1) : 6 * n])
     found = SeriesCheck(log_odds, detectable(np.linalg.inv(newest.information)), tuple(decided))
     if log_odds < np.log(ODDS):
         return found

@@ -152,12 +152,12 @@ def _in_words(move: Move) -> str:
     """Return a change in words."""
     nouns = {"camera": "the camera", "scene": "the scene", "robot": "the robot's reported poses"}
     said = " or ".join(nouns[one] for one in nouns if one in move.causes)
-    has = "have" if move.causes == ("robot",) else "has"
+    did = "have changed" if "robot" in move.causes else "has moved"
     size = ""
     if move.step is not None:
         mm, deg = 1e3 * np.linalg.norm(move.step[:3]), np.degrees(np.linalg.norm(move.step[3:]))
         size = f" by {mm:.2f} mm and {deg:.3f}°"
-    return f"{said} {has} {'changed' if move.causes == ('robot',) else 'moved'}{size} since {move.since}"
+    return f"{said} {did}{size} since {move.since}"
 
 
 def verify_run(
