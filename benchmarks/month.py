@@ -69,8 +69,8 @@ def _claims(
     matter, share = sum(map(_matters, alarms)), 100 * len(alarms) / captures
     yield (
         f"> {len(alarms)} false alarms in {captures} captures of months in which nothing moved (in {months} of "
-        f"{len(quiet)} months): {share:.2f} per hundred captures, stated 0.1 at most; {matter} of them exceed the "
-        "default tolerance."
+        f"{len(quiet)} months): {share:.2f} per hundred captures, stated 0.1 at most. {matter} of them exceed the "
+        "default tolerance, so that `jcr verify` would reject the calibration."
     )
     parts = []
     for mm, months in bumped.items():

@@ -46,11 +46,10 @@ class Half(NamedTuple):
 
     @property
     def off_mm(self) -> float:
-        """Distance of the found translation from the shift; infinite if no cause is named alone."""
-        true = np.zeros(3) if self.shift == "none" else SHIFT_M * np.array([-1.0, 0, 0])
-        true = -true if self.shift == "scene" else true
-        steps = [move.step[:3] for move in self.found.moves if move.step is not None]
-        return 1e3 * float(np.linalg.norm(steps[-1] - true)) if steps else np.inf
+        """Distance of the found translation from the shift; infinite if another cause is likelier, or none found."""
+        true = np.array([SHIFT_M if self.shift == "scene" else -SHIFT_M, 0, 0])
+        step = self.found.moves[-1].step if self.found.cause == self.shift else None
+        return np.inf if step is None else 1e3 * float(np.linalg.norm(step[:3] - true))
 
 
 def run(captures: Path, every: int = 1) -> str:
@@ -76,8 +75,7 @@ def run(captures: Path, every: int = 1) -> str:
             "one capture finds: mm | ° | s",
             map(_cells, halves),
         ),
-        "",
-        *absent,
+        *(["", *absent] if absent else []),
         "",
         "## A check at a start",
         "",
@@ -103,7 +101,7 @@ def _claims(halves: list[Half], seconds: float) -> Iterator[str]:
         found = [one for one in own if one.found.moved]
         if found:
             named = sum(shift in one.found.moves[-1].causes for one in found)
-            off = [one.off_mm for one in found if one.found.cause == shift]
+            off = [one.off_mm for one in found if np.isfinite(one.off_mm)]
             stated = sum(one.found.detectable[0] > SHIFT_M for one in own if not one.found.moved)
             yield (
                 f"> With poses shifted as if the {shift} moved by {1e3 * SHIFT_M:.0f} mm, a move is found in "
@@ -119,7 +117,7 @@ def _cells(one: Half) -> list[object]:
     named = " or ".join(one.found.moves[-1].causes) if one.found.moves else "none"
     move = one.found.moves[-1].step if one.found.moves else None
     step = ("", "") if move is None else map(number, mm_deg(move))
-    off = number(one.off_mm) if one.found.moves and np.isfinite(one.off_mm) else ""
+    off = number(one.off_mm) if np.isfinite(one.off_mm) else ""
     mm, rad = one.found.detectable
     noticed = number(1e3 * mm), number(np.degrees(rad))
     return [
