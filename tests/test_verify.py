@@ -253,7 +253,9 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
     write_capture(tmp_path / "today", capture, poses, [10])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith("REJECTED: the camera or the scene or the robot's reported poses have changed")
+    assert printed[0].startswith(
+        "REJECTED: the camera or the scene or the robot's reported poses have changed"
+    )
     assert printed[1].startswith("Remedy ") and "calibrate again" in printed[1]
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet", "--json"]) == 3
     printed = capsys.readouterr()
