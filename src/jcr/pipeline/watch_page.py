@@ -98,7 +98,7 @@ def _chart(
         ],
         band=" ".join(f"{x:.1f},{at:.1f}" for x, at in corners),
         tolerance=y(tolerance) if tolerance < top else None,
-        top=f"{significant(top)} {unit}",
+        top=f"{significant(top)}{unit if unit == '°' else f' {unit}'}",
     )  # fmt: skip
 
 
