@@ -22,10 +22,11 @@ from jcr.estimation.problem import (
     BASE_TRANSLATION,
     SCALE,
     LinearPrior,
+    Problem,
     State,
     pose_problem,
 )
-from jcr.estimation.robot_noise import solve_equations
+from jcr.estimation.robot_noise import TOO_MANY, of_poses, solve_equations
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import ARM, Poses, inverse, rotation_angle, skew, transform
 
@@ -78,25 +79,38 @@ def robust_fit(
     if camera_covariance is not None:
         per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
         camera_covariance = per_unit[:, None] * camera_covariance * per_unit
-    every, state = pose_problem(
-        base_from_gripper,
-        recon_from_camera,
-        (np.eye(4), 1.0, np.eye(4)),
-        camera_covariance=camera_covariance,
-        error_covariance=systematic,
-        noise_floor=noise,
-        priors=priors,
-        carries=carries,
-    )
     moving = inverse(base_from_gripper) if carries == "scene" else base_from_gripper
     fits: dict[bytes, Solution] = {}
 
+    def problem_of(rows: Int[ndarray, " k"]) -> tuple[Problem, State]:
+        """Return the problem with k of the n images, and an initial state to complete."""
+        return pose_problem(
+            base_from_gripper[rows],
+            recon_from_camera[rows],
+            (np.eye(4), 1.0, np.eye(4)),
+            camera_covariance=None if camera_covariance is None else of_poses(camera_covariance, rows),
+            error_covariance=None if systematic is None else of_poses(systematic, rows),
+            noise_floor=noise,
+            priors=priors,
+            carries=carries,
+        )
+
+    every, state = problem_of(np.arange(n))
+
     def fitted(used: Images) -> Solution:
-        """Return the solution with the used images, without averaging over error sizes."""
+        """Return the solution with the used images, without averaging over error sizes.
+
+        With more than TOO_MANY images it starts from the solution with as many of them, evenly spaced, because a step
+        takes the cube of their number.
+        """
         if used.tobytes() not in fits:
             x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
-            start = replace(state, x=x[None], scale=scale, z=z[None])
-            fits[used.tobytes()] = solve(replace(every, used=used), start, averaged=False)
+            start = {"x": x[None], "scale": scale, "z": z[None]}
+            if (rows := np.flatnonzero(used)).size > TOO_MANY:
+                some, begin = problem_of(rows[np.linspace(0, len(rows) - 1, TOO_MANY).astype(int)])
+                near = solve(some, replace(begin, **start), averaged=False).most_likely
+                start = {name: getattr(near, name) for name in (*start, "robot_log_sizes")}
+            fits[used.tobytes()] = solve(replace(every, used=used), replace(state, **start), averaged=False)
         return fits[used.tobytes()]
 
     used = np.ones(n, dtype=bool)

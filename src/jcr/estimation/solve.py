@@ -52,6 +52,7 @@ from jcr.estimation.problem import (
 )
 from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import (
+    TOO_MANY,
     Equations,
     Information,
     LinearSolution,
@@ -436,11 +437,13 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
     iteration ends when the squared step in units of standard deviations is below `settled`, or still above 1 after
     DIVERGING steps.
     """
-    arms = problem.arm_unknowns
+    arms, size, sizes = problem.arm_unknowns, np.inf, state.robot_log_sizes
     for count in range(STEPS):
         poses = pose_equations(problem, state, images)
         equations = poses.equations
-        sizes, _ = most_likely(equations, state.robot_log_sizes, SIZES_SETTLED / 3)
+        # Sizes that are estimated from some of the poses alternate by 1e-5 and less until the steps are tiny.
+        if sizes is None or size > NEARLY_SETTLED or len(equations.residual) <= 6 * TOO_MANY:
+            sizes, _ = most_likely(equations, sizes, SIZES_SETTLED / 3)
         solution = solve_equations(equations, sizes)
         share = share_within_limits(solution.step[:arms])
         step = share * solution.step[:arms]

@@ -119,12 +119,14 @@ def reconstruct_colmap(
             # Wrong intrinsics spoil the matches' verification and the map; their focal length is nearly right mostly.
             start = [without_distortion(like), *starting_intrinsics(replace(capture, intrinsics=None))[0]]
             free = Matcher(matcher.features, working_cameras(start, False, working_size_px)[0], False, seed)
-            other = mapped(start, free)
-            if other[1] is not None and other[1].num_reg_images() > max(2 * registered, len(images) // 2):
-                (matched, model), matcher, like, known = other, free, start[0], False
+            others, other = mapped(start, free)
+            if other is not None and (count := other.num_reg_images()) > max(
+                2 * registered, len(images) // 2
+            ):
+                matched, model, matcher, like, known = others, other, free, start[0], False
                 warnings = (
                     f"the given intrinsics are not used: with them {registered} of {len(images)} images register, with "
-                    f"estimated ones {model.num_reg_images()}; calibrate the camera again, or leave them out",
+                    f"estimated ones {count}; calibrate the camera again, or leave them out",
                 )
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
