@@ -4,6 +4,8 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,15 +17,18 @@ from conftest import shrunk_capture
 from jcr.calibration.drift import Located, Reference, check_series, step_of
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
+from jcr.camera import project
 from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.errors import InputError
+from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.estimation.solve import solve
 from jcr.files import write_bytes
 from jcr.geometry import (
+    Similarity,
     apply,
     inverse,
     retract,
@@ -34,11 +39,13 @@ from jcr.geometry import (
     transform,
 )
 from jcr.pipeline import recalibrate as recalibrating
+from jcr.pipeline.old_scene import OldScene
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
 from jcr.pipeline.verify import TOLERANCE, of_two_poses
 from jcr.records import Capture, RobotNoise, Uncertainty
 from jcr.result import RunOptions, RunResult
+from jcr.sfm.register import Registration
 from scenes import hand_eye_of, reconstruction_of, reference_of
 from simulation.capture import with_robot_noise
 from simulation.poses import gripper_poses
@@ -486,3 +493,35 @@ def test_the_expected_errors_of_a_touch_are_those_of_its_click_depth_and_pose():
         error = (tip - surface).ravel()
         squared[k] = error @ np.linalg.solve(covariance, error)
     assert squared.mean() == pytest.approx(3 * count, rel=0.1)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.2])
+def test_a_place_that_few_points_are_left_of_has_changed(kept: float):
+    """A place with a fifth of its points, as unchanged ones seen from other poses may have, is not called changed."""
+    rng = np.random.default_rng(0)
+    middles = np.array([[-0.15, -0.05, 0.65], [0.05, -0.05, 0.65], [0.15, 0.05, 0.65]])
+    x = (middles[:, None] + rng.uniform(-0.04, 0.04, (3, 50, 3))).reshape(-1, 3)
+    left = np.r_[rng.random(50) < kept, np.ones(100, bool)]
+    scene: Any = SimpleNamespace(
+        tracks=SimpleNamespace(points_in_recon=x),
+        known=SimpleNamespace(camera=INTRINSICS, recon_from_camera=np.eye(4)[None]),
+        seen=np.ones((1, len(x)), bool),
+        similarity=Similarity(np.eye(4), 1.0),
+    )
+    pose = CameraPose(
+        a_from_camera=np.eye(4),
+        covariance=np.eye(6),
+        camera=INTRINSICS,
+        inlier=left[left],
+        std_px=0.3,
+        rms_px=0.3,
+    )
+    none, x_px = np.zeros(0, int), project(INTRINSICS, x[left])
+    placed = Registration(
+        pose=pose, points_in_recon=x[left], x_px=x_px, row=none, row_x_px=np.zeros((0, 2)), row_point=none
+    )
+    share, places = OldScene._left(scene, [placed])
+    assert share == pytest.approx(left.mean(), abs=0.05)
+    assert len(places) == (kept == 0)
+    if places:
+        np.testing.assert_allclose(places[0], middles[0], atol=0.02)
