@@ -14,7 +14,7 @@ def dies_on_bad(capture: Path, out: Path, options: RunOptions, read: ReadOptions
     """End this process as the system ends one that is short of memory."""
     if capture.name == "bad":
         os._exit(9)
-    return BatchRow(capture=str(capture), out=str(out), status="accepted", offset_std_mm=1.0)
+    return BatchRow(capture=str(capture), out=str(out), status="accepted", point_95_mm=1.0)
 
 
 def copies_a_run(capture: Path, out: Path, options: RunOptions, read: ReadOptions) -> BatchRow:

@@ -57,7 +57,7 @@ def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys)
     )
     assert rows["broken"].status == "failed" and "not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
-    assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
+    assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].point_95_mm is not None
     found = jcr.load_run(out / "b").calibration
     assert (rows["b"].x_m, rows["b"].fx) == (found.gripper_from_camera[0, 3], found.intrinsics.fx)
     with (out / "summary.csv").open() as file:

@@ -23,12 +23,25 @@ LONGEST_PATH = 1000
 
 
 @contextmanager
+def writable(path: Path) -> Iterator[None]:
+    """Make the folder of `path`; raise InputError if it or a file in it cannot be made, as below a file or in /proc."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+@contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to; on success this file replaces `path`, on an exception it is deleted."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Yield a temporary path to write to; on success this file replaces `path`, on an exception it is deleted.
+
+    Raises InputError as `writable` does.
+    """
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.part{path.suffix}"
-    # With mode 0o666 the umask decides on the permissions, as for any other file of the user.
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    with writable(path):
+        # With mode 0o666 the umask decides on the permissions, as for any other file of the user.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
         with open(temporary, "rb+") as stream:

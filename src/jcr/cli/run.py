@@ -151,10 +151,10 @@ class BatchCommand:
             rows = batch(captures, out, run_options(self), self.batch, progress, self.read)
         summary, lines = out / "summary.html", list[str]()
         for rank, row in enumerate(rows, start=1):
-            std, used = "", f"{row.used:3d}/{row.images:<3d}"
-            if row.offset_std_mm is not None:
-                std = f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
-            line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<35} {used} {std}  {row.reason}"
+            accuracy, used = "", f"{row.used:3d}/{row.images:<3d}"
+            if row.point_95_mm is not None and row.rotation_95_deg is not None:
+                accuracy = f"{significant(row.point_95_mm)} mm, {significant(row.rotation_95_deg)}° (95 %)"
+            line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<35} {used} {accuracy}  {row.reason}"
             lines.append(line.rstrip())
         self.output.result([*lines, f"table: {summary}"], {"captures": [asdict(row) for row in rows]})
         if doubtful := sum(not row.is_accepted for row in rows):

@@ -17,6 +17,7 @@ from jcr.camera import is_distorted, pinhole_inside, project, undistortion, unpr
 from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions
+from jcr.files import writable
 from jcr.geometry import Similarity, apply, inverse
 from jcr.records import COEFFICIENTS, Intrinsics, PointCloud, Pointmaps, Tracks
 from jcr.scene.cloud import write_cloud
@@ -211,8 +212,9 @@ def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `folder` at the end; raise InputError if `folder` is not empty."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; name a new folder, or remove it first")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+    with writable(folder):
+        begun = tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent)
+    with begun as temporary:
         made = Path(temporary) / "made"
         made.mkdir()
         yield made

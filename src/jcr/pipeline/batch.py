@@ -56,10 +56,10 @@ class BatchRow:
     """Number of images of the capture."""
     used: int = 0
     """Number of images that the calibration uses."""
-    offset_std_mm: float | None = None
-    """Standard deviation of the camera's translation along the worst axis; None without a calibration."""
-    turn_std_deg: float | None = None
-    """Standard deviation of the camera's rotation about the worst axis; None without a calibration."""
+    point_95_mm: float | None = None
+    """Bound of 95 % of the errors of a point at the distance of the scene; None without a calibration."""
+    rotation_95_deg: float | None = None
+    """Bound of 95 % of the errors of the rotation; None without a calibration."""
     scale_std_percent: float | None = None
     held_out_mm: float | None = None
     """Translation of the leave-one-out error."""
@@ -139,7 +139,7 @@ def batch(
     order = (*get_args(Verdict), "failed")
     for new in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
         rows.append(new)
-        rows.sort(key=lambda row: (order.index(row.status), row.offset_std_mm or np.inf, row.capture))
+        rows.sort(key=lambda row: (order.index(row.status), row.point_95_mm or np.inf, row.capture))
         _write_summary(out, rows, notes)
         report("captures", len(rows) / len(tasks))
     rows, sentences = _with_compared_cameras(rows)
@@ -165,6 +165,7 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
     except Exception as error:  # a bug is reported in the row, and does not stop the other captures
         return replace(row, reason=f"{type(error).__name__}: {error}")
     uncertainty, held_out = content.uncertainty, content.held_out
+    seen = None if uncertainty is None else uncertainty.seen
     named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
     return replace(
         row,
@@ -172,8 +173,8 @@ def run_one(capture: Path, out: Path, options: RunOptions, read: ReadOptions) ->
         backend=content.backend,
         images=len(content.images),
         used=content.images_used,
-        offset_std_mm=None if uncertainty is None else max(uncertainty.translation_std_mm),
-        turn_std_deg=None if uncertainty is None else max(uncertainty.rotation_std_deg),
+        point_95_mm=None if seen is None else seen.within_95_mm,
+        rotation_95_deg=None if seen is None else seen.rotation_95_deg,
         scale_std_percent=None if uncertainty is None else uncertainty.scale_std_percent,
         held_out_mm=None if held_out is None else held_out.translation_mm,
         held_out_deg=None if held_out is None else held_out.rotation_deg,

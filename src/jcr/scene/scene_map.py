@@ -94,15 +94,18 @@ class Sample:
 
     @cached_property
     def label(self) -> Any:
-        """Label (n,) as index into the map's `label_names`; 0 = none, and in unseen space."""
+        """Label (n,) as index into the map's `label_names`; 0 = none, in unseen space, and in free air.
+
+        Labels are known at surfaces, to two cells of the grid of seen space from a cell with a surface point.
+        """
         scene = self._map
 
         def label(x: Tensor) -> tuple[Tensor]:
-            """Return the label of each point (n,), 0 in unseen space."""
+            """Return the label of each point (n,), 0 far from surfaces."""
             if "label" not in scene.properties:
                 return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
             found = scene.fields(x, ("label",))["label"].argmax(1)
-            return (found if scene.is_published else torch.where(scene.seen.at(x) > 0, found, 0),)
+            return (found if scene.is_published else torch.where(scene.near_surfaces.at(x) > 0, found, 0),)
 
         return self._answers(label)[0]
 
@@ -323,6 +326,12 @@ class SceneMap:
             return torch.where(beyond > 0, outside, distance) - radius, *std
 
         return tuple(column.cpu().numpy() for column in in_chunks(clearance, x, radius))
+
+    @cached_property
+    def near_surfaces(self) -> SeenGrid:
+        """Grid of the cells up to two cells from a cell with a surface point."""
+        near = dilate((self.seen.state & HIT) != 0, 2)
+        return SeenGrid(self.seen.lower, self.seen.cell, near.to(torch.uint8))
 
     def distance_grid(self, unknown: str) -> DistanceGrid:
         """Return the grid of signed distances to the surfaces of occupancy 0.5, computed at the first call.
