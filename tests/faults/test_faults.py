@@ -124,11 +124,6 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
         "export done urdf /proc/a.urdf --parent-frame flange",
         "cannot be written",
     ),
-        "out",
-        nothing,
-        "export done urdf /proc/a.urdf --parent-frame flange",
-        "cannot be written",
-    ),
     "export below a file": (
         "out",
         lambda p: p.write_text("precious"),
