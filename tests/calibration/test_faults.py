@@ -57,14 +57,14 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     ),
     "slight slip": (
         Faults(slip=(3.6e-3, np.radians(0.8))),
-        r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
+        r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png",
         [3.6, 0.8],
         0.6,
     ),
     # Another TCP: the adjustment takes it for robot pose noise.
     "tool changed": (
         Faults(slip=(0.03, 0.0), robot_noise=(1e-4, 2e-4)),
-        r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
+        r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png",
         [30.0, 0.0],
         1.0,
     ),

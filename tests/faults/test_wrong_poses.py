@@ -127,3 +127,33 @@ def test_a_reconstruction_in_pieces_leads(faultless: tuple[Capture, Reconstructi
     found = calibrate_reconstruction(capture, replace(made, recon_from_camera=camera, tracks=nothing))
     assert found.findings[0].kind is FindingKind.PIECES, found.warnings
     assert set(found.findings[0].images) == {capture.images[k] for k in np.flatnonzero(astray)}
+
+
+TOOL = transform(rotation_exp(np.array([0.0, 0.0, 0.4])), np.array([0.0, 0.0, 0.15]))
+
+
+@pytest.mark.parametrize("at_start", [False, True])
+@pytest.mark.parametrize("kind", [FindingKind.SLIP, FindingKind.BASE_MOVED])
+def test_poses_that_are_moved_alike_to_one_end_are_one_finding(
+    faultless: tuple[Capture, Reconstruction], kind: FindingKind, at_start: bool
+):
+    """Another TCP moves the poses in gripper axes, another base frame in base axes."""
+    capture, made = faultless
+    poses, rows = capture.base_from_gripper.copy(), np.arange(3)
+    place = 3 if at_start else len(capture) - 3
+    rows += 0 if at_start else place
+    poses[rows] = poses[rows] @ TOOL if kind is FindingKind.SLIP else TOOL @ poses[rows]
+    found = calibrate_reconstruction(with_poses(capture, poses), made)
+    (step,) = [one for one in found.findings if one.severity == "rejects"]
+    assert step.kind is kind and step.images == capture.images[place - 1 : place + 1]
+    assert step.value == pytest.approx(0.15, rel=0.05)
+    assert step.details["rotation"] == pytest.approx(0.4, rel=0.05)
+
+
+def test_poses_that_are_moved_differently_are_no_step(faultless: tuple[Capture, Reconstruction]):
+    capture, made = faultless
+    poses, draw = capture.base_from_gripper.copy(), np.random.default_rng(4)
+    for row in range(len(capture) - 3, len(capture)):
+        poses[row] = poses[row] @ transform(np.eye(3), draw.normal(0, 0.1, 3))
+    found = calibrate_reconstruction(with_poses(capture, poses), made)
+    assert not {FindingKind.SLIP, FindingKind.BASE_MOVED} & {one.kind for one in found.findings}

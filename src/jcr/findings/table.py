@@ -191,8 +191,9 @@ class FindingKind(StrEnum):
         help="calibrate them again at this resolution, or give none (null) to have them estimated",
         means="the given intrinsics are not those of the images; parameters in `details`")
     SLIP = "camera moved on the gripper", KindRow("order",
-        "the camera seems to have moved on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° after {images[0]}",
-        ONE_PART + "the camera still sits as then", explains=MISFIT)
+        "the camera seems to have moved on the gripper, or the TCP to have changed, by {mm:.1f} mm and "
+        "{rotation_deg:.2f}° after {images[0]}",
+        ONE_PART + "the camera still sits as then and the TCP is the same", explains=MISFIT)
     DRIFT = "camera drifts on the gripper", KindRow("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° from the first image to "
         "the last", "tighten its mount, let it warm up, and take the images again", explains=MISFIT)

@@ -4,12 +4,13 @@ import numpy as np
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
+from jcr.calibration.checks.effects import LARGE_MOTION
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import ARM, inverse, step_between
+from jcr.geometry import ARM, Transform, inverse, motion_length, step_between
 from jcr.records import Capture, Reconstruction
 from jcr.sfm.register import register
 
@@ -19,10 +20,10 @@ which the other pose belongs to the image."""
 
 
 def check_pairing(case: Case) -> Case:
-    """Return the case with findings on unused images whose gripper poses are exchanged, if those of used images agree.
+    """Return the case with findings on unused images whose gripper poses are exchanged or all differ by one motion.
 
-    The robust fit rejects exchanged poses one by one, so a calibration from the other images may be accepted. Images
-    with a merely wrong pose give no finding here.
+    The robust fit rejects such poses one by one, so a calibration from the other images may be accepted. Images with a
+    merely wrong pose give no finding here, nor does a case whose used images do not agree.
     """
     kinds = {one.kind for one in case.calibration.findings}
     disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
@@ -30,18 +31,20 @@ def check_pairing(case: Case) -> Case:
         return case
     # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
     found = left_out_poses(case.capture, case.reconstruction, case.fit)
-    return case.found(*(one for one in found if one.kind is FindingKind.POSES_SWAPPED))
+    return case.found(*(one for one in found if one.kind is not FindingKind.POSE_CONTRADICTS_IMAGE))
 
 
 def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
-    """Return findings about unused images whose reported gripper poses are exchanged, or contradicted by the image.
+    """Return findings about unused images whose gripper poses are exchanged, all moved, or contradicted by the image.
 
     Unused images without a camera pose in `made` are registered by their features alone. Camera pose and hand-eye
     transform then give the true gripper pose. A reported pose is contradicted if it differs from the true one by more
-    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images. Images
-    that cannot be registered give no finding.
+    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images. All other
+    contradicted poses give one finding if they are moved alike (`_one_step`). Images that cannot be registered give no
+    finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
+    shows = dict[int, Transform]()
     used = set(made.image_index[hand_eye.inliers].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
     unseen = [row for row in range(len(capture)) if row not in camera]
@@ -61,6 +64,7 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
             right.add(row)
             continue
         metres[row], radians[row] = by[row].tolist()
+        shows[row] = pose
         distance = by @ (1.0, ARM)
         if distance.min() < NEARER * distance[row]:
             belongs_to[row] = int(distance.argmin())
@@ -70,8 +74,42 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
     if exchanged:
         names = [capture.images[row] for row in sorted(exchanged)]
         findings.append(Finding.of(FindingKind.POSES_SWAPPED, "rejects", "poses", *names))
-    for row in sorted(set(metres) - exchanged):
+    moved = {row: pose for row, pose in sorted(shows.items()) if row not in exchanged}
+    if capture.mount == "gripper" and (step := _one_step(capture, moved)) is not None:
+        return *findings, step
+    for row in moved:
         off = {"value": metres[row], "rotation": radians[row]}
         image = capture.images[row]
         findings.append(Finding.of(FindingKind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
     return tuple(findings)
+
+
+def _one_step(capture: Capture, shows: dict[int, Transform]) -> Finding | None:
+    """Return the finding that the images to one end of a capture are moved alike; None unless two or more all are.
+
+    `shows` has the gripper pose that each contradicted image shows (base_from_gripper), by row of the capture. A motion
+    that is constant in gripper axes is one of the camera or of the TCP, in base axes one of the base.
+    """
+    rows, n = list(shows), len(capture)
+    at_end = (
+        len(rows) >= 2 and rows == list(range(rows[0], rows[-1] + 1)) and (rows[0] == 0 or rows[-1] == n - 1)
+    )
+    if not at_end:
+        return None
+    place = rows[-1] + 1 if rows[0] == 0 else rows[0]
+    reported, shown = capture.base_from_gripper[rows], np.stack(list(shows.values()))
+    spreads = []
+    for kind, motions in (
+        (FindingKind.SLIP, inverse(reported) @ shown),
+        (FindingKind.BASE_MOVED, shown @ inverse(reported)),
+    ):
+        apart = float(motion_length(inverse(motions[0]) @ motions).max())
+        metres, radians = np.linalg.norm(step_between(np.eye(4), motions[0]).reshape(2, 3), axis=1).tolist()
+        spreads.append((apart / float(motion_length(motions[0])), kind, metres, radians))
+    spread, kind, metres, radians = min(spreads, key=lambda one: one[0])
+    if spread > NEARER:
+        return None
+    severity = "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns"
+    count, longer = max((place, "before"), (n - place, "after"))
+    details = {"value": metres, "rotation": radians, "longer": longer, "count": float(count)}
+    return Finding.of(kind, severity, "poses", *capture.images[place - 1 : place + 1], **details)
