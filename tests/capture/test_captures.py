@@ -1,5 +1,6 @@
 """Captures in every kind of file of poses, faults of single rows, and samples of marker-based tools."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -147,6 +148,15 @@ def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
         )
         with pytest.raises(jcr.InputError, match="effector_wrt_world: holds no poses"):
             read_source(tmp_path / "samples.yaml")
+
+
+@pytest.mark.parametrize("key", ["mount", "arm"])
+def test_a_camera_s_key_beside_the_frames_is_refused(key: str, tmp_path: Path):
+    """The camera would be taken for one on the gripper without a word."""
+    frames = [{"image": f"{k}.png", "base_from_gripper": np.eye(4).tolist()} for k in range(3)]
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, key: "base"}))
+    with pytest.raises(jcr.InputError, match=f'"{key}" belongs to a camera'):
+        jcr.read_capture(tmp_path)
 
 
 def test_intrinsics_of_another_size_and_rows_with_missing_numbers_are_named(tmp_path: Path, written: Path):

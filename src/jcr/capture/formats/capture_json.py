@@ -50,6 +50,12 @@ def read_capture_json(file: Path) -> CaptureFile:
     for row, frame in enumerate(content["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
             raise InputError(f'{file}: frame {row} has no "image"; give the image\'s path as text')
+    if misplaced := sorted(
+        (CameraEntry.model_fields.keys() - CaptureFile.model_fields.keys()) & content.keys()
+    ):
+        raise InputError(
+            f'{file}: "{misplaced[0]}" belongs to a camera; write "cameras": {{"NAME": {{"mount": "base"}}}}'
+        )
     return validated_content(CaptureFile, content, str(file))
 
 
