@@ -149,14 +149,17 @@ class RecordedArm:
             return None
         return recorded * self.unit
 
-    def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
+    def poses(self, recorded: Float[ndarray, "n j"], where: str) -> Float[ndarray, "n 4 4"]:
         """Compute base_from_gripper (m) from recorded angles, one column per joint in order of `joints`.
 
-        Raises InputError if the angles are so large that they are degrees, although the unit is radians.
+        Raises InputError, begun with `where`, if the angles are so large that they are degrees, although the unit is
+        radians.
         """
         angles = recorded * self.unit
         if (largest := float(np.abs(angles).max(initial=0.0))) > 2 * RADIANS_LIMIT:
-            raise InputError(f"angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg")
+            raise InputError(
+                f"{where}: joint angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg"
+            )
         return forward_kinematics(self.arm, angles)
 
     def interpolated(

@@ -68,7 +68,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
             def by_joints(at: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
                 recorded, gap = arm.interpolated(samples, at)
-                return arm.poses(recorded), gap
+                return arm.poses(recorded, str(path)), gap
 
             poses_at, joints = by_joints, arm.angles(arm.interpolated(samples, stamps)[0])
 

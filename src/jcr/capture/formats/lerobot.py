@@ -321,7 +321,7 @@ def _poses(
         if max(columns) >= state.shape[1]:
             raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
         recorded = state[:, columns]
-        return arm.poses(recorded), arm.angles(recorded)
+        return arm.poses(recorded, where), arm.angles(recorded)
     if key == CARTESIAN and not names:
         names = ["x", "y", "z", "roll", "pitch", "yaw"]
     names = [*names, *[None] * (state.shape[1] - len(names))] if names else [None] * state.shape[1]
