@@ -25,7 +25,7 @@ def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
     angles = np.random.default_rng(0).uniform(-3, 3, (5, 3))
     arm = arm_of(tmp_path, URDF)
     assert arm.joints == ("pan", "lift", "roll")
-    np.testing.assert_allclose(arm.poses(angles), arm_poses(angles), atol=1e-12)
+    np.testing.assert_allclose(arm.poses(angles, ""), arm_poses(angles), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, uni
     pan, still = np.array([0.49, -0.49]) * turn, np.zeros(2)
     samples = [(stamps, pan), (stamps, still), (stamps, still)]
     recorded, gap = arm.interpolated(samples, np.array([5_000_000]))
-    np.testing.assert_allclose(arm.poses(recorded), arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
+    np.testing.assert_allclose(arm.poses(recorded, ""), arm_poses(np.array([[np.pi, 0, 0]])), atol=1e-12)
     assert gap.tolist() == [10_000_000]
 
 
