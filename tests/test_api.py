@@ -136,3 +136,15 @@ def test_a_pixel_and_its_depth_give_a_point_in_the_base_from_lists_and_arrays(tm
     single, of_single = run.point_in_base(pixels[1], 0.7, gripper)
     assert single == pytest.approx(found[1]) and of_single == pytest.approx(covariance[1])
     assert np.linalg.eigvalsh(covariance).min() > 0
+    for pixel, depth_m, pose, fault in (
+        ([320, 240], -0.4, gripper, "no depth"),
+        ([320, 240], 500.0, gripper, "no depth"),  # millimetres
+        ([320, 240], np.nan, gripper, "no depth"),
+        ([-20, 240], 0.4, gripper, "outside of the image"),
+        ([320], 0.4, gripper, "x and y"),
+        ([[320, 240]] * 2, [0.4] * 3, gripper, "one depth for each"),
+        ([320, 240], 0.4, gripper[:3, :3], "4×4"),
+        ([320, 240], 0.4, 2 * gripper, "base_from_gripper: "),
+    ):
+        with pytest.raises(jcr.InputError, match=fault):
+            run.point_in_base(pixel, depth_m, pose)

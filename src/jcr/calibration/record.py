@@ -38,7 +38,7 @@ from jcr.findings import (
     warnings_of,
     without_consequences,
 )
-from jcr.geometry import Similarity
+from jcr.geometry import Similarity, require_rigid
 from jcr.records import (
     Attempt,
     Capture,
@@ -46,6 +46,7 @@ from jcr.records import (
     FrameNames,
     GivenIntrinsicsResult,
     ImageVerdict,
+    Intrinsics,
     IntrinsicsAndStd,
     JointOffsets,
     LeaveOneOut,
@@ -76,6 +77,9 @@ NAMES = {
     "base": ("base_from_camera", "gripper_from_object"),
 }
 """Names of the two transforms of a calibration, for a camera on the gripper and for one fixed in the base frame."""
+FARTHEST = 30.0
+"""Largest depth of a point, as a multiple of the calibration's working distance: a depth in mm is 1000 times too large,
+and 30 is about the geometric mean of 1 and 1000, so ± 50 % changes nothing."""
 
 
 def as_json(finding: Finding) -> dict[str, Any]:
@@ -348,13 +352,45 @@ class Calibration(Outcome):
         `pixel` (…,2) are pixels (x, y) of the distorted image, `depth_m` (…) the z coordinates in the camera frame.
         `base_from_gripper` (4,4) is the reported gripper pose of the image. The covariances include the errors of
         intrinsics, transform and reported gripper pose, but not those of `pixel` and `depth_m`. Raises InputError for a
-        fixed camera or without intrinsics.
+        fixed camera, without intrinsics, for a pixel outside of the image, and for a depth or pose that cannot be.
         """
         x = self.gripper_from_camera
         if self.intrinsics is None:
             raise InputError("the calibration has no intrinsics: it was made from camera poses alone")
         pixel, depth_m, pose = (np.asarray(one, float) for one in (pixel, depth_m, base_from_gripper))
+        if pose.shape != (4, 4):
+            raise InputError(f"base_from_gripper: shape {pose.shape}; give one 4×4 gripper pose")
+        if pixel.shape[-1:] != (2,) or depth_m.shape not in ((), pixel.shape[:-1]):
+            raise InputError(
+                f"pixel of shape {pixel.shape}, depth_m of {depth_m.shape}; give x and y, and one depth for each pixel"
+            )
+        self._require_visible(self.intrinsics, pixel, depth_m)
+        pose = require_rigid(pose, "base_from_gripper")
         return point_in_base(x, self.uncertainty, self.intrinsics, self.robot_noise, pixel, depth_m, pose)
+
+    def _require_visible(
+        self, camera: Intrinsics, pixel: Float[ndarray, "..."], depth_m: Float[ndarray, "..."]
+    ) -> None:
+        """Raise InputError for a pixel (x, y) outside of the image, and for a depth (m) that no wrist camera has."""
+        size = np.array([camera.width, camera.height])
+        outside = ~((pixel >= -0.5) & (pixel <= size - 0.5)).all(-1)
+        if outside.any():
+            first = pixel[outside][0].tolist()
+            raise InputError(
+                f"pixel {first}: outside of the image of {size[0]}x{size[1]}; give x, then y, from 0"
+            )
+        seen = self.uncertainty.seen
+        farthest = np.inf if seen is None else FARTHEST * 1e-3 * seen.distance_mm
+        wrong = ~((depth_m > 0) & (depth_m < farthest))
+        if wrong.any():
+            where = (
+                ""
+                if seen is None
+                else f"; the calibration's images are {seen.distance_mm / 1e3:.2g} m from the scene"
+            )
+            raise InputError(
+                f"depth_m {depth_m[wrong][0]:g}: no depth in metres{where}; convert it, or leave that pixel out"
+            )
 
 
 class _WithoutUncertainty(Outcome):
