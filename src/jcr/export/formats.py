@@ -17,6 +17,7 @@ from jcr.calibration.words import intrinsics_in_words
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
+from jcr.extras import extra
 from jcr.files import written_whole
 from jcr.geometry import scale_translation, transform
 from jcr.options import checked_options
@@ -129,6 +130,8 @@ def write_run(
         )
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    if row.name == "rerun":  # The map takes seconds to load.
+        extra("rerun", "rerun", "a .rrd file")
     values = [attrgetter(content)(run) for content in row.contents.split()]
     module, function = row.writer.split(".")
     write: Any = getattr(import_module(f"jcr.export.{module}"), function)

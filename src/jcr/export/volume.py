@@ -3,6 +3,7 @@
 OctoMap, voxel grid and spheres are computed by queries of `SceneMap`, so they agree with these.
 """
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,9 +170,9 @@ def write_rrd(
 ) -> None:
     """Write a recording for the Rerun viewer (.rrd): point cloud, surface, gripper poses and images with cameras.
 
-    Poses and points are in the base frame (m); `notes` are stored as text. Raises InputError without rerun-sdk.
+    Poses and points are in the base frame (m); `notes` are stored as text.
     """
-    rr: Any = extra("rerun", "rerun", "a .rrd file")
+    rr: Any = import_module("rerun")
     vertices, faces, colors = surface_mesh(scene)
     intrinsics = views.intrinsics
     recording = rr.RecordingStream("jcr")

@@ -160,7 +160,7 @@ class FindingKind(StrEnum):
         "the published method checks nothing: poses, intrinsics and motions may be wrong, and the result has no ±",
         "run the default method on the same capture, and compare (jcr compare)",
         means="the calibration is that of `--method paper`")
-    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", f"not as exact as needed: {REACHED}",
+    NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", REACHED,
         f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of it comes from systematic robot "
         "errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; move "
         "closer to the scene, or use a better camera or robot}",
