@@ -328,7 +328,7 @@ The `verdict` is that of the strongest:
 | severity | verdict | exit status |
 |---|---|---|
 | `rejects` | rejected | 3 |
-| `warns` | accepted with warnings | 0 |
+| `warns` | accepted; of the kind `requirement not met`: accepted, but not as exact as needed | 0; 3 |
 | `informs` | accepted | 0 |
 
 Among findings of one severity, causes come before their consequences. Fields of a finding:

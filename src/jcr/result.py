@@ -5,7 +5,7 @@ A file of the run folder may be invalid, because the user has edited it; reading
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -35,6 +35,7 @@ from jcr.files import read_bytes
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.npz import read_reconstruction
+from jcr.rounding import significant
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map
@@ -93,6 +94,8 @@ class RunState(BaseModel):
 class RunResult:
     """Result of a run in the folder `out`; it also has all attributes of its `calibration`.
 
+    `help(jcr.Calibration)` describes these: verdict, gripper_from_camera, covariance, intrinsics, images, findings, ….
+
     Parts that this process has not computed are read from the folder on first use; a damaged file raises InputError.
     """
 
@@ -114,6 +117,21 @@ class RunResult:
         if name.startswith("_"):
             raise AttributeError(name)
         return getattr(self.calibration, name)
+
+    def __dir__(self) -> list[str]:
+        """Return the names of the attributes, with those of the calibration."""
+        return sorted({*super().__dir__(), *dir(Calibration), *(field.name for field in fields(Calibration))})
+
+    def __repr__(self) -> str:
+        """Return the verdict, the number of used images, and the error that 95 % of the points stay below."""
+        try:
+            found = self.calibration
+        except InputError as error:
+            return f"<RunResult {error}>"
+        used = f"{sum(one.used for one in found.images)} of {len(found.images)} images"
+        seen = None if found.uncertainty is None else found.uncertainty.seen
+        point = "" if seen is None else f", a point within {significant(seen.within_95_mm)} mm (95 %)"
+        return f"<RunResult {self.out}: {found.verdict}, {used}{point}>"
 
     @cached_property
     def calibration(self) -> AnyCalibration:

@@ -60,6 +60,7 @@ def test_what_no_ray_crossed_and_what_is_outside_is_unknown(scene: "SceneMap"):
     hidden = np.stack([INSIDE_BOX, BALL_CENTER, UNDER_TABLE, [0.0, 0.0, -0.02], OUTSIDE])
     sample = scene.query(hidden)
     assert sample.unknown.all() and (sample.occupancy == 0.5).all() and (sample.label == 0).all()
+    assert repr(sample) == "<Sample of 5 points, 5 unseen>" and " % unseen; occupancy, color" in repr(scene)
     assert (scene.query(hidden, unknown="occupied").occupancy == 1).all()
     assert (scene.query(hidden, unknown="free").occupancy == 0).all()
     just_out = np.array([[0.0, 0.0, 0.601], [0.0, 0.0, 5.0], [-0.451, 0, 0.3], [1e30, 0, 0], [0, -3e9, 0]])

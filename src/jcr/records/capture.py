@@ -240,6 +240,11 @@ class Capture:
         """Return the number of images."""
         return len(self.images)
 
+    def __repr__(self) -> str:
+        """Return the folder, the number and size of the images, and whether intrinsics are given."""
+        size, given = "x".join(map(str, self.image_size)), "unknown" if self.intrinsics is None else "given"
+        return f"<Capture {self.source or self.folder}: {len(self)} images of {size}, intrinsics {given}>"
+
     def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
         """Return the capture with the images at the indices `rows` only, in their order, without further cameras."""
         chosen = np.asarray(rows, dtype=int).tolist()

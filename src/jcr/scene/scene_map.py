@@ -50,6 +50,10 @@ class Sample:
         """
         self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
 
+    def __repr__(self) -> str:
+        """Return the number of points, and of unseen ones."""
+        return f"<Sample of {len(self._x)} points, {int((self._map.seen.at(self._x) == 0).sum())} unseen>"
+
     @property
     def occupancy(self) -> Any:
         """Probability (n,) of solid space; in unseen space 1, 0 or 0.5 for unknown = "occupied", "free", "report".
@@ -191,6 +195,12 @@ class SceneMap:
                 field.expand()
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        """Return the corners of the workspace (m), its unseen share, and the properties of the map."""
+        lower, upper = (" ".join(f"{one:.2f}" for one in corner) for corner in self.box)
+        unseen = f"{100 * (self.seen.state == 0).double().mean().item():.0f} % unseen"
+        return f"<SceneMap from {lower} to {upper} m, {unseen}; {', '.join(self.properties)}>"
 
     @property
     def is_published(self) -> bool:
