@@ -12,6 +12,8 @@ import pytest
 
 import capture_writers as writers
 import jcr
+from jcr.calibration.stage import calibrate_pose_pairs
+from jcr.calibration.words import summary
 from jcr.capture.read import format_of, read_source
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
@@ -78,6 +80,7 @@ def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path,
     pairs = read_source(path)
     assert isinstance(pairs, PosePairs) and pairs.is_metric
     assert_same_calibration(pairs.base_from_gripper, pairs.recon_from_camera, problem)
+    assert "from the robot and the size of the board" in summary(calibrate_pose_pairs(pairs))
     with pytest.raises(jcr.InputError, match="no images; use `jcr calibrate`"):
         jcr.read_capture(path)
 

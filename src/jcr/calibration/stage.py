@@ -17,7 +17,7 @@ from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot
-from jcr.calibration.hand_eye import fit_poses, solve_hand_eye
+from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import advised
@@ -33,7 +33,7 @@ from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, rotation_angle
 from jcr.least_squares import one_blas_thread
-from jcr.records import Capture, PosePairs, Reconstruction
+from jcr.records import Capture, LengthCheck, PosePairs, Reconstruction
 
 CHECKS = (
     check_convention,
@@ -240,6 +240,12 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     # The known scale is a prior unless the scale estimated from the motions contradicts the metric poses.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve(scale=scale)
+        if options.scale is None and free.converged:
+            longer = 100 * (free.scale - 1)
+            size = LengthCheck(
+                name="board", robot_longer_percent=longer, std_percent=100 * SCALE_STD, used=True
+            )
+            hand_eye = replace(hand_eye, lengths=(size,))
         if not free.observability.observable and scale == 1.0:
             return hand_eye.with_findings(Finding.of(FindingKind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:

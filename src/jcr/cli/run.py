@@ -55,7 +55,6 @@ class CalibrateCommand:
 
     def main(self) -> int:
         """Calibrate and print the result; return the exit status of `show`."""
-        from jcr.calibration.stage import is_one
         from jcr.capture.read import read_source
         from jcr.pipeline.run import calibrate_poses
         from jcr.result import CAPTURE
@@ -67,8 +66,7 @@ class CalibrateCommand:
                 return show(_run(self, capture, run_options(self, map=None), progress), self.output)
             result = calibrate_poses(capture, self.out, self.calibrate, self.method)
         show_calibration(result, capture, self.output)
-        is_marker = self.method == "default" and result.converged and is_one(result.found)
-        return show(result, self.output, *labelled("Scale", *["1, as the marker's size says"] * is_marker))
+        return show(result, self.output)
 
 
 @dataclass(frozen=True, kw_only=True)
