@@ -50,13 +50,13 @@ class Apart(NamedTuple):
     """Places of points by two pairs of transform and intrinsics, at nine pixels and the working distance."""
 
     mm: float
-    """Median distance over the image."""
+    """rms distance over the image."""
     sigmas: float
     """rms distance over the image in standard deviations of both, per axis; 1 is expected."""
     stated_mm: float
-    """Distance that 95 % of both errors are stated to stay below, median over the image."""
+    """Distance that 95 % of both errors are stated to stay below, rms over the image."""
     other_mm: float
-    """Distance that 95 % of the other's errors are stated to stay below, median over the image."""
+    """Distance that 95 % of the other's errors are stated to stay below, rms over the image."""
 
 
 SIDE_CELL = 3
@@ -137,10 +137,10 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "",
         "## Captures",
         "",
-        "Point: median distance of the places that both pairs of transform and intrinsics give nine points over the "
-        "image, at the working distance; rms in σ of what both state, per axis. Reference: its own 95 %, median of the "
-        "nine points. It says nothing of a corner of the image in which no image has the board, so no rms of distances "
-        "is stated. The reference cannot confirm a calibration more exactly than its own 95 %.",
+        "Point: rms distance of the places that both pairs of transform and intrinsics give nine points over the "
+        "image, at the working distance; in σ of what both state, per axis. Reference: rms of its own 95 % bounds at these "
+        "points, within which it cannot confirm a calibration; it is large where the board was in no corner of the "
+        "images.",
         "",
         *table(
             "capture | from | images | verdict | point: mm | reference, 95 %: mm | σ | "
@@ -270,7 +270,8 @@ def _apart(found: Calibration, other: Calibration | Reference) -> Apart | None:
     covariance = stated(found) + of_other
     sigmas = float(np.sqrt(squared_distance(off, covariance).mean() / 3))
     bounds = ([within_95(one) for one in each] for each in (covariance, of_other))
-    mm, stated_mm, other_mm = (1e3 * float(np.median(one)) for one in (np.linalg.norm(off, axis=1), *bounds))
+    sizes = np.linalg.norm(off, axis=1), *bounds
+    mm, stated_mm, other_mm = (1e3 * float(np.sqrt(np.mean(np.square(one)))) for one in sizes)
     return Apart(mm, sigmas, stated_mm, other_mm)
 
 
