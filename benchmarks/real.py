@@ -138,9 +138,9 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "## Captures",
         "",
         "Point: rms distance of the places that both pairs of transform and intrinsics give nine points over the "
-        "image, at the working distance; in σ of what both state, per axis. Reference: rms of its own 95 % bounds at these "
-        "points, within which it cannot confirm a calibration; it is large where the board was in no corner of the "
-        "images.",
+        "image, at the working distance; in σ of what both state, per axis. Reference: rms of its own 95 % bounds at "
+        "these points, within which it cannot confirm a calibration; it is large where the board was in no corner of "
+        "the images.",
         "",
         *table(
             "capture | from | images | verdict | point: mm | reference, 95 %: mm | σ | "
