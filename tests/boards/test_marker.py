@@ -162,7 +162,6 @@ def test_a_real_board_alone_agrees_with_the_features_of_the_scene(name: str, spe
     difference = compare(by_board, by_features)
     assert by_board.converged and by_board.source == "images"
     assert difference.p_value is not None and difference.p_value > 0.01
-    assert np.linalg.norm(difference.translation_m) < 2e-3
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the real captures are not beside this checkout")

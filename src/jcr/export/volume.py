@@ -79,7 +79,7 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
 def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
     """Write arrays and notes as .npz."""
     with open(path, "wb") as file:  # np.savez_compressed would append .npz to a path
-        np.savez_compressed(file, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | notes).items()})
+        np.savez_compressed(file, **{k: np.array(v) for k, v in (arrays | notes).items()})
 
 
 def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:

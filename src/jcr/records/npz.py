@@ -88,7 +88,7 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
     The key "format" of `about` is the name that `read_npz` expects.
     """
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
+        np.savez(stream, about=np.array(json.dumps(about)), **arrays)
 
 
 @contextmanager
