@@ -78,8 +78,9 @@ def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: Expo
 
 def _write_npz(path: Path, notes: dict[str, str], **arrays: object) -> None:
     """Write arrays and notes as .npz."""
+    content: dict[str, Any] = {name: np.array(value) for name, value in (arrays | notes).items()}
     with open(path, "wb") as file:  # np.savez_compressed would append .npz to a path
-        np.savez_compressed(file, **{k: np.array(v) for k, v in (arrays | notes).items()})
+        np.savez_compressed(file, **content)
 
 
 def write_spheres(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:

@@ -87,8 +87,9 @@ def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
 
     The key "format" of `about` is the name that `read_npz` expects.
     """
+    content: dict[str, Any] = {"about": np.array(json.dumps(about)), **arrays}
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, about=np.array(json.dumps(about)), **arrays)
+        np.savez(stream, **content)
 
 
 @contextmanager
