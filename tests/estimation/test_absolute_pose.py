@@ -102,3 +102,14 @@ def test_a_focal_length_is_found_with_the_pose():
     std = np.sqrt(np.diag(found.covariance))
     assert abs(np.log(found.camera.fx / 600)) < 4 * std[6] and std[6] < 0.01
     assert np.abs(step_between(TRUE, found.a_from_camera) / std[:6]).max() < 4
+
+
+def test_corners_that_no_pose_fits_give_none():
+    """A detector returned these corners beside the board; the pose went to infinity, where its matrix is singular."""
+    x_px = np.array([
+        [1248.2, 350.3], [1241.2, 392.9], [1232.5, 432.6], [1224.1, 471.3], [1161.8, 333.2], [1158.6, 376.7],
+        [1151.0, 416.1], [1143.5, 454.7], [1112.6, 344.9], [1118.2, 369.3], [1110.6, 408.1], [1077.2, 484.6],
+    ])  # fmt: skip
+    corners = np.column_stack([*(0.05 * one.ravel() for one in np.indices((3, 4))[::-1]), np.zeros(12)])
+    camera = Intrinsics(1371.02278154, 1371.02278154, 960.5, 540.5, 1920, 1080)
+    assert absolute_pose(x_px, corners, camera, gate_px=10.0, planar=True) is None

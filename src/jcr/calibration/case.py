@@ -203,9 +203,10 @@ class Case:
         adjustment does not model these; it models the size of a board.
         """
         is_board = self.model.tracks.boards is not None and self.reconstruction.metric_std is not None
+        modelled = 1 if is_board else 0
         return (
             self.reconstruction.evidence is None
-            and len(self.priors) <= is_board
+            and len(self.priors) <= modelled
             and len(self.model.observations.image) >= MIN_OBSERVATIONS
             and len(self.used) >= MIN_IMAGES
         )

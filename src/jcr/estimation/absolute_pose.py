@@ -169,6 +169,8 @@ def _refined(
         pose, camera = minimise(whitened, (pose, camera), moved, loss).unknowns
         residual, jacobian = _reprojection(*seen, pose, camera, p)
         rows = (white @ jacobian).reshape(-1, p)
+        if np.linalg.matrix_rank(rows) < p:  # points that no pose fits can drive it to infinity
+            return None
         found = CameraPose(
             a_from_camera=pose,
             covariance=inefficiency * np.linalg.inv(rows.T @ rows),
