@@ -8,7 +8,7 @@ tests, and the final adjustment includes those that its model can represent.
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -396,10 +396,7 @@ def finding_of(test: Test, model: Examined) -> Finding | None:
         known = {"value": metres, "rotation": radians}
         if effect.place:
             images = model.names[effect.place - 1 : effect.place + 1]
-            if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1]:
-                severity = "rejects"
-            count, longer = max((effect.place, "before"), (len(model.names) - effect.place, "after"))
-            known |= {"longer": longer, "count": float(count)}
+            severity, known = of_step(metres, radians, effect.place, len(model.names))
     elif kind is FindingKind.DELAY:
         known = {"value": float(estimate[0]), "std": float(np.sqrt(test.covariance[0, 0]))}
     else:
@@ -410,6 +407,16 @@ def finding_of(test: Test, model: Examined) -> Finding | None:
     p = float(np.exp(max(test.log_p, -700)))
     known |= {"p": p, "shift": None if shift is None else tuple(shift.tolist())}
     return Finding.of(kind, severity, policy.concerns, *images, **known)
+
+
+def of_step(
+    metres: float, radians: float, place: int, images: int
+) -> tuple[Literal["warns", "rejects"], dict[str, Any]]:
+    """Return severity and details of the finding of a motion (m, rad) before the image `place` of so many `images`."""
+    count, longer = max((place, "before"), (images - place, "after"))
+    is_large = metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1]
+    details = {"value": metres, "rotation": radians, "longer": longer, "count": float(count)}
+    return "rejects" if is_large else "warns", details
 
 
 def _size_of_strain(test: Test) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.capture import SAME
-from jcr.calibration.checks.effects import LARGE_MOTION, POLICIES
+from jcr.calibration.checks.effects import POLICIES, of_step
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
@@ -109,9 +109,7 @@ def _one_step(capture: Capture, shows: dict[int, Transform]) -> Finding | None:
     spread, kind, metres, radians = min(spreads, key=lambda one: one[0])
     if spread > NEARER:
         return None
-    severity = "rejects" if metres > LARGE_MOTION[0] or radians > LARGE_MOTION[1] else "warns"
-    count, longer = max((place, "before"), (n - place, "after"))
-    details = {"value": metres, "rotation": radians, "longer": longer, "count": float(count)}
+    severity, details = of_step(metres, radians, place, n)
     return Finding.of(
         kind, severity, POLICIES[kind].concerns, *capture.images[place - 1 : place + 1], **details
     )
