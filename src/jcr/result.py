@@ -185,8 +185,6 @@ class RunResult:
     @cached_property
     def others(self) -> tuple[CellCamera, ...]:
         """Cameras of the cell besides the calibrated one: from the capture, then added to the run (`add_camera`)."""
-        if self.capture.mount == "base":
-            return ()
         return (*self.capture.others, *read_added_cameras(self.out, self.capture))
 
     @cached_property

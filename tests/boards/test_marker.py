@@ -9,20 +9,22 @@ import cv2
 import numpy as np
 import pytest
 
+import jcr
 import scenes
 from jcr.boards.detection import boards
 from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.difference import compare
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
+from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
 from jcr.files import write_bytes
 from jcr.findings import FindingKind
-from jcr.geometry import inverse, rotation_between_deg
+from jcr.geometry import inverse, rotation_between_deg, rotation_exp, step_between, transform
 from jcr.pipeline.selection import select_reconstruction
 from jcr.reconstruct import ReconstructOptions, reconstruct
-from jcr.records import Intrinsics
+from jcr.records import CellCamera, Intrinsics
 from jcr.result import RunOptions
 from places import SHARED
 from scenes import png_names
@@ -179,6 +181,40 @@ def test_a_board_that_the_gripper_carries_before_a_fixed_camera_comes_before_fea
     made, found = select_reconstruction(capture, options)
     assert made.backend == "marker" and found.converged and len(found.attempts) == 1
     assert np.linalg.norm(found.parent_from_camera - base_from_camera) < 0.01
+
+
+def test_cameras_that_watch_the_gripper_are_located_together_by_its_board(tmp_path: Path):
+    """The second camera has its images of two poses at which the first does not see the board."""
+    spec, step = (
+        "charuco:7x6:0.030:0.022:DICT_4X4_50",
+        transform(rotation_exp(np.array([0.05, 0.1, 0.2])), np.array([0.03, 0.02, 0.0])),
+    )
+    seen, base_from_camera = capture_of(tmp_path / "capture", charuco)
+    for grey, name in enumerate(seen.images[6:], start=90):
+        write_bytes(seen.folder / name, encode_png(np.full((480, 640, 3), grey, np.uint8)))
+    there = seen.base_from_gripper @ base_from_camera @ step
+    names = [f"second/{k}.png" for k in range(1, 8)]
+    for k, name in enumerate(names, start=1):
+        write_bytes(seen.folder / name, encode_png(photographed(charuco(), there[k], 20 + k)))
+    second = CellCamera(
+        name="second",
+        mount="base",
+        images=tuple(names),
+        image_size=(640, 480),
+        intrinsics=INTRINSICS,
+        frame=np.arange(1, 8),
+    )
+    own = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
+    capture_json.write(seen.folder, replace(own, others=(second,)))
+    result = jcr.calibrate(
+        read_capture(seen.folder), tmp_path / "out", RunOptions(reconstruct=ReconstructOptions(board=spec))
+    )
+    assert result.cameras is not None
+    (placed,) = result.cameras.cameras
+    assert placed.verdict == "accepted" and [one.used for one in placed.images] == [True] * 7
+    assert placed.parent_from_camera is not None and placed.covariance is not None
+    off = step_between(placed.parent_from_camera, base_from_camera @ step)
+    assert np.linalg.norm(off[:3]) < 0.004 and off @ np.linalg.solve(placed.covariance, off) < 22.5
 
 
 def test_a_chessboard_with_a_narrow_border_before_a_dark_background_is_found_where_it_is():

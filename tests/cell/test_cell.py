@@ -388,7 +388,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
         ),
         ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
         ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
-        ({"mount": "base", "images": ["3.png"], "watches": "gripper"}, "a capture of their own"),
+        ({"mount": "base", "images": ["3.png"], "watches": "gripper"}, "make a capture for each"),
         (
             {"mount": "base", "imagse": ["3.png"], "images": ["3.png"]},
             "overhead.imagse: Extra inputs are not permitted",

@@ -52,7 +52,7 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     report("board", 1.0)
     seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
     notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
-    intrinsics, intrinsics_notes = _intrinsics(capture, board, seen)
+    intrinsics, intrinsics_notes = intrinsics_by_board(capture.intrinsics, capture.image_size, board, seen)
     notes += intrinsics_notes
     if (fold_px := fold_distance_px(intrinsics)) is not None:
         centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
@@ -91,21 +91,22 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     )
 
 
-def _intrinsics(
-    capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
+def intrinsics_by_board(
+    given: Intrinsics | None, size: tuple[int, int], board: Board, seen: Sequence[Sequence[Sighting]]
 ) -> tuple[Intrinsics, list[str]]:
     """Return the given intrinsics, or those calibrated from the board's detections `seen` in each image; and notes.
 
-    Calibrated are the focal length, principal point and two radial coefficients. The notes are for the user. Raises
-    RejectedError if fewer than FEWEST_FOR_INTRINSICS images show the board and no intrinsics are given.
+    `size` is the width and height of the images (px). Calibrated are the focal length, principal point and two radial
+    coefficients. The notes are for the user. Raises RejectedError if fewer than FEWEST_FOR_INTRINSICS images show the
+    board and no intrinsics are given.
     """
-    if capture.intrinsics is not None:
-        return capture.intrinsics, []
+    if given is not None:
+        return given, []
     shown = [s for sightings in seen for s in sightings]
     images = sum(map(bool, seen))
     if images < FEWEST_FOR_INTRINSICS:
         raise RejectedError(
-            f"{images} of {len(capture)} images show {board.name}, {FEWEST_FOR_INTRINSICS} are needed to find the "
+            f"{images} of {len(seen)} images show {board.name}, {FEWEST_FOR_INTRINSICS} are needed to find the "
             "unknown intrinsics from it",
             "check the board's kind and size, or give the intrinsics",
         )
@@ -113,12 +114,12 @@ def _intrinsics(
     x_in_body = [np.asarray(s.x_in_body, np.float32) for s in shown]
     x_px = [np.asarray(s.x_px, np.float32) for s in shown]
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
-        x_in_body, x_px, capture.image_size, np.eye(3), np.zeros(5), flags=flags
+        x_in_body, x_px, size, np.eye(3), np.zeros(5), flags=flags
     )
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     k1, k2, *_ = distortion.ravel().tolist()
     note = f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
-    return Intrinsics(fx, fy, cx, cy, *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)), [note]
+    return Intrinsics(fx, fy, cx, cy, *size, (k1, k2, 0.0, 0.0, 0.0)), [note]
 
 
 def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:

@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
+from jcr.estimation.boards import shapes_of
 from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.problem import Observations, Problem, State
 from jcr.estimation.robot_noise import of_poses
@@ -39,10 +40,11 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
             n = len(one.x_px)
             image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
-            point += [count + np.arange(n), count + one.row_point]
+            point += [count + np.arange(n) if one.point is None else one.point, count + one.row_point]
             std_px.append(np.full(n + len(one.row), KEYPOINT_STD_PX))
-            points.append(one.points_in_recon)
-            count += n
+            if one.point is None:
+                points.append(one.points_in_recon)
+                count += n
             rig.append(at)
             camera.append(c)
     contradicted = (one.kind is FindingKind.INTRINSICS and one.shift is None for one in hand_eye.findings)
@@ -56,19 +58,23 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
         cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
         mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
     arms, starts, effects = rigs.arm_poses()
+    points_in_world, seen = np.concatenate(points), np.concatenate(point)
+    twice = np.bincount(seen, minlength=len(points_in_world)) >= 2
+    boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(rigs.poses))
     problem = Problem(
         arms=tuple(arms),
-        n_rigs=len(rigs.poses),
+        n_rigs=len(rigs.poses) + len(world_from_board),
         cameras=tuple(cameras),
         observations=Observations(
             rig=np.array(rig),
             camera=np.array(camera),
             image=np.concatenate(image),
             x_px=np.concatenate(x_px),
-            point=np.concatenate(point),
+            point=seen,
             std_px=np.concatenate(std_px),
         ),
         known_rigs=prior,
+        boards=boards,
         effects=effects,
         robot_noise_floor=case.options.robot_noise_m_rad,
     )
@@ -76,9 +82,9 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
         x=np.stack([x for x, _ in starts]),
         scale=1.0,
         z=np.stack([z for _, z in starts]),
-        world_from_rig=np.stack(rigs.poses),
+        world_from_rig=np.concatenate([rigs.poses, world_from_board]),
         rig_from_camera=np.stack(mounts),
-        points_in_world=np.concatenate(points),
+        points_in_world=points_in_world,
     )
     return problem, state
 

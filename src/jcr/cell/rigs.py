@@ -16,6 +16,7 @@ from jcr.calibration.case import Case
 from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
+from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import guessed_intrinsics, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
@@ -86,6 +87,11 @@ class CameraViews:
         return np.array(list(self.used), dtype=int)
 
     @property
+    def is_fixed(self) -> bool:
+        """Whether all images were taken from one place in the scene."""
+        return self.camera.mount == "base" and self.camera.frame is None
+
+    @property
     def names(self) -> list[str]:
         """Names of the used images."""
         return [self.camera.images[k] for k in self.used]
@@ -132,12 +138,16 @@ class Rigs:
     def __init__(self, case: Case, known: KnownImages | None = None) -> None:
         self.case, self.rows, found = case, case.reconstruction.image_index[case.used], case.reconstruction
         if known is None:
-            images = (read_image(case.capture.folder / case.capture.images[row]) for row in self.rows)
             places = scale_translation(found.recon_from_camera[case.used], case.numbers.scale)
+            # Before the gripper, images are localised by the board that it carries, without features.
+            rows = self.rows if case.carries == "camera" else ()
+            images = (read_image(case.capture.folder / case.capture.images[row]) for row in rows)
             own = tuple(features(image, found.intrinsics) for image in images)
             known = KnownImages(found.intrinsics, places, own)
         self.known = known
         self.poses = list(known.recon_from_camera)
+        # Rig of each row of the capture that has one; rows without an own image get theirs with the image of another.
+        self.rig_of = {int(row): k for k, row in enumerate(self.rows)}
         # Rigs, gripper poses and hand-eye fit of the camera of each further arm, by the name of the arm.
         self.arms: dict[str, tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], Calibration]] = {}
 
@@ -153,8 +163,8 @@ class Rigs:
             return seen.refused(Finding.of(kind, "rejects", "images", best, value=count))
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
-        if seen.camera.mount == "gripper":
-            return self._on_same_gripper(seen)
+        if seen.camera.frame is not None:
+            return self._on_same_rig(seen)
         place = seen.places[int(np.trace(seen.covariances, axis1=1, axis2=2).argmin())]
         apart = np.linalg.norm(step_between(self.known.recon_from_camera, place).reshape(-1, 2, 3), axis=-1)
         seen = replace(seen, rig=np.full(len(seen.used), len(self.poses)))
@@ -165,26 +175,33 @@ class Rigs:
         at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
         return replace(seen, findings=(*seen.findings, at_own))
 
-    def _on_same_gripper(self, seen: CameraViews) -> CameraViews | CameraPlacement:
-        """Return the views of another camera on the own gripper; each image gets the rig of the own image taken with it.
+    def _on_same_rig(self, seen: CameraViews) -> CameraViews | CameraPlacement:
+        """Return the views of a camera on the own camera's body; each image gets the rig of the own image taken with it.
+
+        The body is the gripper or, for cameras that watch the gripper, the ground.
 
         Return a rejected placement if the other camera is not rigidly connected, or its images do not suffice.
         """
         assert seen.camera.frame is not None
-        capture, rig_of = self.case.capture, {int(row): k for k, row in enumerate(self.rows)}
+        case, capture = self.case, self.case.capture
         frame = {k: int(seen.camera.frame[k]) for k in seen.used}
+        doubtful = set(case.reconstruction.image_index.tolist()) - set(self.rows.tolist())
         seen = seen.without(
             {
                 k: f"{capture.images[row]}, taken with it, is not used"
                 for k, row in frame.items()
-                if row not in rig_of
+                if row in doubtful
             }
         )
         if not seen.used:
             return seen.refused(Finding.of(FindingKind.NO_COMMON_POSE, "rejects", "images"))
-        rig = np.array([rig_of[frame[k]] for k in seen.used])
-        moved = ()
-        if len(seen.used) >= MIN_IMAGES:
+        for row in (frame[k] for k in seen.used if frame[k] not in self.rig_of):
+            # The own image of this row shows nothing; its camera's pose is the one that the robot's pose predicts.
+            (moving,) = case.of_arm(capture.base_from_gripper[[row]])
+            numbers, self.rig_of[row] = case.numbers, len(self.poses)
+            self.poses.append(inverse(numbers.body_from_recon.rigid) @ moving @ numbers.parent_from_camera)
+        rig, moved = np.array([self.rig_of[frame[k]] for k in seen.used]), ()
+        if len(seen.used) >= MIN_IMAGES and (rig < len(self.rows)).all():
             moved = fit_views(seen, self.known.recon_from_camera[rig], EXACT_SCALE)[1]
         if any(one.severity == "rejects" for one in moved):
             return seen.refused(*moved)
@@ -193,8 +210,10 @@ class Rigs:
                 first, before = seen.names.index(one.images[1]), one.details["longer"] == "before"
                 part = seen.rows[first:] if before else seen.rows[:first]
                 rig = rig[:first] if before else rig[first:]
-                seen = seen.without(dict.fromkeys(part.tolist(), "the camera moved on the gripper"))
-        wrist = self.known.recon_from_camera[rig]
+                seen = seen.without(
+                    dict.fromkeys(part.tolist(), f"the camera moved on the {seen.camera.mount}")
+                )
+        wrist = np.stack(self.poses)[rig]
         apart = np.linalg.norm(step_between(wrist[:, None], wrist).reshape(-1, 2, 3), axis=-1)
         if (apart <= SAME_PLACE).all():
             return seen.refused(Finding.of(FindingKind.ONE_GRIPPER_POSE, "rejects", "images", *seen.names))
@@ -207,7 +226,7 @@ class Rigs:
         if astray.mean() > 0.4:
             size = {"value": float(np.linalg.norm(step[:, :3], axis=1).max()), "camera": capture.camera_name}
             return seen.refused(Finding.of(FindingKind.NOT_RIGID, "rejects", "mount", **size))
-        why = "its place on the gripper is not that of its other images"
+        why = f"its place on the {seen.camera.mount} is not that of its other images"
         kept = seen.without(dict.fromkeys(seen.rows[astray].tolist(), why))
         return replace(kept, rig=rig[~astray], rig_from_camera=on_rig[middle], arm=0, findings=moved)
 
@@ -243,11 +262,15 @@ class Rigs:
         The third result is the effects that the calibration of the own camera found on its arm.
         """
         case = self.case
-        poses = case.capture.base_from_gripper[self.rows]
-        arms = [wrist_arm(poses, case.systematic)]
+        rows = np.array(list(self.rig_of))
+        poses, systematic = case.capture.base_from_gripper[rows], case.systematic
+        if len(rows) > len(self.rows):
+            systematic = robot_errors(case.capture, case.options).of(rows).systematic
+        own = replace(wrist_arm(poses, systematic), carries=case.carries)
+        arms = [replace(own, rigs=np.array(list(self.rig_of.values())))]
         arms += [replace(wrist_arm(gripper), rigs=rigs) for rigs, gripper, _ in self.arms.values()]
         found = [case.numbers, *(one for _, _, one in self.arms.values())]
-        starts = [(one.gripper_from_camera, one.base_from_recon.rigid) for one in found]
+        starts = [(one.parent_from_camera, one.body_from_recon.rigid) for one in found]
         kinds = {one.kind for one in case.numbers.findings if one.kind.row.group == "strain"}
         others = 6 * sum(len(rigs) for rigs, _, _ in self.arms.values())
         effects = (

@@ -20,6 +20,7 @@ from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.verdict import MAX_STD
 from jcr.capture.images import read_image
+from jcr.cell.board_images import located_by_board
 from jcr.cell.images import cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
@@ -76,20 +77,34 @@ def place_cameras(
     )
     rigs = Rigs(case)
     found = {camera.name: list[tuple[Registration | None, int]]() for camera in others}
-    todo = [(camera, image) for camera in others for image in camera.images]
+    todo = [(camera, image) for camera in others for image in camera.images if case.carries == "camera"]
     for camera, image in steps(progress or silent, "other cameras", todo):
         pixels = read_image((camera.folder or capture.folder) / image)
         found[camera.name].append(localise(rigs.known, pixels, camera))
+    shown_by_board = case.carries == "scene"
+    shown, points = case.model.tracks.boards, hand_eye.scale * case.model.tracks.points_in_recon.astype(float)
+    for camera in steps(progress or silent, "other cameras", others if shown_by_board else ()):
+        at = replace(camera, folder=camera.folder or capture.folder)
+        found[camera.name] = [] if shown is None else located_by_board(shown, points, at)
     cameras, mounted = dict[str, CameraPlacement](), list[CameraViews]()
     for camera in others:
+        if not found[camera.name]:
+            no_board = Finding.of(FindingKind.BOARD_NEEDED, "rejects", "images")
+            cameras[camera.name] = CameraPlacement.of(camera, (no_board,))
+            continue
         shared = list(enumerate(found[camera.name]))
+        why = (
+            "shows {} corners of the board, too few"
+            if shown_by_board
+            else "shares {} points with the mapped scene"
+        )
         views = CameraViews(
             camera=camera,
             points=[count for _, (_, count) in shared],
             used={k: one for k, (one, _) in shared if one is not None},
-            reasons={k: f"shares {n} points with the mapped scene" for k, (one, n) in shared if one is None},
+            reasons={k: why.format(n) for k, (one, n) in shared if one is None},
         )
-        moved = _moved(rigs, views) if camera.mount == "base" and len(views.used) > 1 else ()
+        moved = _moved(rigs, views) if views.is_fixed and len(views.used) > 1 else ()
         refused = any(one.severity == "rejects" for one in moved)
         views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
         if isinstance(views, CameraPlacement):

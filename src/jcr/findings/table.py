@@ -274,6 +274,9 @@ class FindingKind(StrEnum):
     FEW_POINTS_SHARED = "few points shared with the scene", KindRow("cell",
         "{images[0]} shares {value:.0f} points with the mapped scene, too few",
         "it must see the same scene, unchanged, from a direction not too different")
+    BOARD_NEEDED = "no board before several cameras", KindRow("cell",
+        "cameras that watch the gripper are located together by a board that it carries, and none was found",
+        "put a board into the gripper and name it (--board)")
     FEW_LOCALISED = "few images localised", KindRow("cell",
         "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
         "add images of the mapped scene")

@@ -195,6 +195,11 @@ def add_camera(
     if not files:
         raise InputError(f"{name}: no images; give one or more that the camera took")
     before, report = RunResult(out), progress or silent
+    if before.capture.mount == "base":
+        raise InputError(
+            f"{out}: its camera watches the gripper; list the others beside it under cameras in capture.json, with an "
+            "image for each frame, and calibrate again"
+        )
     options = replace(before.state.options, map=None)
     if (doubt := before.calibration.doubt) is not None:
         raise RejectedError(

@@ -115,7 +115,8 @@ class CellCamera:
     folder: Path | None = None
     """Folder of the images; None: the folder of the capture."""
     frame: Int[ndarray, " k"] | None = None
-    """Row of the capture, for each image, with the gripper pose of that image; None unless on the capture's gripper."""
+    """Row of the capture, for each image, with the gripper pose of that image, for a camera on the gripper or one that
+    watches it; None for others."""
     arm: str | None = None
     """Name of another arm that carries the camera; None: the arm of the capture, or a fixed camera."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None

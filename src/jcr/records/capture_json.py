@@ -155,7 +155,8 @@ class CameraEntry(Entry, extra="forbid"):
 
     mount: Mount
     watches: Literal["scene", "gripper"] | None = None
-    """Subject of the images; unset: the gripper for a fixed camera without images, else the scene."""
+    """Subject of the images; unset: the gripper for a fixed camera without images and for those beside it, else the
+    scene."""
     arm: Name | None = None
     """Name of another arm that carries the camera."""
     frames: list[FrameEntry] | None = None
@@ -179,10 +180,8 @@ class CameraEntry(Entry, extra="forbid"):
                 "the frames have gripper poses, so a fixed camera's images in them must show what the gripper "
                 "carries; list images of the scene as its images"
             )
-        if not own and shows_gripper:
-            raise ValueError(
-                "watches the gripper; give its images a capture of their own, whose camera has mount base"
-            )
+        if not own and shows_gripper and not is_fixed:
+            raise ValueError("watches the gripper, so that it stands still; write mount base")
         if (self.arm is None) is not (self.frames is None) or (self.arm is not None and is_fixed):
             raise ValueError(
                 "a camera on another arm has mount gripper, that arm's name as arm, and frames of its own"

@@ -55,6 +55,8 @@ class Registration:
     """Known image (row) of each further observation of these points."""
     row_x_px: Float[ndarray, "k 2"]
     row_point: Int[ndarray, " k"]
+    point: Int[ndarray, " p"] | None = None
+    """Row of each point among the points of the reconstruction, for corners of a board; None: the points are new."""
 
 
 def register(

@@ -152,12 +152,21 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
 
     `used` is True for each frame of the file that `capture` contains. Messages begin with `where`.
     """
-    poses, frame = None, None
+    poses, frame, watches = None, None, capture.mount == "base"
+    if watches is not (entry.watches == "gripper" or (watches and entry.watches is None)):
+        raise InputError(
+            f"{where}: the frames' own camera watches the {'gripper' if watches else 'scene'}, and this one something "
+            "else; make a capture for each"
+        )
+    if watches and entry.mount == "gripper":
+        raise InputError(
+            f"{where}: is on the gripper, which the frames' camera watches; make a capture for each"
+        )
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:
         listed = [one.image for one in entry.frames]
         poses = np.array([one.base_from_gripper for one in entry.frames])
-    elif entry.mount == "gripper":
+    elif entry.mount == "gripper" or watches:
         if len(listed) != len(used):
             raise InputError(f"{where}: {len(listed)} images for {len(used)} frames; give one each, or null")
         listed = [image for image, is_used in zip(listed, used, strict=True) if is_used]
