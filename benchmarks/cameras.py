@@ -1,11 +1,12 @@
 """Fixed cameras, second wrist cameras, second arms and eye-to-hand: simulated cells, and real images of a capture."""
 
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +34,8 @@ from jcr.estimation.solve import Solution, solve
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import CellCamera
+from jcr.records.json_file import read_json
+from jcr.result import RunOptions
 from simulation.arms import PresetName
 from simulation.cell_faults import CellKind, further_camera
 from simulation.cells import CellProblem, Kind, cell_problem
@@ -116,6 +119,10 @@ def answered(problem: CellProblem, seed: int) -> Solution:
     return solve(*with_observations(cell, state))
 
 
+FIXED = "fixed"
+"""Folder, below that of the captures, of those of cameras beside the robot."""
+
+
 def run(captures: Path, every: int = 1) -> str:
     """Return the page in Markdown, of one draw, rendered cell and capture in `every`."""
     faults = [cells for seed in CELL_SEEDS[::every] for cells in _with_faults(seed)]
@@ -129,6 +136,7 @@ def run(captures: Path, every: int = 1) -> str:
             beyond = f"{100 * np.mean([draw.sigmas > 3 for draw in draws]):.0f} %"
             squared = f"{np.mean([draw.squared for draw in draws]) / 6:.2f}"
             rows.append([kind, preset, name, *sizes, f"{100 * _inside(draws):.0f} %", beyond, squared])
+    watching = [row for folder in sorted((captures / FIXED).glob("*")) for row in _watching(folder)]
     placed = np.array([off for _, off in real if off is not None])
     lines = [
         f"> Simulated cells of {COUNT} poses an arm: {100 * _inside(drawn):.0f} % of {len(drawn)} results lie within "
@@ -157,6 +165,11 @@ def run(captures: Path, every: int = 1) -> str:
         "compared before and after, whichever is farther.",
         "",
         *table("mount | fault | verdict | findings | off: mm | ° | σ", faults),
+        "",
+        "Cameras that watch the gripper, each alone, with the board that it carries and without it (by features of what "
+        "moves), and all together; `off` is from the pose that the repository states, σ the largest on an axis.",
+        "",
+        *table("capture | camera | how | images | verdict | off: mm | ° | ±σ: mm | ° | σ | s", watching),
     ]
     return "\n".join(lines) + "\n"
 
@@ -216,6 +229,52 @@ def _withheld(folder: Path) -> Iterator[tuple[list[str], tuple[float, float] | N
             off = mm_deg(step_between(camera.parent_from_camera, there))
             numbers = [f"{value:.2f}" for value in (*off, *largest_std(camera.covariance))]
         yield [folder.name, capture.images[row], str(camera.images[0].points), *numbers], off
+
+
+def _watching(folder: Path) -> Iterator[list[object]]:
+    """Calibrate cameras that watch the gripper, each alone and all together, and yield a row for each."""
+    cell, source = read_capture(folder), read_json(folder / "capture.json")["source"]
+    board = ReconstructOptions(board=source["board"])
+    captures = {cell.camera_name: replace(cell, others=())}
+    for camera in cell.others:
+        assert camera.frame is not None
+        poses = cell.base_from_gripper[camera.frame]
+        captures[camera.name] = replace(
+            captures[cell.camera_name], images=camera.images, base_from_gripper=poses, camera_name=camera.name
+        )
+
+    def row(
+        name: str, how: str, images: str, verdict: str, found: Any, covariance: Any, begun: float
+    ) -> list[object]:
+        """Return the row of one placed camera; `found` is its base_from_camera, None if it has none."""
+        off, seconds = ["–"] * 5, f"{time.perf_counter() - begun:.0f}"
+        if found is not None:
+            step, sigmas = farthest(found, covariance, [np.array(source["truth"][name])])
+            off = [f"{value:.2f}" for value in (*mm_deg(step), *largest_std(covariance), sigmas)]
+        return [folder.name, name, how, images, verdict, *off, seconds]
+
+    with tempfile.TemporaryDirectory() as out:
+        for (name, capture), (how, options) in product(
+            captures.items(), {"board": board, "features": ReconstructOptions()}.items()
+        ):
+            begun = time.perf_counter()
+            try:
+                result = jcr.calibrate(capture, Path(out) / name / how, RunOptions(reconstruct=options))
+            except RejectedError as error:
+                yield row(name, how, f"0 of {len(capture)}", error.what, None, None, begun)
+                continue
+            made = result.found
+            used = f"{sum(one.used for one in made.images)} of {len(capture)}"
+            yield row(name, how, used, made.verdict, made.base_from_camera, made.covariance[:6, :6], begun)
+        begun = time.perf_counter()
+        result = jcr.calibrate(cell, Path(out) / "together", RunOptions(reconstruct=board))
+        made = result.found
+        used = f"{sum(one.used for one in made.images)} of {len(cell)}"
+        together = made.base_from_camera, made.covariance[:6, :6]
+        yield row(cell.camera_name, "together", used, made.verdict, *together, begun)
+        for one in [] if result.cameras is None else result.cameras.cameras:
+            used = f"{sum(image.used for image in one.images)} of {len(one.images)}"
+            yield row(one.name, "together", used, one.verdict, one.parent_from_camera, one.covariance, begun)
 
 
 def _with_faults(seed: int) -> Iterator[list[object]]:

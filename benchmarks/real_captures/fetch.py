@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 import tyro
@@ -28,13 +28,22 @@ from jcr.errors import InputError
 from jcr.estimation.arms import RobotName, arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.files import write_bytes
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, CellCamera, Intrinsics, Mount
 
 RECIPES = Path(__file__).with_name("recipes.toml")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 """Number in a text, of any notation that the repositories use."""
 WIDTHS = {"matrix": 16, "quat:xyzw": 7}
 """Numbers of a pose, by its convention, where these are not six."""
+
+
+class Other(TypedDict):
+    """Further camera of a cell with the same intrinsics: paths of its images and of its truth, and the rows it has."""
+
+    images: str
+    truth: str
+    rows: list[int]
+    """Numbers of its images among those of the pattern; they are numbers of the frames' images, too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +73,17 @@ class Recipe:
     """Rows, or a slice of them, that belong together."""
     intrinsics: list[float] = field(default_factory=list)
     """fx, fy, cx, cy and distortion that are stored in the repository; none where empty."""
+    intrinsics_std: list[float] = field(default_factory=list)
+    """Standard deviations of the intrinsics; none stated where empty."""
     board: str = ""
     """Board in the images, as in `--board`."""
+    mount: Mount = "gripper"
+    camera: str = "wrist"
+    """Name of the frames' camera."""
+    truth: str = ""
+    """Path of a file with base_from_camera, of a repository that knows it."""
+    others: dict[str, Other] = field(default_factory=dict)
+    """Further cameras that watch the gripper, by name."""
     sha256: str = ""
     """Hash of images and poses."""
 
@@ -129,7 +147,13 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
         raise InputError(
             f"{recipe.repository}: {len(images)} images and {len(poses)} poses; correct the recipe"
         )
-    found = digest([files[name] for name in images], poses)
+    chosen = _chosen(list(range(len(_matching(files, recipe.images)))), recipe.use_images)
+    of_others = {
+        name: {chosen.index(row): _matching(files, other["images"])[row] for row in other["rows"]}
+        for name, other in recipe.others.items()
+    }
+    more = [files[image] for rows in of_others.values() for image in rows.values()]
+    found = digest([*(files[name] for name in images), *more], poses)
     if recipe.sha256 not in ("", found):
         raise InputError(f"{recipe.repository}: content is not that of the recipe (sha256 {found})")
     # Images that have the same name in folders of their own are named by their folders.
@@ -143,15 +167,35 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
     if recipe.intrinsics:
         fx, fy, cx, cy, *distortion = recipe.intrinsics
         intrinsics = Intrinsics(fx, fy, cx, cy, *size, tuple(distortion or [0.0] * 5))
+    known: dict[str, Any] = {"image_size": size, "intrinsics": intrinsics}
+    if recipe.intrinsics_std:
+        known["intrinsics_std"] = np.array(recipe.intrinsics_std)
+    others = []
+    for name, rows in of_others.items():
+        listed = {row: f"{name}/{Path(image).name}" for row, image in rows.items()}
+        for row, image in rows.items():
+            write_bytes(out / listed[row], files[image])
+        frame = np.array([*listed])
+        others.append(CellCamera(name=name, mount="base", images=(*listed.values(),), frame=frame, **known))
     capture = Capture(
         folder=out,
         images=tuple(f"images/{name}" for name in names),
         base_from_gripper=poses,
-        image_size=size,
-        intrinsics=intrinsics,
+        mount=recipe.mount,
+        camera_name=recipe.camera,
+        others=tuple(others),
+        **known,
     )
-    source = {"repository": recipe.repository, "commit": recipe.commit, "licence": recipe.licence}
-    capture_json.write(out, capture, source=source | {"board": recipe.board})
+    source: dict[str, Any] = {
+        name: getattr(recipe, name) for name in ("repository", "commit", "licence", "board")
+    }
+    truths = {capture.camera_name: recipe.truth} | {name: one["truth"] for name, one in recipe.others.items()}
+    source["truth"] = {
+        name: np.loadtxt(io.BytesIO(files[path])).reshape(4, 4).tolist()
+        for name, path in truths.items()
+        if path
+    }
+    capture_json.write(out, capture, source=source)
     return out
 
 
@@ -164,7 +208,9 @@ def digest(images: Sequence[bytes], poses: Float[ndarray, "n 4 4"]) -> str:
 def _files(recipe: Recipe, repository: str) -> dict[str, bytes]:
     """Return the content of the files of a recipe by their paths."""
     names = _git(repository, "ls-tree", "-r", "-z", "--name-only", recipe.commit).decode().split("\0")
-    wanted = [*_matching(names, recipe.images), *_matching(names, recipe.poses)]
+    paths = [recipe.images, recipe.poses, *([recipe.truth] if recipe.truth else [])]
+    paths += [path for other in recipe.others.values() for path in (other["images"], other["truth"])]
+    wanted = [name for path in paths for name in _matching(names, path)]
     if not wanted:
         raise InputError(f"{recipe.repository}: no file {recipe.images} at {recipe.commit[:10]}")
     archive = io.BytesIO(_git(repository, "archive", recipe.commit, "--", *wanted))

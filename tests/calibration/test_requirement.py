@@ -7,11 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration, validated
+from jcr.calibration.requirement import advised
 from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.calibration.words import summary
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run import show, show_calibration
-from jcr.findings import sentence
+from jcr.findings import Finding, FindingKind, sentence
 from jcr.records import PosePairs
 from jcr.report.html import report_html
 from jcr.result import RunResult
@@ -72,6 +73,22 @@ def test_the_images_that_are_missing_are_counted():
     few = calibrate_pose_pairs(pairs(12, 3)[0], out_of_reach)
     assert few.requirement is not None and few.requirement.more_images == 5, "no forecast from three images"
     assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
+
+
+@pytest.mark.parametrize(("share", "severity"), [(0.2, "informs"), (0.5, "warns")])
+def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, severity: str):
+    given, _ = pairs(12, 12)
+    found = calibrate_pose_pairs(given)
+    assert found.requirement is not None
+    size = {
+        "value": 1e-3 * share * found.requirement.reached_mm,
+        "rotation": 0.0,
+        "count": 6.0,
+        "longer": "after",
+    }
+    moved = found.with_findings(Finding.of(FindingKind.SLIP, "warns", "mount", *given.images[5:7], **size))
+    again = advised(moved, given.base_from_gripper, CalibrateOptions())
+    assert [one.severity for one in again.findings] == [severity]
 
 
 @pytest.mark.slow
