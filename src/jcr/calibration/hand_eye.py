@@ -18,11 +18,11 @@ from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
-from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
+from jcr.estimation.problem import SCALE, LinearPrior, Start, offset_prior, scale_prior
 from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
-from jcr.geometry import Poses, Transform, inverse, require_rigid, step_between
+from jcr.geometry import Poses, Transform, inverse, require_rigid, step_between, transform
 from jcr.least_squares import one_blas_thread
 from jcr.records import ImageVerdict, LeaveOneOut, Mount, PaperResiduals, Uncertainty
 
@@ -133,11 +133,10 @@ def fit_poses(
     lower bound on the robot noise, priors of X and scale. With `carries` "scene" the camera is fixed and the gripper
     carries what it sees.
     """
-    fit, distinct = _fitted(
+    fit, (x, scale, z), distinct = _fitted(
         gripper, camera, noise, priors, camera_covariance, systematic, carries, camera_errors
     )
     assert fit.problem.used is not None
-    x, scale, z = fit.state.x[0], fit.state.scale, fit.state.z[0]
     used, of_arm = fit.problem.used[distinct], inverse if carries == "scene" else np.asarray
     predicted = of_arm(predicted_gripper_poses(x, scale, z, camera))
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
@@ -157,7 +156,7 @@ def fit_poses(
         residuals=PaperResiduals(*paper_residuals(moving, camera, x, scale, used)),
         robot_noise=fit.noise,
         held_out=leave_one_out(left_out, "each image predicted by the others"),
-        findings=observability(moving[used], x, camera[used], fit.problem.priors).findings,
+        findings=observability(moving[used], x, camera[used], priors).findings,
     )
 
 
@@ -177,8 +176,8 @@ def _fitted(
     systematic: Float[ndarray, "r r"],
     carries: Literal["camera", "scene"],
     camera_errors: Literal["none", "independent", "in sequence"],
-) -> tuple[Solution, Int[ndarray, " n"]]:
-    """Return the robust fit to the poses without duplicates, and for each pose its index in that fit.
+) -> tuple[Solution, Start, Int[ndarray, " n"]]:
+    """Return the robust fit to the poses without duplicates, X, scale and Z, and for each pose its index in that fit.
 
     `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `camera_covariance`
     (6n,6n; None: exact) is that of the camera poses, `systematic` that of the systematic robot errors. Errors of the
@@ -193,26 +192,42 @@ def _fitted(
     moving = inverse(gripper) if carries == "scene" else gripper
     agreeing = least_trimmed(moving[order], camera[order])[0] if len(order) >= FEW else None
 
-    def fitted(covariance: Float[ndarray, "r r"] | None) -> Solution:
-        """Return the robust fit to the distinct poses, with the given covariance (6n,6n) of the camera poses."""
-        errors, of_robot = (
-            None if covariance is None else of_poses(covariance, order),
-            of_poses(systematic, order),
-        )
-        return robust_fit(gripper[order], camera[order], noise, priors, errors, of_robot, agreeing, carries)
+    # A frame at the centre of the cameras with their extent as unit keeps the digits.
+    centres, of_robot = camera[:, :3, 3], of_poses(systematic, order)
+    middle = centres[order].mean(0)
+    unit = float(np.sqrt(((centres[order] - middle) ** 2).sum(1).mean()))
+    unit = unit if unit > 1e-12 * np.abs(centres).max() else 1.0
+    central = transform(camera[order, :3, :3], (centres[order] - middle) / unit)
+    of_unit = tuple(
+        one._replace(value=one.value + np.log(unit) * float(one.row[SCALE].item())) for one in priors
+    )
 
-    fit = fitted(camera_covariance)
+    def fitted(covariance: Float[ndarray, "r r"] | None) -> tuple[Solution, Start]:
+        """Return the robust fit to the distinct poses, and X, scale and Z in the given frame.
+
+        `covariance` (6n,6n) is that of the camera poses.
+        """
+        if covariance is not None:
+            per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), len(order))
+            covariance = per_unit[:, None] * of_poses(covariance, order) * per_unit
+        fit = robust_fit(gripper[order], central, noise, of_unit, covariance, of_robot, agreeing, carries)
+        scale, z = fit.state.scale / unit, fit.state.z[0].copy()
+        z[:3, 3] -= z[:3, :3] @ (scale * middle)
+        return fit, (fit.state.x[0], scale, z)
+
+    fit, start = fitted(camera_covariance)
     if camera_errors != "none":
         assert fit.problem.used is not None
-        start, used = (fit.state.x[0], fit.state.scale, fit.state.z[0]), fit.problem.used[distinct]
+        likely, used = start, fit.problem.used[distinct]
         if not poses_agree(fit.noise):
             # The fit may have explained camera errors by systematic robot errors; the closed form has neither.
-            start, used = initial_estimate(gripper, camera), np.ones(n, dtype=bool)
+            likely, used = initial_estimate(gripper, camera), np.ones(n, dtype=bool)
         errors = camera_error_covariance(
-            gripper, camera, start, used, systematic, noise, priors, camera_errors == "in sequence"
+            gripper, camera, likely, used, systematic, noise, priors, camera_errors == "in sequence"
         )
-        fit = fit if errors is None else fitted(errors)
-    return fit, distinct
+        if errors is not None:
+            fit, start = fitted(errors)
+    return fit, start, distinct
 
 
 def image_verdicts(

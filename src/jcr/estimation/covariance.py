@@ -16,6 +16,7 @@ from jcr.estimation.elimination import cholesky, lower, upper
 from jcr.estimation.pose_equations import Region
 from jcr.estimation.problem import SCALE, columns_of_arm
 from jcr.estimation.robot_noise import (
+    TOO_MANY,
     Each,
     Equations,
     Information,
@@ -43,6 +44,7 @@ Stack = Float[ndarray, "*k p p"]
 def posterior(
     equations: Equations,
     mode: LogSizes,
+    at_mode: LinearSolution,
     information: Information,
     region: Region,
     expected: bool = False,
@@ -50,18 +52,17 @@ def posterior(
     """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
     The averages are over the posterior of the robot's error sizes σ. `mode` are their most likely logarithms,
-    `information` is their information matrix. The sizes of one arm vary while those of the others stay at the mode, and
-    the changes by all arms add up. The covariance includes `region.spread`, the effect of systematic errors
-    at other poses. `expected`: for predictions, the residuals are 0 and their squares are replaced by expectations
-    under the noise at the mode.
+    `at_mode` is the solution for them, `information` their information matrix. The sizes of one arm vary while those of
+    the others stay at the mode, and the changes by all arms add up; those of more than TOO_MANY poses stay at the mode.
+    The covariance includes `region.spread`, the effect of systematic errors at other poses. `expected`: for
+    predictions, the residuals are 0 and their squares are replaced by expectations under the noise at the mode.
     """
-    root = cholesky(equations.covariance(mode))
 
     def density(solution: LinearSolution) -> Each:
         """Return the log posterior of the error sizes for which `solution` was computed."""
         if not expected:
             return solution.log_posterior
-        whitened, fitted = _whitened_and_fitted(solution, root)
+        whitened, fitted = _whitened_and_fitted(solution, at_mode.root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
@@ -81,11 +82,10 @@ def posterior(
             learned = learned + sign * np.swapaxes(columns, -1, -2) @ columns
         return region.spread(second_moment + poses / (poses + PRIOR_POSES) * learned)
 
-    mode_solution = solve_equations(equations, mode)
-    at_mode = elsewhere(mode_solution, mode)
-    step, covariance = mode_solution.step, mode_solution.covariance + at_mode
+    spread = elsewhere(at_mode, mode)
+    step, covariance = at_mode.step, at_mode.covariance + spread
     factor, steps_beyond, beyond = np.ones(len(step)), np.zeros_like(step), np.zeros_like(covariance)
-    for arm in range(equations.arms):
+    for arm in range(equations.arms if len(equations.residual) <= 6 * TOO_MANY else 0):
         found = over_sizes(equations, mode, information, density, arm)
         groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
         weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
@@ -98,7 +98,7 @@ def posterior(
         factor[slice(None) if arm == 0 else columns_of_arm(arm)] = np.sqrt(widened)
         steps_beyond, beyond = steps_beyond + (mean - step), beyond + (averaged - covariance)
     step, covariance = step + steps_beyond, factor[:, None] * (covariance + beyond) * factor
-    return step, covariance, _budget(equations, mode, at_mode, covariance)
+    return step, covariance, _budget(equations, mode, at_mode, spread, covariance)
 
 
 def _whitened_and_fitted(
@@ -143,13 +143,19 @@ def _widening(
     return max(1.0, float(np.exp(most)) / normal)
 
 
-def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covariance: Square) -> Budget:
+def _budget(
+    equations: Equations,
+    log_sizes: LogSizes,
+    found: LinearSolution,
+    elsewhere: Square,
+    covariance: Square,
+) -> Budget:
     """Return the covariance of X (hand-eye) and scale by cause: robot random, robot systematic, intrinsics, images.
 
-    `elsewhere` is the covariance that systematic errors add for other poses of the workspace, at `log_sizes`. X and log
-    scale are in the order translation (m), rotation (rad), log scale. The part of the intrinsics is the covariance that
-    exact intrinsics would remove. The parts are scaled so that they add up to `covariance`. The part of the images
-    includes unobservable directions and rounding.
+    `found` is the solution at `log_sizes`; `elsewhere` is the covariance that systematic errors add there for other
+    poses of the workspace. X and log scale are in the order translation (m), rotation (rad), log scale. The part of the
+    intrinsics is the covariance that exact intrinsics would remove. The parts are scaled so that they add up to
+    `covariance`. The part of the images includes unobservable directions and rounding.
     """
     arms = 12 * equations.arms + 1
     exact = replace(
@@ -158,7 +164,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
         prior_information=equations.prior_information[:arms, :arms],
         prior_gradient=equations.prior_gradient[:arms],
     )
-    solution = solve_equations(exact, log_sizes)
+    solution = solve_equations(exact, log_sizes) if len(found.step) > arms else found
     gain = solution.gain
     random = (gain * exact.random(log_sizes)) @ gain.T
     systematic = elsewhere[:arms, :arms]
@@ -169,7 +175,7 @@ def _budget(equations: Equations, log_sizes: LogSizes, elsewhere: Square, covari
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:
         images = images + gain @ exact.known @ gain.T
-    intrinsics = solve_equations(equations, log_sizes).covariance[:arms, :arms] - solution.covariance
+    intrinsics = found.covariance[:arms, :arms] - solution.covariance
     whole, parts = covariance[:7, :7], [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     # A linear map takes errors with the covariance of all parts to errors with the whole covariance.
     known = sum(parts[1:], parts[0])

@@ -16,7 +16,7 @@ Matrices = Float[ndarray, "*k n n"]
 Columns = Float[ndarray, "*#k n r"]
 JITTER = (0.0, 1e-14, 1e-12, 1e-10)
 """Values tried in turn on the diagonal of a correlation matrix whose smallest eigenvalue is lost in rounding."""
-_solve_triangular, _invert = get_lapack_funcs(("trtrs", "potri"), dtype=np.float64)
+_solve_triangular, _invert, _invert_triangle = get_lapack_funcs(("trtrs", "potri", "trtri"), dtype=np.float64)
 
 
 def cholesky(matrix: Matrices) -> Matrices:
@@ -25,10 +25,15 @@ def cholesky(matrix: Matrices) -> Matrices:
     The diagonal of a matrix that is singular up to rounding, as of degenerate motions, is increased slightly.
     """
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
-    scaled = matrix / size[..., :, None] / size[..., None, :]
+    scaled = matrix / size[..., :, None]
+    scaled /= size[..., None, :]
+    each = np.arange(matrix.shape[-1])
     for rounding in JITTER:
+        scaled[..., each, each] += rounding
         try:
-            return size[..., None] * np.linalg.cholesky(scaled + rounding * np.eye(matrix.shape[-1]))
+            root = np.linalg.cholesky(scaled)
+            root *= size[..., None]
+            return root
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
                 return np.array([cholesky(each) for each in matrix])
@@ -56,6 +61,11 @@ def inverse_of(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
     """Return V⁻¹ for V = L Lᵀ, with the lower Cholesky factor L = `root`."""
     half = np.tril(_invert(root, lower=1)[0])
     return half + np.tril(half, -1).T
+
+
+def inverse_root(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
+    """Return L⁻¹ for the lower Cholesky factor L = `root`."""
+    return _invert_triangle(root.T, lower=0)[0].T
 
 
 def log_root_determinant(root: Matrices) -> Float[ndarray, "*k"] | np.floating:

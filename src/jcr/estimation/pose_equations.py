@@ -69,9 +69,11 @@ class Region:
         `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error (`fit`), J the derivative
         `by_unknown`.
         """
-        # (I − J A) S (I − J A)ᵀ, without a product of two matrices of the residuals' size.
-        half = systematic - self.by_unknown @ (self.fit @ systematic)
-        return half - (half @ self.fit.T) @ self.by_unknown.T
+        # (I − J A) S (I − J A)ᵀ = S − J M − (J M)ᵀ, without a product of two matrices of the residuals' size.
+        shift = self.fit @ systematic
+        shift -= (shift @ self.fit.T / 2) @ self.by_unknown.T
+        left = np.hstack([self.by_unknown, shift.T]) @ np.vstack([shift, self.by_unknown.T])
+        return np.subtract(systematic, left, out=left)
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
         """Return the covariance of all p unknowns that is due to the choice of the m poses; 0 except for X and Z.
@@ -306,7 +308,8 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     fit[:, rows] = np.linalg.pinv(weighted, rcond=1e-9)[:, : len(rows)] * root
     everywhere = Region(by_unknown, fit, problem.unknowns)
     region = replace(everywhere, by_unknown=by_unknown[rows], fit=fit[:, rows])
-    systematic = np.asarray(block_diag(*(arm.error_covariance for arm in problem.arms)))
+    systematic, *others = (arm.error_covariance for arm in problem.arms)
+    systematic = np.asarray(block_diag(systematic, *others)) if others else systematic
     bent = problem.bent
     every = Equations(
         residual=residual.ravel(),

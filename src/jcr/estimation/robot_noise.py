@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.estimation.elimination import cholesky, inverse_of, log_root_determinant, lower, over, upper
+from jcr.estimation.elimination import (
+    cholesky,
+    inverse_of,
+    inverse_root,
+    log_root_determinant,
+    lower,
+    over,
+    upper,
+)
 from jcr.estimation.kinematics import Arm, Joints, error_jacobian, error_std
 from jcr.geometry import Poses
 from jcr.records import RobotNoise
@@ -39,15 +47,16 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
     between = rotation[:, None] @ np.swapaxes(rotation, 1, 2)[None]
-    apart = np.linalg.norm(position[:, None] - position, axis=-1) / REACH
+    squared_apart = ((position[:, None] - position) ** 2).sum(-1) / REACH**2
     # The chord 2 sin(θ/2) of an angle θ: with θ itself the matrix has negative eigenvalues (a Gaussian of the geodesic
     # distance on SO(3) is not positive definite).
     squared_chord = 3 - np.trace(between, axis1=-2, axis2=-1)
-    share = np.exp(-(squared_chord + apart**2) / (2 * ALIKE**2))[..., None, None]
-    alike = share * (np.eye(3) + between) / 2
-    out = np.zeros((n, n, 6, 6))
-    out[..., :3, :3], out[..., 3:, 3:] = REACH**2 * alike, alike
-    return out.swapaxes(1, 2).reshape(6 * n, 6 * n)
+    between += np.eye(3)
+    between *= np.exp(-(squared_chord + squared_apart) / (2 * ALIKE**2))[..., None, None] / 2
+    out = np.zeros((n, 6, n, 6))
+    out[:, :3, :, :3] = out[:, 3:, :, 3:] = between.swapaxes(1, 2)
+    out[:, :3, :, :3] *= REACH**2
+    return out.reshape(6 * n, 6 * n)
 
 
 def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
@@ -239,8 +248,8 @@ class Equations:
 
         V is the sum of the random part, the systematic part, camera pose errors and confirmed effects.
         """
-        covariance = self.random(log_sizes)[..., None] * np.eye(len(self.residual))
-        covariance += self.systematic_part(log_sizes)
+        covariance, each = self.systematic_part(log_sizes), np.arange(len(self.residual))
+        covariance[..., each, each] += self.random(log_sizes)
         variances = self.variances(log_sizes)[..., OF_ARM * self.arms :]
         for k, part in enumerate(self.camera_errors):
             covariance += variances[..., k, None, None] * part
@@ -331,7 +340,9 @@ def left_out(
     """
     m = len(solution.root) // 6
     sigma = np.sqrt(random).reshape(m, 6)
-    own = solution.projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
+    whitener = inverse_root(solution.root).reshape(-1, m, 6)
+    fitted = lower(solution.information_root, solution.weighed.T).reshape(-1, m, 6)
+    own = np.einsum("kia,kib->iab", whitener, whitener) - np.einsum("kia,kib->iab", fitted, fitted)
     without = np.linalg.inv(sigma[:, :, None] * own * sigma[:, None] + 1e-9 * np.eye(6))
     found = sigma * np.einsum("mij,mj->mi", without, sigma * solution.weighed_left.reshape(m, 6))
     return found, sigma[:, :, None] * without * sigma[:, None]

@@ -9,26 +9,17 @@ therefore give a larger estimated noise rather than many rejected poses.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.pose_equations import pose_equations, predicted_gripper_poses
-from jcr.estimation.problem import (
-    BASE_ROTATION,
-    BASE_TRANSLATION,
-    SCALE,
-    LinearPrior,
-    Problem,
-    State,
-    pose_problem,
-)
-from jcr.estimation.robot_noise import TOO_MANY, of_poses, solve_equations
+from jcr.estimation.problem import LinearPrior, Problem, State, pose_problem
+from jcr.estimation.robot_noise import TOO_MANY, of_poses
 from jcr.estimation.solve import Solution, solve
-from jcr.geometry import ARM, Poses, inverse, rotation_angle, skew, transform
+from jcr.geometry import ARM, Poses, Transform, inverse, rotation_angle
 
 Images = Bool[ndarray, " n"]
 """Mask of the used images."""
@@ -49,6 +40,22 @@ LEAST_WRONG, MOST_WRONG = (1e-3, np.radians(0.2)), (1.0, np.pi)
 """Smallest and largest errors of wrong poses (m, rad); images with smaller errors are not rejected."""
 
 
+class _Trial(NamedTuple):
+    """Fit with some of n images, as far as the search compares it."""
+
+    used: Images
+    state: State
+    """Most likely state."""
+    evidence: float
+    """Log evidence of the used poses, plus `log_wrong` of the unused poses."""
+    distance: Float[ndarray, " n"]
+    """Squared Mahalanobis length of each pose's leave-one-out error."""
+    log_right: Float[ndarray, " n"]
+    """Log((2π)³ d) of each pose: d is the density of its leave-one-out error if the pose is right."""
+    log_wrong: Float[ndarray, " n"]
+    """Log((2π)³ w d) of each pose: w odds of a wrong pose, d density of its leave-one-out error if wrong."""
+
+
 def robust_fit(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
@@ -64,32 +71,22 @@ def robust_fit(
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
     evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
     they are more than MANY. Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`:
-    error_covariance). The problem is solved in a frame at the centre of the cameras with their extent as unit, for
-    numerical reasons; the solution is in the given frame.
+    error_covariance).
     """
-    n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
-    middle = centers.mean(0)
-    unit = float(np.sqrt(((centers - middle) ** 2).sum(1).mean()))
-    unit = unit if unit > 1e-12 * np.abs(centers).max() else 1.0
-    given_cameras = recon_from_camera, camera_covariance, priors
-    recon_from_camera = transform(recon_from_camera[:, :3, :3], (centers - middle) / unit)
-    priors = tuple(
-        one._replace(value=one.value + np.log(unit) * float(one.row[SCALE].item())) for one in priors
-    )
-    if camera_covariance is not None:
-        per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
-        camera_covariance = per_unit[:, None] * camera_covariance * per_unit
+    n, fits = len(base_from_gripper), dict[bytes, _Trial]()
     moving = inverse(base_from_gripper) if carries == "scene" else base_from_gripper
-    fits: dict[bytes, Solution] = {}
 
     def problem_of(rows: Int[ndarray, " k"]) -> tuple[Problem, State]:
         """Return the problem with k of the n images, and an initial state to complete."""
+        some = len(rows) < n
         return pose_problem(
             base_from_gripper[rows],
             recon_from_camera[rows],
             (np.eye(4), 1.0, np.eye(4)),
-            camera_covariance=None if camera_covariance is None else of_poses(camera_covariance, rows),
-            error_covariance=None if systematic is None else of_poses(systematic, rows),
+            camera_covariance=of_poses(camera_covariance, rows)
+            if some and camera_covariance is not None
+            else camera_covariance,
+            error_covariance=of_poses(systematic, rows) if some and systematic is not None else systematic,
             noise_floor=noise,
             priors=priors,
             carries=carries,
@@ -97,8 +94,8 @@ def robust_fit(
 
     every, state = problem_of(np.arange(n))
 
-    def fitted(used: Images) -> Solution:
-        """Return the solution with the used images, without averaging over error sizes.
+    def fitted(used: Images) -> _Trial:
+        """Return the fit with the used images, without averaging over error sizes.
 
         With more than TOO_MANY images it starts from the solution with as many of them, evenly spaced, because a step
         takes the cube of their number.
@@ -110,112 +107,66 @@ def robust_fit(
                 some, begin = problem_of(rows[np.linspace(0, len(rows) - 1, TOO_MANY).astype(int)])
                 near = solve(some, replace(begin, **start), averaged=False).most_likely
                 start = {name: getattr(near, name) for name in (*start, "robot_log_sizes")}
-            fits[used.tobytes()] = solve(replace(every, used=used), replace(state, **start), averaged=False)
+            fits[used.tobytes()] = _trial(
+                solve(replace(every, used=used), replace(state, **start), averaged=False), used
+            )
         return fits[used.tobytes()]
 
-    used = np.ones(n, dtype=bool)
+    best = fitted(np.ones(n, dtype=bool)) if n <= MANY else None
     if n >= 5:
         if agreeing is None:
             agreeing = least_trimmed(moving, recon_from_camera)[0]
-        used, evidence = _improved(fitted, agreeing, adding=True)
-        if n <= MANY:
-            fewer, other = _improved(fitted, np.ones(n, dtype=bool), adding=False)
-            used = fewer if other >= evidence else used
-    fit = solve(replace(every, used=used), fitted(used).most_likely)
-    return _in_frame(fit, given_cameras, middle, unit)
+        more = _improved(fitted, fitted(agreeing), adding=True)
+        fewer = more if best is None else _improved(fitted, best, adding=False)
+        best = fewer if fewer.evidence >= more.evidence else more
+    assert best is not None
+    return solve(replace(every, used=best.used), best.state)
 
 
-def _in_frame(
-    fit: Solution,
-    given: tuple[Poses, Float[ndarray, "r r"] | None, tuple[LinearPrior, ...]],
-    middle: Float[ndarray, "3"],
-    unit: float,
-) -> Solution:
-    """Return a solution for cameras (c - `middle`) / `unit` as that for the cameras c.
-
-    `given` holds the camera poses c, their covariance, and the priors. X, Z and scale step as before; only the position
-    of Z depends on the frame.
-    """
-    recon_from_camera, covariance, priors = given
-
-    def moved(state: State) -> State:
-        """Return the state with base_from_recon, scale and camera poses in the given frame and unit."""
-        z, rigs, scale = state.z[0], state.world_from_rig, state.scale / unit
-        z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
-        rigs = transform(rigs[:, :3, :3], unit * rigs[:, :3, 3] + middle)
-        return replace(state, scale=scale, z=z[None], world_from_rig=rigs)
-
-    problem = replace(fit.problem, known_rigs=(recon_from_camera, covariance), priors=priors)
-    state, likely = moved(fit.state), moved(fit.most_likely)
-    poses = pose_equations(problem, likely, None)
-    away = state.scale * state.z[0][:3, :3] @ middle
-    by_step = np.eye(len(fit.covariance))
-    by_step[BASE_TRANSLATION, SCALE], by_step[BASE_TRANSLATION, BASE_ROTATION] = -away[:, None], skew(away)
-    found = replace(
-        fit,
-        problem=problem,
-        state=state,
-        covariance=by_step @ fit.covariance @ by_step.T,
-        most_likely=likely,
-        poses=poses,
-        at_mode=solve_equations(poses.equations, fit.log_sizes),
-    )
-    # Leave-one-out errors are the same in all frames; a frame far from the cameras would cost digits.
-    found.__dict__["leave_one_out"] = fit.leave_one_out
-    return found
-
-
-def _improved(fitted: Callable[[Images], Solution], used: Images, adding: bool) -> tuple[Images, float]:
-    """Return the mask of used images with the largest log evidence, by a greedy search from `used`, and that evidence.
+def _improved(fitted: Callable[[Images], _Trial], best: _Trial, adding: bool) -> _Trial:
+    """Return the fit with the largest log evidence, by a greedy search from the fit `best`.
 
     `fitted` returns the fit for a mask. `adding`: each step adds all images whose pose is more likely right than wrong,
     or else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error, down to four
     images.
     """
-    fit = fitted(used)
-    best = _evidence(fit, used)
     while True:
+        used = best.used
         if adding:
-            _, spread = np.linalg.slogdet(fit.leave_one_out[1])
-            likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
+            likelier = np.where(used, -np.inf, best.log_right - best.log_wrong)
             joining = () if used.all() else (likelier > 0, likelier == likelier.max())
             changes = [used | some for some in joining if some.any()]
         else:
-            worst = np.arange(len(used)) == np.where(used, _distance(fit), -np.inf).argmax()
+            worst = np.arange(len(used)) == np.where(used, best.distance, -np.inf).argmax()
             changes = [used & ~worst] if used.sum() > 4 else []
-        for changed in changes:
-            tried = fitted(changed)
-            evidence = _evidence(tried, changed)
-            if evidence > best:
-                used, best, fit = changed, evidence, tried
-                break
-        else:
-            return used, best
+        better = (tried for changed in changes if (tried := fitted(changed)).evidence > best.evidence)
+        if (found := next(better, None)) is None:
+            return best
+        best = found
 
 
-def _evidence(fit: Solution, used: Images) -> float:
-    """Return the log evidence of a fit: log evidence of the used poses, plus `_log_wrong` of the unused poses."""
-    return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
+def _trial(fit: Solution, used: Images) -> _Trial:
+    """Return what the search compares of a fit with the `used` images.
 
-
-def _distance(fit: Solution) -> Float[ndarray, " n"]:
-    """Return the squared Mahalanobis length of each pose's leave-one-out error: error squared over its covariance."""
+    The errors of wrong poses have a uniform direction and a log-uniform size between LEAST_WRONG and MOST_WRONG. A pose
+    with errors below LEAST_WRONG in translation and rotation is never wrong.
+    """
     left_out, covariance = fit.leave_one_out
     gap = np.linalg.solve(covariance, left_out[..., None])[..., 0]
-    return np.einsum("ni,ni->n", left_out, gap)
-
-
-def _log_wrong(fit: Solution) -> Float[ndarray, " n"]:
-    """Return log((2π)³ · w · d) of each pose: w odds of a wrong pose, d density of its leave-one-out error if wrong.
-
-    The errors of wrong poses have a uniform direction and a log-uniform size between LEAST_WRONG and MOST_WRONG. The
-    result is −∞ for errors below LEAST_WRONG in translation and rotation.
-    """
-    off = np.linalg.norm(fit.leave_one_out[0].reshape(-1, 2, 3), axis=2)
+    distance = np.einsum("ni,ni->n", left_out, gap)
+    off = np.linalg.norm(left_out.reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
     density = -np.log(4 * np.pi * np.log(most / least)) - 3 * np.log(np.maximum(off, least))
     odds = np.log(WRONG / (1 - WRONG)) + 3 * np.log(2 * np.pi)
-    return np.where((off < least).all(1), -np.inf, density.sum(1) + odds)
+    wrong = np.where((off < least).all(1), -np.inf, density.sum(1) + odds)
+    return _Trial(
+        used,
+        fit.most_likely,
+        fit.log_evidence + float(wrong[~used].sum()),
+        distance,
+        -(distance + np.linalg.slogdet(covariance)[1]) / 2,
+        wrong,
+    )
 
 
 def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
@@ -228,8 +179,9 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
     triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
     x, scale, z = closed_form(base_from_gripper[triples], recon_from_camera[triples], rounds=0)
-    error = _squared_error(x, scale, z, base_from_gripper, recon_from_camera)
-    error[scale <= 0] = np.inf
+    error = np.full((len(triples), n), np.inf)
+    for k in np.flatnonzero(scale > 0):
+        error[k] = _squared_error(x[k], np.asarray(scale)[k], z[k], base_from_gripper, recon_from_camera)
     ranked = np.argsort(np.sort(error, axis=1)[:, :keep].sum(1), kind="stable")[:CONCENTRATED]
 
     best, best_cost, tried = np.ones(n, dtype=bool), np.inf, set()
@@ -250,18 +202,24 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
 
 
 def _squared_error(
-    x: Float[ndarray, "*batch 4 4"],
-    scale: Float[ndarray, "*batch"] | np.floating,
-    z: Float[ndarray, "*batch 4 4"],
+    x: Transform,
+    scale: Float[ndarray, ""] | np.floating,
+    z: Transform,
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-) -> Float[ndarray, "*batch n"]:
+) -> Float[ndarray, " n"]:
     """Return the squared error (m²) of each reported gripper pose from its prediction; an angle counts as ARM times rad.
 
     The prediction is from `recon_from_camera`, `x` (gripper_from_camera), `scale` and `z` (base_from_recon).
     """
-    gap = predicted_gripper_poses(x, scale, z, recon_from_camera) - base_from_gripper
-    return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
+    # Both are turned to the axes of the reconstruction, with one product of matrices for all poses.
+    n, scaled_camera_from_gripper = len(base_from_gripper), inverse(x)
+    scaled_camera_from_gripper[3, 3] = scale
+    predicted = recon_from_camera[:, :3].reshape(3 * n, 4) @ scaled_camera_from_gripper
+    reported = z[:3, :3].T @ base_from_gripper[:, :3].swapaxes(0, 1).reshape(3, 4 * n)
+    gap = predicted.reshape(n, 3, 4) - reported.reshape(3, n, 4).swapaxes(0, 1)
+    gap[..., 3] += z[:3, :3].T @ z[:3, 3]
+    return (gap[..., 3] ** 2).sum(1) + ARM**2 * (gap[..., :3] ** 2).sum((1, 2)) / 2
 
 
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:

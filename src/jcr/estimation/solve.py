@@ -173,7 +173,7 @@ class Solution:
         rows = np.repeat(used, 6)
         for i in np.flatnonzero(~used):
             mine = slice(6 * i, 6 * i + 6)
-            gain = alike[mine, rows] @ solution.weight
+            gain = over(solution.root, alike[rows, mine]).T
             by = every.jacobian[mine] - gain @ self.equations.jacobian
             found[i] -= gain @ self.equations.residual
             own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(random[mine])
@@ -404,7 +404,7 @@ def with_covariance(
     if expected is None:
         state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
     poses = pose_equations(problem, state, images)
-    equations, region = poses.equations, poses.region
+    equations = poses.equations
     if expected is None:
         log_sizes, information = most_likely(equations, state.robot_log_sizes)
     else:
@@ -414,7 +414,9 @@ def with_covariance(
     at_mode = solve_equations(equations, log_sizes)
     covariance, budget = at_mode.covariance, None
     if averaged:
-        step, covariance, budget = posterior(equations, log_sizes, information, region, expected is not None)
+        step, covariance, budget = posterior(
+            equations, log_sizes, at_mode, information, poses.region, expected is not None
+        )
         state = full_step(problem, state, step)
     return Solution(
         problem=problem,
@@ -450,6 +452,7 @@ def _most_likely_arms(problem: Problem, state: State, images: ImageEvidence | No
         columns = share * poses.rig_step(solution) if images is None else None
         state = replace(stepped(problem, state, step, columns), robot_log_sizes=sizes)
         size = float(((step @ solution.information_root[:arms]) ** 2).sum())
+        del poses, equations, solution  # of many poses each takes much memory
         if size < settled or (size > 1 and count >= DIVERGING):
             break
     return state
