@@ -22,6 +22,7 @@ from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
 from jcr.records import CameraEvidence
 from scenes import capture_of, pairs_of, reconstruction_of
+from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
 from simulation.problems import bent_problem, hand_eye_problem, observed
@@ -220,6 +221,17 @@ def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covarianc
         off = problem.bent.errors[1:5] - found.joint_offsets.offset[1:5]
         assert (np.abs(off) < 3 * found.joint_offsets.std[1:5]).all()
         assert least < np.degrees(found.joint_offsets.std[1:5]).max() < most
+
+
+@pytest.mark.parametrize(("preset", "images", "is_named"), [("low-cost", 40, True), ("typical", 24, False)])
+def test_smooth_errors_that_leave_one_out_does_not_show_are_a_finding(
+    preset: PresetName, images: int, is_named: bool
+):
+    problem = bent_problem(arm_named("ur5e"), preset, images, 2)
+    capture = capture_of(problem.base_from_gripper, intrinsics=OBSERVED_BY)
+    tracks = observed(problem, np.random.default_rng(2), 100, 0.4)
+    found = calibrate_reconstruction(capture, reconstruction_of(problem.recon_from_camera, tracks=tracks))
+    assert found.converged and (FindingKind.SMOOTH_ERRORS in {one.kind for one in found.findings}) is is_named
 
 
 def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large():

@@ -51,7 +51,8 @@ def advised(
         for one in hand_eye.findings
         if one.kind is not FindingKind.NOT_EXACT_ENOUGH
     )
-    required, missed = requirement_of(x, uncertainty, findings, hand_eye.images_used, options)
+    arm_known = hand_eye.joint_offsets is not None
+    required, missed = requirement_of(x, uncertainty, findings, hand_eye.images_used, options, arm_known)
     made = replace(hand_eye, uncertainty=uncertainty, requirement=required, findings=findings)
     return made.with_findings(*missed)
 
@@ -73,11 +74,13 @@ def requirement_of(
     findings: Sequence[Finding],
     images: int,
     options: CalibrateOptions,
+    arm_known: bool = False,
 ) -> tuple[Requirement | None, tuple[Finding, ...]]:
     """Return the required and reached accuracy, and a finding if it is missed by a calibration that nothing rejects.
 
     `x` is gripper_from_camera, `uncertainty` has the uncertainty of points (`seen`), and `findings` are those of the
-    calibration. `images` is the number of used images. The first is None if no accuracy is required or it is unknown.
+    calibration. `images` is the number of used images, `arm_known` whether the arm's joints are modelled. The first is
+    None if no accuracy is required or it is unknown.
     """
     seen = uncertainty.seen
     if options.require == "none" or seen is None:
@@ -96,7 +99,7 @@ def requirement_of(
     more = max(FORECAST_IMAGES - images, 0) or _more_images(x, uncertainty, findings, images, required)
     required = replace(required, more_images=more)
     systematic = uncertainty.budget is not None and uncertainty.budget.mostly_systematic
-    concerns: Concerns = "images" if more is not None else "robot" if systematic else "none"
+    concerns: Concerns = "images" if more is not None else "robot" if systematic and not arm_known else "none"
     size = 1e-3 * required.reached_mm
     return required, (
         Finding.of(FindingKind.NOT_EXACT_ENOUGH, "warns", concerns, value=size, **required.details),

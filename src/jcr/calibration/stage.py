@@ -16,7 +16,7 @@ from jcr.calibration.checks.convention import better_reading, check_convention, 
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
 from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
-from jcr.calibration.checks.robot import check_robot
+from jcr.calibration.checks.robot import check_robot, check_smooth_errors
 from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
@@ -45,6 +45,7 @@ CHECKS = (
     check_boards,
     check_lengths,
     check_robot,
+    check_smooth_errors,
     check_mount,
     check_remarks,
 )

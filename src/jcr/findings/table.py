@@ -212,6 +212,12 @@ class FindingKind(StrEnum):
     JOINT_OFFSETS = "joint offsets", KindRow("robot", "robot: {shown}",
         means="`joints` are off; each in `details`",
         help="master the joints")
+    SMOOTH_ERRORS = "gripper poses err smoothly", KindRow("robot",
+        "the gripper poses err smoothly by {mm:.1f} mm and {rotation_deg:.2f}° per axis; the leave-one-out error "
+        "({held_out_mm:.2f} mm) does not show it, because near poses share their errors{joint_deg:. Joints of this arm "
+        "would be off by $°}",
+        "take the poses of the robot's controller, not those computed from nominal lengths; spread the views",
+        means="the estimated smooth errors of the poses are five times the leave-one-out error or more")
     LENGTHS = "robot lengths differ by direction", KindRow("strain",
         "along {axis} the robot's positions are {percent:!.1f} ± {std_percent:~} % too {value:long|short} "
         "beside those across it",
