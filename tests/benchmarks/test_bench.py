@@ -142,6 +142,6 @@ def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path:
 
 def test_every_recipe_names_a_commit_a_licence_and_what_it_makes():
     known = recipes()
-    assert len(known) == 14
+    assert len(known) == 15
     for name, recipe in known.items():
         assert len(recipe.commit) == 40 and len(recipe.sha256) == 64 and recipe.licence, name
