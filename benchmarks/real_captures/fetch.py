@@ -140,63 +140,84 @@ def build(recipe: Recipe, out: Path, clone: str | None = None) -> Path:
             _git(clone, "init", "--quiet", "--bare")
             _git(clone, "remote", "add", "origin", recipe.repository)
             _git(clone, "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", recipe.commit)
-        files = _files(recipe, clone)
-    images = _chosen(_matching(files, recipe.images), recipe.use_images)
+        names = _git(clone, "ls-tree", "-r", "-z", "--name-only", recipe.commit).decode().split("\0")
+        images = _chosen(_matching(names, recipe.images), recipe.use_images)
+        others = _others(recipe, names)
+        of_others = [path for own in others.values() for path in own.values()]
+        truths = [one for one in (recipe.truth, *(other["truth"] for other in recipe.others.values())) if one]
+        if not images:
+            raise InputError(f"{recipe.repository}: no file {recipe.images} at {recipe.commit[:10]}")
+        wanted = [*images, *_matching(names, recipe.poses), *truths, *of_others]
+        files = _files(clone, recipe.commit, wanted)
     poses = _poses(recipe, files)
     if len(images) != len(poses):
         raise InputError(
             f"{recipe.repository}: {len(images)} images and {len(poses)} poses; correct the recipe"
         )
-    chosen = _chosen(list(range(len(_matching(files, recipe.images)))), recipe.use_images)
-    of_others = {
-        name: {chosen.index(row): _matching(files, other["images"])[row] for row in other["rows"]}
-        for name, other in recipe.others.items()
-    }
-    more = [files[image] for rows in of_others.values() for image in rows.values()]
-    found = digest([*(files[name] for name in images), *more], poses)
+    found = digest([files[name] for name in (*images, *of_others)], poses)
     if recipe.sha256 not in ("", found):
         raise InputError(f"{recipe.repository}: content is not that of the recipe (sha256 {found})")
     # Images that have the same name in folders of their own are named by their folders.
     apart = len({Path(name).name for name in images}) == len(images)
-    names = [Path(name).name if apart else f"{Path(name).parent.name}{Path(name).suffix}" for name in images]
-    for name, image in zip(names, images, strict=True):
-        write_bytes(out / "images" / name, files[image])
-    with Image.open(io.BytesIO(files[images[0]])) as image:
+    named = {
+        f"images/{Path(name).name if apart else Path(name).parent.name + Path(name).suffix}": name
+        for name in images
+    }
+    beside = {f"{camera}/{Path(path).name}": path for camera, own in others.items() for path in own.values()}
+    for name, path in (named | beside).items():
+        write_bytes(out / name, files[path])
+    _write(out, recipe, poses, [*named], others, files)
+    return out
+
+
+def _write(
+    out: Path,
+    recipe: Recipe,
+    poses: Float[ndarray, "n 4 4"],
+    images: Sequence[str],
+    others: dict[str, dict[int, str]],
+    files: dict[str, bytes],
+) -> None:
+    """Write the capture.json of a recipe into `out`, where its images are.
+
+    `images` are the names of the frames' images, `others` the paths of other cameras' images by frame, `files` the
+    content of the repository's files.
+    """
+    with Image.open(out / images[0]) as image:
         size = image.size
-    intrinsics = None
+    known: dict[str, Any] = {"image_size": size, "intrinsics": None}
     if recipe.intrinsics:
         fx, fy, cx, cy, *distortion = recipe.intrinsics
-        intrinsics = Intrinsics(fx, fy, cx, cy, *size, tuple(distortion or [0.0] * 5))
-    known: dict[str, Any] = {"image_size": size, "intrinsics": intrinsics}
+        known["intrinsics"] = Intrinsics(fx, fy, cx, cy, *size, tuple(distortion or [0.0] * 5))
     if recipe.intrinsics_std:
         known["intrinsics_std"] = np.array(recipe.intrinsics_std)
-    others = []
-    for name, rows in of_others.items():
-        listed = {row: f"{name}/{Path(image).name}" for row, image in rows.items()}
-        for row, image in rows.items():
-            write_bytes(out / listed[row], files[image])
-        frame = np.array([*listed])
-        others.append(CellCamera(name=name, mount="base", images=(*listed.values(),), frame=frame, **known))
+    cameras = [
+        CellCamera(
+            name=name,
+            mount="base",
+            images=tuple(f"{name}/{Path(path).name}" for path in own.values()),
+            frame=np.array([*own]),
+            **known,
+        )
+        for name, own in others.items()
+    ]
     capture = Capture(
         folder=out,
-        images=tuple(f"images/{name}" for name in names),
+        images=tuple(images),
         base_from_gripper=poses,
         mount=recipe.mount,
         camera_name=recipe.camera,
-        others=tuple(others),
+        others=tuple(cameras),
         **known,
     )
-    source: dict[str, Any] = {
-        name: getattr(recipe, name) for name in ("repository", "commit", "licence", "board")
-    }
-    truths = {capture.camera_name: recipe.truth} | {name: one["truth"] for name, one in recipe.others.items()}
-    source["truth"] = {
+    truths = {recipe.camera: recipe.truth} | {name: one["truth"] for name, one in recipe.others.items()}
+    truth = {
         name: np.loadtxt(io.BytesIO(files[path])).reshape(4, 4).tolist()
         for name, path in truths.items()
         if path
     }
-    capture_json.write(out, capture, source=source)
-    return out
+    source = {name: getattr(recipe, name) for name in ("repository", "commit", "licence", "board")}
+    capture_json.write(out, capture, source=source | {"truth": truth})
 
 
 def digest(images: Sequence[bytes], poses: Float[ndarray, "n 4 4"]) -> str:
@@ -205,15 +226,18 @@ def digest(images: Sequence[bytes], poses: Float[ndarray, "n 4 4"]) -> str:
     return hashlib.sha256(b"".join([*images, text])).hexdigest()
 
 
-def _files(recipe: Recipe, repository: str) -> dict[str, bytes]:
-    """Return the content of the files of a recipe by their paths."""
-    names = _git(repository, "ls-tree", "-r", "-z", "--name-only", recipe.commit).decode().split("\0")
-    paths = [recipe.images, recipe.poses, *([recipe.truth] if recipe.truth else [])]
-    paths += [path for other in recipe.others.values() for path in (other["images"], other["truth"])]
-    wanted = [name for path in paths for name in _matching(names, path)]
-    if not wanted:
-        raise InputError(f"{recipe.repository}: no file {recipe.images} at {recipe.commit[:10]}")
-    archive = io.BytesIO(_git(repository, "archive", recipe.commit, "--", *wanted))
+def _others(recipe: Recipe, names: Sequence[str]) -> dict[str, dict[int, str]]:
+    """Return for each further camera the paths of its images by the frame that each was taken with."""
+    frames = _chosen([*range(len(_matching(names, recipe.images)))], recipe.use_images)
+    return {
+        name: {frames.index(row): _matching(names, other["images"])[row] for row in other["rows"]}
+        for name, other in recipe.others.items()
+    }
+
+
+def _files(repository: str, commit: str, names: Sequence[str]) -> dict[str, bytes]:
+    """Return the content of the files of a commit by their paths."""
+    archive = io.BytesIO(_git(repository, "archive", commit, "--", *names))
     with tarfile.open(fileobj=archive) as tar:
         return {one.name: tar.extractfile(one).read() for one in tar if one.isfile()}  # type: ignore[union-attr]
 
