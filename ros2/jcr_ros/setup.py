@@ -6,7 +6,7 @@ NAME = "jcr_ros"
 
 setup(
     name=NAME,
-    version="0.3.0",
+    version="0.4.0",
     packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
