@@ -61,6 +61,12 @@ def test_the_images_that_are_missing_are_counted():
     out_of_reach = CalibrateOptions(require=(0.01 * reached.reached_mm, 10.0))
     far = calibrate_pose_pairs(given, out_of_reach).requirement
     assert far is not None and far.more_images is None
+    perhaps = calibrate_pose_pairs(
+        given, CalibrateOptions(require=(0.62 * reached.reached_mm, 10.0))
+    ).requirement
+    assert perhaps is not None and perhaps.more_images == 5, (
+        "12 more may be enough: no other camera or robot yet"
+    )
     content, html = hand_eye, page(given, hand_eye)
     assert content.short is not None and content.verdict == NOT_EXACT and hand_eye.converged
     show = sentence(content.short)

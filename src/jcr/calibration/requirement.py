@@ -18,6 +18,8 @@ from jcr.records import Requirement, SceneUncertainty, Uncertainty
 
 MOST_MORE_IMAGES = 12
 """Largest number of images to add that is stated as the remedy of a missed accuracy."""
+IMAGES_FIRST = 5
+"""Number of images to add before the advice of another camera or robot, if the bound may be reached with images."""
 FORECAST_IMAGES = 8
 """Least number of used images for a forecast from how much of their error is random: with k images that size is known
 to a factor of about 1 ± 1/√(2k), 25 % for eight. With fewer images the remedy is to take as many."""
@@ -98,11 +100,32 @@ def requirement_of(
         return replace(required, more_images=0), ()
     more = max(FORECAST_IMAGES - images, 0) or _more_images(x, uncertainty, findings, images, required)
     required = replace(required, more_images=more)
-    systematic = uncertainty.budget is not None and uncertainty.budget.mostly_systematic
-    concerns: Concerns = "images" if more is not None else "robot" if systematic and not arm_known else "none"
+    main_part = None if uncertainty.budget is None else uncertainty.budget.main_part
+    concerns: Concerns = "images" if more is not None else "none"
+    if more is None and main_part == "robot_systematic" and not arm_known:
+        concerns = "robot"
+    elif more is None and main_part == "intrinsics":
+        concerns = "intrinsics"
+    elif (
+        more is None and _more_images(x, uncertainty, findings, images, _eased(required, images)) is not None
+    ):
+        required, concerns = replace(required, more_images=IMAGES_FIRST), "images"
     size = 1e-3 * required.reached_mm
     return required, (
         Finding.of(FindingKind.NOT_EXACT_ENOUGH, "warns", concerns, value=size, **required.details),
+    )
+
+
+def _eased(required: Requirement, images: int) -> Requirement:
+    """Return the requirement that the true errors miss if the estimated ones are too large by one standard deviation.
+
+    With k images, the size of the errors is known to a factor of about 1 ± 1/√(2k).
+    """
+    factor = 1 / (1 - 1 / np.sqrt(2 * images))
+    return replace(
+        required,
+        translation_mm=factor * required.translation_mm,
+        rotation_deg=factor * required.rotation_deg,
     )
 
 

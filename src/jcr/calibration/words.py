@@ -176,7 +176,7 @@ def details(content: AnyCalibration) -> list[str]:
         with np.printoptions(precision=6, suppress=True):
             matrix = str(np.array(content.parent_from_camera)).splitlines()
         lines += [f"{content.mount}_from_camera", *(f"  {row}" for row in matrix)]
-        lines.append(f"least certain {worst_direction(content)}")
+        lines.append(f"largest uncertainty {worst_direction(content)}")
         if uncertainty.seen is not None and uncertainty.joint is not None:
             lines.append(seen_in_words(uncertainty.seen))
         if content.with_given_intrinsics is not None:
@@ -203,7 +203,7 @@ def log(content: AnyCalibration) -> str:
 def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
     """Return blocks of named values as text: {title: {name: value}}, with times, uncertainty, lengths and robot."""
     time = {stage: f"{seconds:.1f} s" for stage, seconds in content.timings_s.items()}
-    time["together"] = f"{sum(content.timings_s.values()):.1f} s"
+    time["total"] = f"{sum(content.timings_s.values()):.1f} s"
     for k, attempt in enumerate(content.attempts, start=1):
         features = f" with {attempt.features}" if attempt.features else ""
         count = "nothing" if attempt.images_registered is None else f"{attempt.images_registered} images"
@@ -216,7 +216,7 @@ def facts(content: AnyCalibration) -> dict[str, Mapping[str, str]]:
         depth["scale error, compared with the robot"] = off
         for z in check.distances_m:
             depth[f"noise at {z:.2f} m, 1 σ"] = f"{significant(1e3 * float(check.std_m(z)))} mm"
-        depth["looked at"] = f"{check.features} features of {check.images} images"
+        depth["compared"] = f"{check.features} features of {check.images} images"
     if (errors := content.robot_errors) is not None:
         shared = "{translation_mm:.2g} mm {rotation_deg:.2g}° per axis".format_map(errors)
         robot["errors shared by neighbouring poses"] = shared

@@ -192,7 +192,7 @@ def best_frames(
     if len(views) < MIN_FRAMES:
         raise InputError(
             f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
-            "needed: record again with a pause at each of a dozen views"
+            "needed: record again with a pause at each of twelve views"
         )
     information = _pose_information(base_from_gripper[views])
     frames, known = np.zeros(0, int), WEAK * np.eye(13)

@@ -20,8 +20,8 @@ TOO_FEW = (
 )
 """Kinds that are consequences in addition to MISFIT if too few of the images can be used."""
 ONE_PART = (
-    "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone, and those of "
-    "the other part only where "
+    "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone; use the other "
+    "images only if "
 )
 REACHED = (
     "a point seen at {distance_m:~} m is placed within {reached_mm:~} mm and {reached_deg:~}° in the robot's base frame "
@@ -29,7 +29,7 @@ REACHED = (
     "{translation_mm:g} mm and {rotation_deg:g}° are required"
 )
 """Template of the sentence with the reached and the required bound on 95 % of the errors."""
-NEARER = "take two or more images 20 % nearer to or farther from the point you look at"
+NEARER = "take two or more images 20 % nearer to or farther from the point that all views show"
 ROTATED = "rotated by 20° or more about different axes"
 TILT = "tilt the wrist by 20° or more away from {axis} in two images"
 MOTIONS = {
@@ -130,40 +130,42 @@ class FindingKind(StrEnum):
         "take 8 or more")
     FEW_AGREE = "few images agree", KindRow("motion",
         "only {value:.0f} of {images:.0f} images agree on one calibration",
-        "check that images and poses are paired, and how the poses are written (jcr docs captures)")
+        "check the pairing of images and poses, and the pose convention (jcr docs captures)")
     POSES_CONTRADICT_IMAGES = "gripper poses contradict the images", KindRow("motion",
         "gripper poses and images disagree by {mm:.0f} mm and {rotation_deg:.1f}° per axis",
-        "check the pairing, and how the poses are written (jcr docs captures)")
+        "check the pairing of images and poses, and the pose convention (jcr docs captures)")
     POSE_CONVENTION = "pose convention", KindRow("motion",
         "the poses fit when read as {reading}: {fits}, instead of {given}", "{remedy}", explains=MISFIT,
         help="the option in `remedy`, or correct them at their source")
     INVERTED_PAIR = "inverted poses", KindRow("motion",
         "either the gripper poses or the marker poses are inverted, and pairs of poses do not tell which: the camera "
-        "is {value:.3g} m from the gripper if the gripper's are, {other:.3g} m if the marker's are ({fits})",
-        "measure that distance, and correct the poses in the file: the gripper in the base, the marker in the camera",
+        "is {value:.3g} m from the gripper if the gripper poses are, and {other:.3g} m if the marker poses are ({fits})",
+        "measure that distance, and write base_from_gripper and camera_from_marker into the file",
         explains=MISFIT)
     POSES_OF_CAMERA = "poses of the camera", KindRow("motion",
         "camera and gripper frame coincide within {mm:.1f} mm and {rotation_deg:.1f}°: these are poses of the camera "
-        "itself, as from a board that it measured, and not of the gripper",
+        "itself, measured from a board for example, and not of the gripper",
         "give the gripper's poses in the robot's base", explains=MISFIT)
     NOISE_ABOVE_GIVEN = "noise above the given one", KindRow("motion",
         "gripper poses and images disagree by {mm:.2g} mm and {rotation_deg:.2g}° per axis, more than the given "
-        "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°): the larger is used")
+        "robot noise ({given_mm:.2g} mm, {given_rotation_deg:.2g}°); the larger is used",
+        "check the mount, the pairing of images and poses, and the value of --robot-noise")
     UNCERTAIN = "too uncertain", KindRow("motion",
         "the {part} is known to ±{part:translation={mm:.0f} mm|rotation={deg:!.1f}°|scale={percent:.0f} %} only",
         f"add images, {ROTATED}{{noise_unknown:, or give the robot's repeatability (--robot-noise MM DEG)|}}",
         means="translation, rotation or scale (`details.part`) is less certain than 20 mm, 3° or 5 %")
     LEAVE_ONE_OUT = "leave-one-out error", KindRow("motion",
         "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual ({residual_mm:.1f} mm): "
-        "too few images for this motion", "add some")
+        "there are too few images for this motion", f"add images, {ROTATED}")
     NOT_CHECKED = "nothing checked", KindRow("motion",
         "the published method checks nothing: poses, intrinsics and motions may be wrong, and the result has no ±",
         "run the default method on the same capture, and compare (jcr compare)",
         means="the calibration is that of `--method paper`")
     NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", REACHED,
         f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of it comes from systematic robot "
-        "errors: name the arm (--robot) or add its joint angles|none=a dozen more images would not be enough; move "
-        "closer to the scene, or use a better camera or robot}",
+        "errors: name the arm (--robot) or add its joint angles|intrinsics=most of it comes from the intrinsics: give "
+        "calibrated ones (--camera-info), or add images at other distances, rolled about the optical axis|none=more "
+        "than 12 further images would be needed: move closer to the scene, or use a more accurate camera or robot}",
         means="the calibration is sound, and not as exact as `--require` states; the default is 5 mm and 1°",
         help="more images; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",
@@ -183,7 +185,7 @@ class FindingKind(StrEnum):
         "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT)
     THIN_PRISM = "thin prism", KindRow("camera",
         "the images show a thin-prism distortion of up to {value:.1f} ± {std:~} px: the sensor is "
-        "tilted, or the optics are decentred",
+        "tilted, or the lens is decentred",
         "use the transform with the estimated intrinsics, which have the coefficients s1 to s4", explains=MISFIT)
     INTRINSICS = "intrinsics contradict the images", KindRow("camera", "the {source} show {shown}",
         "{estimated:use the transform with the intrinsics of this calibration|calibrate the intrinsics again at this "
@@ -193,25 +195,25 @@ class FindingKind(StrEnum):
     SLIP = "camera moved on the gripper", KindRow("order",
         "the camera seems to have moved on the gripper, or the TCP to have changed, by {mm:.1f} mm and "
         "{rotation_deg:.2f}° after {images[0]}",
-        ONE_PART + "the camera still sits as then and the TCP is the same", explains=MISFIT)
+        ONE_PART + "camera mount and TCP are still as in them", explains=MISFIT)
     DRIFT = "camera drifts on the gripper", KindRow("order",
         "the camera seems to drift on the gripper by {mm:.1f} mm and {rotation_deg:.2f}° from the first image to "
-        "the last", "tighten its mount, let it warm up, and take the images again", explains=MISFIT)
+        "the last", "tighten the camera's mount, let the camera warm up, and take the images again", explains=MISFIT)
     BASE_MOVED = "robot base moved against the scene", KindRow("order",
         "the robot's base and the scene moved against each other by {mm:.1f} mm and {rotation_deg:.2f}° after "
-        "{images[0]}", ONE_PART + "base and scene still stand as then", explains=MISFIT)
+        "{images[0]}", ONE_PART + "base and scene are still as in them", explains=MISFIT)
     DELAY = "gripper poses early or late", KindRow("order",
         "the gripper poses look as if read {value:!.3f} ± {std:~} of the time from one image to the next too "
         "{value:late|early}", "stop the arm at each image, or read pose and image by the same clock",
         explains=MISFIT)
     WRONG_MOUNT = "wrong mount", KindRow("robot",
         "the images fit a camera that the gripper carries, not a fixed one",
-        "write mount gripper for {camera}", explains=MISFIT)
+        "set mount: gripper for {camera} in capture.json", explains=MISFIT)
     ROBOT_UNUSED = "robot not used", KindRow("robot", "the capture's robot is not used: {text}",
-        help="correct its name, URDF or joint angles")
+        "correct the robot's name, URDF or joint angles")
     JOINT_OFFSETS = "joint offsets", KindRow("robot", "robot: {shown}",
-        means="`joints` are off; each in `details`",
-        help="master the joints")
+        "master the joints",
+        means="`joints` are off; each in `details`")
     SMOOTH_ERRORS = "gripper poses err smoothly", KindRow("robot",
         "the gripper poses err smoothly by {mm:.1f} mm and {rotation_deg:.2f}° per axis; the leave-one-out error "
         "({held_out_mm:.2f} mm) does not show it, because near poses share their errors{joint_deg:. Joints of this arm "
@@ -220,15 +222,16 @@ class FindingKind(StrEnum):
         means="the estimated smooth errors of the poses are five times the leave-one-out error or more")
     LENGTHS = "robot lengths differ by direction", KindRow("strain",
         "along {axis} the robot's positions are {percent:!.1f} ± {std_percent:~} % too {value:long|short} "
-        "beside those across it",
+        "compared with those across it",
         "check that axis (a lift, a rail, a gantry): its gear ratio, its unit", explains=MISFIT)
     BASE_LEANS = "robot base leans with reach", KindRow("strain",
         "the robot's base leans {value:towards|away from} the gripper by {deg:!.1f} ± {std_deg:~}° per "
-        "metre of reach, which its poses do not say", "bolt the stand to the floor, or brace it", explains=MISFIT)
+        "metre of reach, and the reported poses do not contain this",
+        "bolt the stand to the floor, or brace it", explains=MISFIT)
     TOOL_SAGS = "tool sags", KindRow("strain",
-        "the gripper rotates by {deg:!.2f} ± {std_deg:~}° where it is level, as a tool does that sags "
+        "the gripper rotates by {deg:!.2f} ± {std_deg:~}° where it is level, as by a tool that sags "
         "under its weight",
-        "stiffen its mount, and check the zero of the wrist's joints, which looks like it", explains=MISFIT)
+        "stiffen the tool's mount, and check the zero of the wrist's joints, which has the same effect", explains=MISFIT)
     BOARD_SIZE = "board size contradicts the robot", KindRow("lengths",
         "by the robot's motion the {marker:marker|board} is {percent:!.1f} ± {std_percent:~} % {value:larger|smaller} "
         "than given",
@@ -240,11 +243,11 @@ class FindingKind(StrEnum):
         "depth camera, network) differ by more than they may")
     BOARD_SIDE = "side of a board", KindRow("lengths",
         "by the robot's positions the sides of {board} are {mm:.2f} ± {std_mm:.2f} mm",
-        "measure one, and give it in --board: the scale is then known twice")
+        "measure one side and give it in --board: the scale is then known from the robot and from the board")
     BOARD_MOVED = "board at several places", KindRow("lengths",
         "in {images} {board} is at another place than in the other images: it was moved, the robot holds it, or "
         "there are two",
-        "its corners there count little or not at all; keep one board of a kind, and keep it still")
+        "keep one board of each kind and do not move it; its corners in these images are hardly used")
     BOARD_STRETCHED = "board stretched", KindRow("lengths",
         "{board} is {percent:!.1f} ± {std_percent:~} % longer along one side than along the other: it was not printed "
         "at its size",
@@ -253,7 +256,7 @@ class FindingKind(StrEnum):
         "{board} is bent: its highest corner is {mm:.1f} mm above its lowest one; its shape is estimated",
         help="nothing for this calibration; mount the board on a flat plate for methods that take it as flat")
     BOARD_NOT_FOUND = "board not found", KindRow("lengths",
-        "no two images show {board}: features alone are used{proposed:, but they seem to show $}",
+        "no two images show {board}: features alone are used{proposed:, but the images seem to show $}",
         "check its kind and its numbers of squares or corners (jcr docs markers)",
         means="no two images show what `--board` names; `details.proposed` is what they seem to show")
     NETWORK_SCALE = "a network's metre contradicts the robot", KindRow("lengths",
@@ -261,10 +264,10 @@ class FindingKind(StrEnum):
         "robot's", "check the unit of the gripper poses", means="by far more than networks err")
     SCALE_ASSUMED = "scale assumed", KindRow("lengths",
         "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
-        help="other motions")
+        f"translate the gripper in all directions, and add samples {ROTATED}")
     SCALE_FROM_ROBOT = "scale from the robot alone", KindRow("lengths",
         "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no "
-        "image shows it, and ± does not include it", "the size of a board would show it")
+        "image shows it, and ± does not include it", "to test it, add a board of known size (--board)")
     BOARD_IN_VIEW = "board in view", KindRow("reconstruction", "a calibration board is in view",
         "try --board {board} with its SIDE in metres, or for tags of a ChArUco board "
         "charuco:COLUMNSxROWS:SIDE:MARKER:DICTIONARY (jcr docs markers)")
@@ -273,13 +276,13 @@ class FindingKind(StrEnum):
     NO_RECONSTRUCTION = "no reconstruction", KindRow("reconstruction", "{text}", "{remedy}",
         means="no back end found camera poses", help="in its words")
     NOT_SETTLED = "adjustment not settled", KindRow("reconstruction",
-        "the adjustment has not settled: its last round moved the result by {value:.2g} standard deviations",
-        "add images of textured, still things")
+        "the adjustment has not converged: its last round moved the result by {value:.2g} standard deviations",
+        "add images of textured objects at rest")
     OWN_REJECTED = "the capture's own camera is rejected", KindRow("cell",
-        "the {camera} camera's own calibration is rejected", help="correct that first")
+        "the {camera} camera's own calibration is rejected", "correct that calibration first")
     FEW_POINTS_SHARED = "few points shared with the scene", KindRow("cell",
-        "{images[0]} shares {value:.0f} points with the mapped scene, too few",
-        "it must see the same scene, unchanged, from a direction not too different")
+        "{images[0]} shares too few points with the mapped scene ({value:.0f})",
+        "take an image of the unchanged scene from a similar direction")
     BOARD_NEEDED = "no board before several cameras", KindRow("cell",
         "cameras that watch the gripper are located together by a board that it carries, and none was found",
         "put a board into the gripper and name it (--board)")
@@ -287,36 +290,37 @@ class FindingKind(StrEnum):
         "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
         "add images of the mapped scene")
     NO_COMMON_POSE = "no image taken with one that is used", KindRow("cell",
-        "none of its images was taken with an image that is used", help="more images")
+        "none of its images was taken with an image that is used",
+        "add images at gripper poses of used images")
     ONE_GRIPPER_POSE = "camera seen at one gripper pose", KindRow("cell",
         "its images show one gripper pose only: whether it is on the gripper, and at which frame each "
         "image was taken, cannot be tested",
-        "add an image at another gripper pose, or write mount base for a fixed camera")
+        "add an image at another gripper pose, or set mount: base for a fixed camera")
     SECOND_ON_ARM = "second camera on another arm", KindRow("cell",
-        "a second camera on arm {arm}: one each is supported")
+        "arm {arm} has a second camera, and one is supported", "calibrate that camera in a capture of its own")
     NOT_FIXED = "camera not fixed", KindRow("cell",
-        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {rotation_deg:.1f}° apart: it is not "
-        "fixed", "of a camera on the gripper write mount gripper, of several cameras give each its own name")
+        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {rotation_deg:.1f}° apart: the camera is "
+        "not fixed", "set mount: gripper for a camera on the gripper, or give each of several cameras its own name")
     NOT_RIGID = "camera not rigid on the gripper", KindRow("cell",
-        "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not "
-        "rigid, or the images are not of the frames that they stand for",
-        help="tighten the mounts; check the frames")
+        "its place relative to the {camera} camera differs by up to {mm:.0f} mm between images: a mount is not "
+        "rigid, or images belong to other frames",
+        "tighten the mounts, and check that each image belongs to its frame")
     IMAGE_MISSES = "image contradicts the camera's place", KindRow("cell",
-        "{images[0]} misses the place that fits its images together by {value:.0f} px (median): {mount:base=it is not "
-        "fixed|gripper=it is not rigid on the gripper}, the scene changed, or the intrinsics are wrong",
-        help="tighten the mount, or leave the image out")
+        "{images[0]} contradicts the common place of all images by {value:.0f} px (median): the camera is not {mount:"
+        "base=fixed|gripper=rigid on the gripper}, the scene changed, or the intrinsics are wrong",
+        "tighten the mount, or remove the image")
     PLACE_UNCERTAIN = "camera's place too uncertain", KindRow("cell",
-        "its place is known to ±{mm:.0f} mm and {rotation_deg:.1f}° only{focal_std_percent:, for its images do not show "
-        "its intrinsics (focal length ± $ %)}",
-        "{concerns:intrinsics=give them, or images with more of the scene, at other depths|images=let it see more of "
-        "the mapped scene, or add images to the wrist camera's capture}",
+        "its place is known only to ±{mm:.0f} mm and {rotation_deg:.1f}°{focal_std_percent:, because its images do not "
+        "determine its intrinsics (focal length ± $ %)}",
+        "{concerns:intrinsics=give the intrinsics, or add images with more of the scene at other depths|images=let it "
+        "see more of the mapped scene, or add images to the wrist camera's capture}",
         means="a further camera is known worse than to 20 mm and 3°",
         help="intrinsics, or more images")
     AT_ANOTHER_CAMERA = "camera stands where another was", KindRow("cell",
-        "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is "
-        "not fixed", help="check that the image is its own")
+        "it is at the place of the {camera} camera at {images[0]}, so its image may be one of that camera",
+        "check that the image is of the fixed camera")
     STATIC_IMAGES = "images show no motion", KindRow("images",
-        "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates "
+        "all images show the same view, while the gripper moves by {mm:.0f} mm and rotates "
         "by {rotation_deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
         explains=(*MISFIT, *TOO_FEW))
@@ -332,10 +336,10 @@ class FindingKind(StrEnum):
     HALF_UNUSED = "most images left out", KindRow("images",
         "only {value:.0f} of {of:.0f} images are used: {lost:.0f} were not registered, {wrong:.0f} contradict the "
         "others",
-        "look at the images that are left out, and at their poses; take more that overlap"),
+        "check the unused images and their poses; take more images that overlap"),
     FEW_USED = "few images used", KindRow("reconstruction",
-        "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of "
-        "all are not", "let the views overlap more and show more texture, or use a board (jcr docs markers)",
+        "only {value:.0f} of {of:.0f} images are used, whose motions alone are degenerate; those of "
+        "all images are not", "take views that overlap more and show more texture, or use a board (jcr docs markers)",
         explains=(*MISFIT, *TOO_FEW))
     PIECES = "reconstruction in pieces", KindRow("reconstruction",
         "the reconstruction is in pieces: {value:.0f} of {of:.0f} images, such as {images[0]}, agree with their gripper "
@@ -346,10 +350,10 @@ class FindingKind(StrEnum):
         "{images} have each other's gripper poses", "correct the pairing of images and poses", explains=MISFIT)
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image", KindRow("single",
         "the gripper pose of {images[0]} is {mm:.0f} mm and {rotation_deg:.1f}° from where its image shows the "
-        "gripper", "correct that pose, or drop the image")
+        "gripper", "correct that pose, or remove the image")
     NOT_REGISTERED = "image not registered", KindRow("single",
-        "{images} {images:is|are} not registered: {value:.0f} other images match, too little of each",
-        "take such a view again, nearer to a pose that registered, with textured things in view",
+        "{images} {images:is|are} not registered: {value:.0f} other images match, but overlap too little",
+        "take the view again, nearer to the pose of a registered image, with textured objects in view",
         means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction")
     # fmt: on
 

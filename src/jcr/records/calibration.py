@@ -188,13 +188,11 @@ class Budget:
     """Part due to findings: the shifts that they state, and differences from known lengths."""
 
     @property
-    def mostly_systematic(self) -> bool:
-        """Whether systematic robot errors are at least half of the translation's variance.
-
-        More images do not reduce these errors.
-        """
-        others = self.robot_random, self.intrinsics, self.images, self.faults
-        return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
+    def main_part(self) -> str | None:
+        """Name of the part that is at least half of the translation's variance; None if no part is."""
+        variances = {name: float(np.trace(part[:3, :3])) for name, part in vars(self).items()}
+        name = max(variances, key=variances.__getitem__)
+        return name if 2 * variances[name] >= sum(variances.values()) else None
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,8 @@ class Sample:
 
     def __repr__(self) -> str:
         """Return the number of points, and of unseen ones."""
-        return f"<Sample of {len(self._x)} points, {int((self._map.seen.at(self._x) == 0).sum())} unseen>"
+        count, unseen = len(self._x), int((self._map.seen.at(self._x) == 0).sum())
+        return f"<Sample of {count} point{'s' * (count != 1)}, {unseen} unseen>"
 
     @property
     def occupancy(self) -> Any:
