@@ -13,7 +13,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from benchmarks.page import folders_with_captures, of_rows, table
-from jcr.calibration.checks.effects import MIN_IMAGES
+from jcr.calibration.checks.effects import EXAMINED_FROM
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
@@ -31,7 +31,7 @@ def run(captures: Path, seed: int = 0) -> str:
     rows, shuffled, false = list[tuple[object, ...]](), 0, 0
     for folder in folders_with_captures(captures):
         capture = of_rows(read_capture(folder), range(len(read_capture(folder))))
-        if len(capture) < MIN_IMAGES or capture.mount == "base":
+        if len(capture) < EXAMINED_FROM or capture.mount == "base":
             continue
         try:
             made = reconstruct(capture, ReconstructOptions(backend="colmap"))

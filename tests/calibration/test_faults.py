@@ -184,7 +184,7 @@ def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_a
     case = case.found(Finding.of(FindingKind.FEW_USED, "warns", "reconstruction", value=12.0, of=20.0))
     kinds = {one.kind for one in check_effects(case).calibration.findings}
     assert kinds >= {FindingKind.FEW_USED, FindingKind.ZOOM} and FindingKind.NOT_SETTLED not in kinds
-    monkeypatch.setattr("jcr.estimation.solve.ROUNDS", 1)
+    monkeypatch.setattr("jcr.estimation.solve.MAX_ROUNDS", 1)
     kinds = {one.kind for one in check_effects(adjusted(start)).calibration.findings}
     assert kinds >= {FindingKind.ZOOM, FindingKind.NOT_SETTLED}
 

@@ -62,7 +62,7 @@ def test_the_order_of_images_does_not_matter_to_the_last_bit():
     [
         (10, 3),
         pytest.param(20, 6, marks=pytest.mark.slow),
-        # More poses than robust.MANY: images only join those that agree.
+        # More poses than robot_noise.MOST_FOR_SIZES: images only join those that agree.
         pytest.param(60, 15, marks=pytest.mark.slow),
     ],
 )

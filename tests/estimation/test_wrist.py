@@ -240,7 +240,7 @@ def test_derivatives_are_those_of_the_residuals():
 
 @pytest.mark.parametrize(("kind", "seed"), [("fixed", 0), ("wrists", 0), ("arms", 2)])
 def test_rounds_settle_from_a_scale_that_is_several_times_too_small(kind: Kind, seed: int):
-    """Steps that were cut short gave the combination of rounds a direction in which the scale shrank."""
+    """Steps that are cut short must not lead the rounds to a scale that shrinks."""
     found = answered(cell_problem(kind, "typical", 8, seed), seed)
     assert found.settled and found.iterations < 12
 

@@ -1,8 +1,9 @@
 """Joint bundle adjustment of a case's camera poses, points, intrinsics and gripper poses (estimation/).
 
-A case without adjusted images keeps the fit to camera poses; errors of the intrinsics are added to its covariance.
+A case without adjusted images keeps the fit to camera poses; errors of a network's camera are added to its covariance.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -11,54 +12,39 @@ from jcr.calibration.case import Case, Model
 from jcr.calibration.hand_eye import image_verdicts, leave_one_out, transforms
 from jcr.calibration.record import Calibration
 from jcr.calibration.verdict import with_uncertainty
-from jcr.camera import by_parameters, by_point, parameter_names
+from jcr.camera import parameter_names
 from jcr.estimation.image_equations import median_reprojection_px
 from jcr.estimation.intrinsics_prior import decentring
-from jcr.estimation.pose_equations import (
-    paper_residuals,
-    pose_by_pose,
-    predicted_gripper_poses,
-    reported_poses,
+from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
+from jcr.estimation.problem import (
+    SCALE,
+    UNKNOWNS,
+    LinearPrior,
+    Problem,
+    transferred,
+    wrist_arm,
+    wrist_problem,
 )
-from jcr.estimation.problem import Problem, pose_problem, transferred, wrist_arm, wrist_problem
 from jcr.estimation.projection import view_of
 from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.solve import START_NOISE, Solution, recon_frame, solve, uncertainty_of
-from jcr.geometry import (
-    apply,
-    inverse,
-    retract,
-    rotation_exp,
-    scale_translation,
-    skew,
-    step_between,
-    transform,
-)
+from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.records import COVARIANCE_ORDER, JointCovariance, PaperResiduals, Uncertainty
-
-FEWEST = 6
-"""Fewest observations of an image; with fewer, the camera's motion due to wrong intrinsics is not computed."""
 
 
 def adjusted(case: Case) -> Case:
     """Return the case after the bundle adjustment of its model, or with the fit to camera poses if that fails.
 
     A rejected fit is replaced too, because without given intrinsics its camera poses are poor. If the case is not
-    adjustable (`Case.is_adjustable`), the fit is kept. The uncertainty of given intrinsics, or of the principal point
-    for a network's camera poses, is then added to its covariance.
+    adjustable (`Case.is_adjustable`), the fit is kept. The uncertainty of the principal point is then added to the
+    covariance of a fit to a network's camera poses.
     """
     if case.is_adjustable:
-        try:
+        with suppress(np.linalg.LinAlgError):
             return solved(case, case.model)
-        except np.linalg.LinAlgError:
-            return case
-    fit, uncertainty = case.fit, None
-    made_with_intrinsics = case.reconstruction.evidence is None and not case.model.tracks.from_pointmaps
-    if case.reconstruction.predicted_focal is not None:
-        uncertainty = _with_network_camera(case)
-    elif case.capture.intrinsics is not None and made_with_intrinsics and case.calibration.converged:
-        uncertainty = _with_intrinsics_considered(case)
-    return case if uncertainty is None else replace(case, numbers=with_uncertainty(fit, uncertainty))
+    elif case.reconstruction.predicted_focal is not None:
+        return replace(case, numbers=with_uncertainty(case.fit, _with_network_camera(case)))
+    return case
 
 
 def solved(case: Case, model: Model) -> Case:
@@ -95,7 +81,14 @@ def solution_of(case: Case, model: Model) -> Solution:
         noise=case.options.robot_noise_m_rad,
         effects=model.effects,
     )
-    problem = replace(problem, priors=model.lengths)
+    priors = list(model.lengths)
+    for row, value, std in case.priors:
+        is_scale = bool(row[SCALE].item())
+        # The size of a board is a length, which is compared with the robot's positions before it becomes a prior.
+        if not is_scale or model.tracks.boards is None:
+            own = np.pad(row, (0, problem.unknowns - UNKNOWNS))
+            priors.append(LinearPrior(own, value - is_scale * float(np.log(fit.scale)), std))
+    problem = replace(problem, priors=tuple(priors))
     if case.solution is not None and _is_near(case.model, model, case.solution.problem, problem):
         state = transferred(case.solution.problem, case.solution.state, problem)
     noise = max(START_NOISE[0], metres), max(START_NOISE[1], radians)
@@ -129,46 +122,6 @@ def _with_network_camera(case: Case) -> Uncertainty:
     together[:7, :7] = uncertainty.covariance
     joint = JointCovariance(covariance=together, order=(*COVARIANCE_ORDER, *names))
     return replace(uncertainty, joint=joint)
-
-
-def _with_intrinsics_considered(case: Case) -> Uncertainty:
-    """Return the uncertainty of the fit to camera poses, with errors of the intrinsics in its covariance C: C + S Φ Sᵀ.
-
-    This is Schmidt's consider covariance (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
-    Φ is the covariance of the intrinsics, from their prior (`Model.camera`). S is the derivative of the fit by the
-    intrinsics. For S, each parameter changes by one standard deviation, and the camera poses change so that the pixels
-    of the tracks stay in place. Nothing is added if an image has fewer than FEWEST observations.
-    """
-    fit, tracks, camera = case.fit, case.model.observations, case.model.camera
-    base_from_gripper, recon_from_camera = (
-        case.base_from_gripper[case.used],
-        case.recon_from_camera[case.used],
-    )
-    moved = np.zeros((len(recon_from_camera), 6, len(camera.std)))
-    for row, pose in enumerate(recon_from_camera):
-        if len(seen := np.flatnonzero(tracks.image == row)) < FEWEST:
-            return fit.uncertainty
-        x_in_camera = apply(inverse(pose), tracks.points_in_recon[tracks.point[seen]].astype(float))
-        by_x = by_point(camera.intrinsics, x_in_camera)
-        by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
-        by_intrinsics = by_parameters(camera.intrinsics, x_in_camera) @ (camera.directions * camera.std)
-        steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
-        again = pose @ inverse(transform(rotation_exp(steps[:, 3:]), steps[:, :3]))
-        moved[row] = step_between(pose, again).T
-    start = fit.parent_from_camera, fit.scale, fit.body_from_recon.rigid
-    problem, state = pose_problem(
-        base_from_gripper,
-        recon_from_camera,
-        start,
-        error_covariance=case.systematic,
-        noise_floor=fit.robot_noise.given,
-        priors=case.priors,
-        carries=case.carries,
-    )
-    found = solve(problem, state, averaged=False)
-    by_camera = reported_poses(problem, found.state)[2]
-    shifts = -(found.at_mode.gain @ pose_by_pose(by_camera, moved.reshape(6 * len(moved), -1)))[:7]
-    return fit.uncertainty.with_error(shifts @ shifts.T, "intrinsics")
 
 
 def adjusted_numbers(case: Case) -> Calibration:

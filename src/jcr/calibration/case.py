@@ -30,15 +30,13 @@ from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, inverse
 from jcr.records import Capture, Reconstruction, Tracks
 
-MIN_OBSERVATIONS = 200
-"""Fewest observations with which images are adjusted; fewer do not improve the fit to camera poses."""
 MIN_IMAGES = 3
-"""Fewest images that are adjusted."""
+"""Fewest images that are adjusted, or that form a piece of a reconstruction: two agree by chance."""
 MOST_OBSERVATIONS = 60_000
 """Most observations that are adjusted, as many as 25 images of 640x480 have; more add little to the robot's errors."""
-SETTLED_ENOUGH = 0.5
-"""Largest last step, in standard deviations, for which an adjustment that did not converge is a note and no warning:
-effects of that size are not reported either (checks/effects.py)."""
+MATERIAL = 0.5
+"""Smallest change of the camera, in standard deviations on at least one axis, that is reported: of an effect, and as the
+last step of an adjustment that did not converge."""
 WELL_SEEN = 3
 """Number of images from which a point is preferred, where only some of the points are adjusted."""
 
@@ -61,6 +59,12 @@ class Model:
     """Most observations that are adjusted."""
     most_points: int | None = None
     """Most points that are adjusted, besides board corners; None: no limit."""
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the observations have more coordinates than the camera poses and points have unknowns."""
+        found = self.observations
+        return 2 * len(found.image) > 6 * int(self.used.sum()) + 3 * len(np.unique(found.point))
 
     @cached_property
     def observations(self) -> Tracks:
@@ -183,7 +187,7 @@ class Case:
         if found is None or found.settled or self.numbers.source == "poses":
             return self.findings
         # The iterations ended before the steps and the estimated sizes of the errors converged.
-        severity = "warns" if found.last_step > SETTLED_ENOUGH else "informs"
+        severity = "warns" if found.last_step > MATERIAL else "informs"
         size = {"value": found.last_step, "rounds": float(found.iterations)}
         return (Finding.of(FindingKind.NOT_SETTLED, severity, "reconstruction", **size), *self.findings)
 
@@ -198,18 +202,11 @@ class Case:
     def is_adjustable(self) -> bool:
         """Whether bundle adjustment can refine the fit to camera poses.
 
-        It needs MIN_OBSERVATIONS observations and MIN_IMAGES used images. Camera poses with a covariance (`evidence`)
-        are not adjusted. Cases with a known scale or height (`priors`) are not adjusted either, because the bundle
-        adjustment does not model these; it models the size of a board.
+        It needs MIN_IMAGES used images and more observations than unknowns (`Model.is_determined`). Camera poses with a
+        covariance (`evidence`) are not adjusted.
         """
-        is_board = self.model.tracks.boards is not None and self.reconstruction.metric_std is not None
-        modelled = 1 if is_board else 0
-        return (
-            self.reconstruction.evidence is None
-            and len(self.priors) <= modelled
-            and len(self.model.observations.image) >= MIN_OBSERVATIONS
-            and len(self.used) >= MIN_IMAGES
-        )
+        is_free = self.reconstruction.evidence is None
+        return is_free and len(self.used) >= MIN_IMAGES and self.model.is_determined
 
     @property
     def shows_camera(self) -> bool:

@@ -54,7 +54,7 @@ EQUAL = np.repeat([1e-3, np.radians(0.1)], 3)
 """Steps (m, rad) of equal weight in the choice of poses: at 0.5 m they move a point equally far."""
 MOST_OLD = 30
 """Largest number of images of the calibration that are used; their errors are then a small part of a new image's."""
-SETTLED, ITERATIONS = 1e-6, 10
+STEP_SETTLED, ITERATIONS = 1e-6, 10
 """Largest step (m, rad) at which the iterations end, and largest number of iterations."""
 
 Cause = Literal["camera", "scene", "robot", "image"]
@@ -413,7 +413,7 @@ def _iterated(
         best = int(np.argmax([one.log_weight + one.log_factor for one in at]))
         step, likeliest = at[best].estimate - motion, [likeliest[best]]
         motion = motion + step
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < STEP_SETTLED:
             break
     return motion, linearised(motion, sizes)
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.verdict import FEW, judged, poses_agree
+from jcr.calibration.verdict import MIN_FOR_OUTLIERS, judged, poses_agree
 from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import camera_error_covariance
@@ -190,7 +190,7 @@ def _fitted(
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, distinct = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
     moving = inverse(gripper) if carries == "scene" else gripper
-    agreeing = least_trimmed(moving[order], camera[order])[0] if len(order) >= FEW else None
+    agreeing = least_trimmed(moving[order], camera[order])[0] if len(order) >= MIN_FOR_OUTLIERS else None
 
     # A frame at the centre of the cameras with their extent as unit keeps the digits.
     centres, of_robot = camera[:, :3, 3], of_poses(systematic, order)

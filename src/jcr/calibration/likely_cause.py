@@ -15,7 +15,7 @@ from jcr.records import Intrinsics
 
 UNLIKELY = 1e-3
 """p-value below which the reported errors do not explain a difference."""
-MOST_FOCAL, MOST_CENTRE = 0.03, 0.03
+MOST_DIFFERENT = 0.03
 """Largest difference of intrinsics that is taken for a cause: of the focal length, and of the principal point in image
 widths. Makers' intrinsics differ by up to 1 to 2 % from measured ones; with 0.015 such causes are missed, with 0.045 the
 unknown intrinsics explain more differences that have other causes."""
@@ -83,7 +83,7 @@ def _other_intrinsics(
         basis[:2, 0], basis[2, 1], basis[3, 2] = at[:2], camera.width, camera.width
         along = by @ basis
         fitted = np.linalg.lstsq(along.T @ weight @ along, along.T @ weight @ step, rcond=None)[0]
-        if (np.abs(fitted) < [MOST_FOCAL, MOST_CENTRE, MOST_CENTRE]).all():
+        if (np.abs(fitted) < MOST_DIFFERENT).all():
             differences.append((basis @ fitted, 3))
     for difference, freedom in differences:
         left = step - by @ difference

@@ -15,7 +15,7 @@ from jcr.calibration.checks.capture import check_mount, check_pieces, check_rema
 from jcr.calibration.checks.convention import better_reading, check_convention, inverted_pair
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
 from jcr.calibration.checks.left_out import check_pairing
-from jcr.calibration.checks.lengths import check_lengths, check_predicted_focal
+from jcr.calibration.checks.lengths import LEAST_CONTRADICTION, check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot, check_smooth_errors
 from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
@@ -59,8 +59,6 @@ HEIGHT_STD = 1e-3
 CONTRADICTED = (4.0, 0.02)
 """Smallest difference of a known scale and the robot's scale that is a contradiction: in standard deviations, and as a
 fraction of the scale; both limits are exceeded."""
-METRIC_STD = 0.005
-"""Difference of the log scale of metric poses from 0 up to which the scale counts as 1 (size of a printed marker)."""
 
 
 @one_blas_thread
@@ -262,6 +260,6 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
 
 
 def is_one(hand_eye: Calibration) -> bool:
-    """Return whether the scale counts as 1: |log scale| is below METRIC_STD or below three standard deviations."""
+    """Return whether |log scale| is below LEAST_CONTRADICTION or below three standard deviations, and counts as 0."""
     off = abs(float(np.log(hand_eye.scale)))
-    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), LEAST_CONTRADICTION)

@@ -6,17 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.calibration.record import Calibration
+from jcr.estimation.pose_misfit import MAX_NOISE
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.records import RobotNoise, Uncertainty
 
-MAX_NOISE = (0.02, np.radians(3.0))
-"""Largest robot pose noise (m, rad) of an accepted calibration; servo arms have less, so larger noise means that poses
-and images do not belong together."""
-MAX_STD = (0.02, np.radians(3.0), 0.05)
+MAX_STD = (*MAX_NOISE, 0.05)
 """Largest standard deviations (m, rad, relative scale) of an accepted calibration."""
 MIN_SHARE_USED = 0.6
 """Smallest fraction of the registered images that an accepted calibration uses."""
-FEW = 5
+MIN_FOR_OUTLIERS = 5
 """Number of images below which outliers cannot be detected and the robot pose noise is poorly known."""
 WELL_ABOVE = 2e-3
 """Leave-one-out error (m) up to which no warning is given."""
@@ -122,7 +120,7 @@ def _rejecting(numbers: Calibration, observable: bool) -> Iterator[Finding]:
     if not observable:
         return
     # With few images, half of the uncertainty may be due to the poorly known robot pose noise.
-    unknown = {"noise_unknown": 1.0} if numbers.robot_noise.given is None and used < FEW else {}
+    unknown = {"noise_unknown": 1.0} if numbers.robot_noise.given is None and used < MIN_FOR_OUTLIERS else {}
     for part, value in _too_uncertain(numbers):
         yield Finding.of(FindingKind.UNCERTAIN, "rejects", "images", part=part, value=value, **unknown)
 
@@ -144,5 +142,5 @@ def _warning(numbers: Calibration) -> Iterator[Finding]:
         left_out_m, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
         if left_out_m > max(3 * typical, WELL_ABOVE):
             yield Finding.of(FindingKind.LEAVE_ONE_OUT, "warns", "images", value=left_out_m, residual=typical)
-    if len(numbers.inliers) < FEW:
+    if len(numbers.inliers) < MIN_FOR_OUTLIERS:
         yield Finding.of(FindingKind.FEW_IMAGES, "warns", "images", value=float(len(numbers.inliers)))

@@ -22,7 +22,7 @@ LEVELS = 14.0
 """Smallest difference (of 255) between different colours; noise and JPEG artefacts are smaller at reduced size."""
 REDUCED = 320
 """Width (px) at which images are compared."""
-LEAST_SHARE, LEAST = 0.3, 3
+LEAST_SHARE, LEAST_IMAGES = 0.3, 3
 """Smallest share and number of images that must agree on a background pixel."""
 GREY = 128
 """Grey level of the removed background."""
@@ -52,7 +52,7 @@ def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarra
     # For each pixel, the number of images that have the same colour as each image (n,h,w), and the most frequent colour.
     agreeing = np.stack([(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced])
     background = np.take_along_axis(reduced, agreeing.argmax(0)[None, ..., None], axis=0)[0]
-    known = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(images))
+    known = agreeing.max(0) >= max(LEAST_IMAGES, LEAST_SHARE * len(images))
     out = []
     for image, small_image in zip(images, reduced, strict=True):
         moves = (np.abs(small_image - background).max(-1) > LEVELS) | ~known

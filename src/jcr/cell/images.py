@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.case import MIN_OBSERVATIONS
 from jcr.cell.rigs import CameraViews, Rigs
 from jcr.estimation.boards import shapes_of
 from jcr.estimation.intrinsics_prior import camera_about
@@ -28,7 +27,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
     case, hand_eye = rigs.case, rigs.case.numbers
     tracks, prior = case.model.observations, None
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
-    if hand_eye.source == "poses" or tracks.from_pointmaps or len(tracks.image) < MIN_OBSERVATIONS:
+    if hand_eye.source == "poses" or tracks.from_pointmaps or not case.model.is_determined:
         prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
     rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
     image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.effects import MIN_IMAGES, effects_of_fit
+from jcr.calibration.case import MIN_IMAGES, Case
+from jcr.calibration.checks.capture import SAME
+from jcr.calibration.checks.effects import EXAMINED_FROM, effects_of_fit
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
@@ -36,12 +37,8 @@ MAP_STD = (4e-3, np.radians(0.25))
 """Standard deviations (m, rad) of a localised pose by errors of map and intrinsics, not in its covariance."""
 APART = float(chi2.isf(1e-6, 6))
 """Squared Mahalanobis distance above which two poses of a camera differ."""
-AT_A_FRAME = (0.01, np.radians(1.0))
-"""Distance (m, rad) to a pose of the wrist camera below which a camera stated as fixed is likely the wrist camera."""
 EXACT_SCALE = 1e-4
 """Assumed relative standard deviation of the scale between two cameras of one reconstruction."""
-LEAST_POSES = 3
-"""Smallest number of localised images of another arm's camera."""
 
 
 def localise(
@@ -169,7 +166,7 @@ class Rigs:
         apart = np.linalg.norm(step_between(self.known.recon_from_camera, place).reshape(-1, 2, 3), axis=-1)
         seen = replace(seen, rig=np.full(len(seen.used), len(self.poses)))
         self.poses.append(place)
-        if not len(near := np.flatnonzero((apart < AT_A_FRAME).all(1))):
+        if not len(near := np.flatnonzero((apart < SAME).all(1))):
             return seen
         image, own = self.case.capture.images[self.rows[near[0]]], self.case.capture.camera_name
         at_own = Finding.of(FindingKind.AT_ANOTHER_CAMERA, "warns", "mount", image, camera=own)
@@ -201,7 +198,7 @@ class Rigs:
             numbers, self.rig_of[row] = case.numbers, len(self.poses)
             self.poses.append(inverse(numbers.body_from_recon.rigid) @ moving @ numbers.parent_from_camera)
         rig, moved = np.array([self.rig_of[frame[k]] for k in seen.used]), ()
-        if len(seen.used) >= MIN_IMAGES and (rig < len(self.rows)).all():
+        if len(seen.used) >= EXAMINED_FROM and (rig < len(self.rows)).all():
             moved = fit_views(seen, self.known.recon_from_camera[rig], EXACT_SCALE)[1]
         if any(one.severity == "rejects" for one in moved):
             return seen.refused(*moved)
@@ -238,8 +235,8 @@ class Rigs:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
             return seen.refused(Finding.of(FindingKind.SECOND_ON_ARM, "rejects", arm=arm))
-        if len(seen.used) < LEAST_POSES:
-            counts = {"value": float(len(seen.used)), "needed": float(LEAST_POSES)}
+        if len(seen.used) < MIN_IMAGES:
+            counts = {"value": float(len(seen.used)), "needed": float(MIN_IMAGES)}
             return seen.refused(Finding.of(FindingKind.FEW_LOCALISED, "rejects", "images", **counts))
         gripper = seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self.case.numbers.covariance[6, 6])), 1e-4)

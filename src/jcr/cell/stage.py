@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr import __version__
-from jcr.calibration.case import Case, Model, camera_of
-from jcr.calibration.checks.effects import LARGE_MOTION, MATERIAL, as_adopted, effects, straight_shift
+from jcr.calibration.case import MATERIAL, Case, Model, camera_of
+from jcr.calibration.checks.effects import LARGE_MOTION, as_adopted, effects, straight_shift
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors

@@ -13,23 +13,22 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.camera import by_point, project, unproject, zoomed
+from jcr.estimation.pixel_noise import LOSS_SCALE
 from jcr.geometry import apply, inverse, retract, rotation_angle, rotation_exp, skew, step_between, transform
 from jcr.least_squares import minimise
 from jcr.records import Intrinsics
 
-FEWEST = {False: 6, True: 4}
+MIN_POINTS = {False: 6, True: 4}
 """Smallest number of points that agree with a pose, for general and for planar points."""
 FOCAL_FACTORS = np.geomspace(0.4, 2.5, 14)
 """Factors on the given focal length that are tried as initial values of a free focal length."""
-LOSS_SCALE = 2.0
-"""Scale of the Cauchy loss, in standard deviations."""
 MEDIAN = 2 * np.log(2.0)
 """Median of the squared length of a whitened residual of two components."""
 INEFFICIENCY = 1.09
 """Variance of the estimate with the Cauchy loss over that of least squares, for normal errors (Huber 1981)."""
 LEAST_STD_PX = 0.05
 """Lower bound of the estimated pixel noise."""
-ROUNDS, SETTLED = 10, 1e-2
+MAX_ROUNDS, POSE_SETTLED = 10, 1e-2
 """Largest number of rounds of noise estimate and least squares, and the step (in σ) that ends them."""
 BEHIND_PX = 1e4
 """Assumed residual (px) of a point behind the camera."""
@@ -77,7 +76,7 @@ def absolute_pose(
     """
     p = 7 if focal == "free" else 6
     spread = np.zeros((len(points), 3, 3)) if point_covariance is None else point_covariance
-    if len(points) < FEWEST[planar]:
+    if len(points) < MIN_POINTS[planar]:
         return None
     starts = list[_Start]()
     for factor in FOCAL_FACTORS if focal == "free" else (1.0,):
@@ -95,7 +94,7 @@ def absolute_pose(
         elif (agreed := ransac_pose(ideal_px, points, scaled.fx, gate_px)) is not None:
             starts.append((agreed[0], scaled, agreed[1]))
     most = max((int(inlier.sum()) for _, _, inlier in starts), default=0)
-    starts = [start for start in starts if start[2].sum() == most >= FEWEST[planar]]
+    starts = [start for start in starts if start[2].sum() == most >= MIN_POINTS[planar]]
     refined = (_refined(x_px, points, spread, start, gate_px, p, planar) for start in starts)
     best, *others = sorted(filter(None, refined), key=lambda one: one.rms_px) or (None,)
     for other in others:
@@ -145,14 +144,14 @@ def _refined(
     """
     loss, scale, inefficiency = ("linear", 1.0, 1.0) if planar else ("cauchy", LOSS_SCALE, INEFFICIENCY)
     (pose, camera, inlier), found = start, None
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         residual, jacobian = _reprojection(x_px, points, pose, camera, p)
         # The derivative by a point is minus the derivative by the camera's translation.
         added = jacobian[..., :3] @ spread @ np.swapaxes(jacobian[..., :3], 1, 2)
         std_px = _noise(residual[inlier], added[inlier], p)
         root = np.linalg.inv(np.linalg.cholesky(std_px**2 * np.eye(2) + added))
         agreed, inlier = inlier, std_px * np.linalg.norm(root @ residual[..., None], axis=(1, 2)) < gate_px
-        if inlier.sum() < FEWEST[planar]:
+        if inlier.sum() < MIN_POINTS[planar]:
             return None
         white, seen = root[inlier], (x_px[inlier], points[inlier])
 
@@ -180,7 +179,7 @@ def _refined(
             rms_px=float(np.sqrt((residual**2).sum(1).mean())),
         )
         moved_by = step_between(before, pose) / np.sqrt(found.covariance.diagonal()[:6])
-        if (inlier == agreed).all() and np.abs(moved_by).max() < SETTLED:
+        if (inlier == agreed).all() and np.abs(moved_by).max() < POSE_SETTLED:
             break
     return found
 

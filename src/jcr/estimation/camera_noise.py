@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from jcr.estimation.pose_equations import pose_by_pose, pose_equations, reported_poses
 from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, LinearPrior, Start, pose_problem
 from jcr.estimation.robot_noise import (
+    MOST_FOR_SIZES,
     OF_ARM,
     Equations,
     LogSizes,
@@ -26,8 +27,8 @@ from jcr.estimation.robot_noise import (
 )
 from jcr.geometry import Poses, by_similarity, nearest_to_lines
 
-FEWEST, MOST = 8, 50
-"""Smallest number of poses for a test of camera errors, and largest number used; more are sampled evenly."""
+MIN_TESTED_POSES = 8
+"""Smallest number of poses for a test of camera errors. More than MOST_FOR_SIZES are sampled evenly."""
 CLEAR = 3.0
 """Gain of the log evidence from which a component is included: odds of 20 to 1."""
 SETTLED = 0.03
@@ -76,15 +77,15 @@ def camera_error_covariance(
     """Return the estimated covariance (6n,6n) of the errors of n camera poses; None if the poses show none.
 
     Rows are the steps of each pose (geometry.retract; recon axes and unit, rad). Components are added one by one, each
-    with the largest log evidence of the `used` poses, while the gain exceeds CLEAR. Fewer than FEWEST used poses give
-    None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
+    with the largest log evidence of the `used` poses, while the gain exceeds CLEAR. Fewer than MIN_TESTED_POSES used
+    poses give None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
     `error_covariance`, `noise_floor` and `priors` are those of `pose_problem`. `adding_up`: errors that accumulate
     along the images are tested too.
     """
     rows = np.flatnonzero(used)
-    if len(rows) < FEWEST:
+    if len(rows) < MIN_TESTED_POSES:
         return None
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).round().astype(int))]
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_FOR_SIZES)).round().astype(int))]
     problem, state = pose_problem(
         base_from_gripper[rows],
         recon_from_camera[rows],

@@ -21,7 +21,7 @@ from jcr.geometry import (
 )
 
 Poses = Float[ndarray, "*#batch n 4 4"]
-ROUNDS = 5
+ROTATION_ROUNDS = 5
 """Largest number of alternating refinements of the two rotations; a likelihood fit follows."""
 ONE_AXIS = np.radians(6)
 """Largest rms deviation of the rotation axis (rad) for which rotations about one axis are solved for."""
@@ -30,7 +30,7 @@ RELATIVE_CUT = 1e-10
 
 
 def closed_form(
-    base_from_gripper: Poses, recon_from_camera: Poses, rounds: int = ROUNDS
+    base_from_gripper: Poses, recon_from_camera: Poses, rounds: int = ROTATION_ROUNDS
 ) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
     """Return `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4) in closed form.
 
@@ -153,7 +153,9 @@ def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
 
 
 def rotations(
-    gripper: Float[ndarray, "*#batch n 3 3"], camera: Float[ndarray, "*#batch n 3 3"], rounds: int = ROUNDS
+    gripper: Float[ndarray, "*#batch n 3 3"],
+    camera: Float[ndarray, "*#batch n 3 3"],
+    rounds: int = ROTATION_ROUNDS,
 ) -> tuple[Rotations, Rotations]:
     """Return R_X and R_Z, the rotations of gripper_from_camera and base_from_recon, from R_G · R_X = R_Z · R_C.
 

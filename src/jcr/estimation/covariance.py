@@ -16,7 +16,7 @@ from jcr.estimation.elimination import cholesky, lower, upper
 from jcr.estimation.pose_equations import Region
 from jcr.estimation.problem import SCALE, columns_of_arm
 from jcr.estimation.robot_noise import (
-    TOO_MANY,
+    MOST_FOR_SIZES,
     Each,
     Equations,
     Information,
@@ -34,8 +34,6 @@ PRIOR_POSES = 6.0
 
 Without this prior, the 95 % regions of eight poses of an arm with known joint angles contain 59 to 76 % of the errors.
 """
-HALVINGS = 40
-"""Number of bisections for the squared radius of that ellipsoid; relative error 1e-11."""
 
 Square = Float[ndarray, "p p"]
 Stack = Float[ndarray, "*k p p"]
@@ -51,10 +49,10 @@ def posterior(
 ) -> tuple[Float[ndarray, " p"], Square, Budget]:
     """Return the step of the p unknowns averaged over the error sizes, their covariance (p,p), and its budget by cause.
 
-    The averages are over the posterior of the robot's error sizes σ. `mode` are their most likely logarithms,
-    `at_mode` is the solution for them, `information` their information matrix. The sizes of one arm vary while those of
-    the others stay at the mode, and the changes by all arms add up; those of more than TOO_MANY poses stay at the mode.
-    The covariance includes `region.spread`, the effect of systematic errors at other poses. `expected`: for
+    The averages are over the posterior of the robot's error sizes σ. `mode` are their most likely logarithms, `at_mode`
+    is the solution for them, `information` their information matrix. The sizes of one arm vary while those of the
+    others stay at the mode, and the changes by all arms add up; those of more than MOST_FOR_SIZES poses stay at the
+    mode. The covariance includes `region.spread`, the effect of systematic errors at other poses. `expected`: for
     predictions, the residuals are 0 and their squares are replaced by expectations under the noise at the mode.
     """
 
@@ -85,7 +83,7 @@ def posterior(
     spread = elsewhere(at_mode, mode)
     step, covariance = at_mode.step, at_mode.covariance + spread
     factor, steps_beyond, beyond = np.ones(len(step)), np.zeros_like(step), np.zeros_like(covariance)
-    for arm in range(equations.arms if len(equations.residual) <= 6 * TOO_MANY else 0):
+    for arm in range(equations.arms if len(equations.residual) <= 6 * MOST_FOR_SIZES else 0):
         found = over_sizes(equations, mode, information, density, arm)
         groups = [(share, one.step, one.covariance + elsewhere(one, sizes)) for share, sizes, one in found]
         weight, steps, each = (np.concatenate(part) for part in zip(*groups, strict=True))
@@ -134,7 +132,7 @@ def _widening(
 
     normal = float(chi2.ppf(COVERED, len(covariance)))
     least, most = np.log([1e-3, 1e4 * normal])
-    for _ in range(HALVINGS):
+    for _ in range(40):  # bisections, to a relative error of 1e-11
         middle = (least + most) / 2
         if weight @ chi2.cdf(np.exp(middle) / unit, mean / unit) < COVERED:
             least = middle

@@ -23,7 +23,7 @@ from jcr.estimation.projection import ProjectedObservations, by_points, derivati
 from jcr.geometry import step_between
 from jcr.least_squares import damped_gauss_newton, one_blas_thread
 
-ROUNDS = 3
+NOISE_ROUNDS = 3
 """Number of adjustments in `adjust_images`; the pixel noise is estimated before each."""
 SIZES_SETTLED = 0.01
 """Relative change of the sizes of errors, of pixels and of robots, that ends the rounds."""
@@ -92,7 +92,7 @@ def adjust_images(problem: Problem, state: State) -> State:
     """
     unseen = information_along(similarities_of_rigs(state.world_from_rig), 1.0)
     world = RigInformation(state.world_from_rig, unseen, np.zeros(len(unseen)))
-    for _ in range(ROUNDS):
+    for _ in range(NOISE_ROUNDS):
         state = with_pixel_noise(problem, state, view_of(problem, state))
         state = adjusted_images(problem, state, world)
     return state

@@ -51,7 +51,7 @@ DECENTRING = 1e-3
 """Standard deviation of thin prism coefficients that were not calibrated, from tangential distortion of new cameras."""
 FIXED: Mapping[str, float] = {}
 """Prior of exact intrinsics: no parameter is free."""
-LEAST = 1e-12
+EXACT_BELOW = 1e-12
 """Prior standard deviation below which an intrinsic parameter is fixed."""
 
 
@@ -85,7 +85,7 @@ def camera_with_prior(
     """
     if isinstance(std, ndarray):
         std = np.where(np.isnan(std), camera_with_prior(intrinsics).parameter_std, std)
-        free = np.flatnonzero(std > LEAST)
+        free = np.flatnonzero(std > EXACT_BELOW)
         return CameraPrior(intrinsics=intrinsics, directions=np.eye(len(std))[:, free], std=std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {

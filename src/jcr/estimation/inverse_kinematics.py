@@ -33,7 +33,7 @@ STARTS = 12
 """Number of sets of initial joint angles for each pose."""
 STEPS = 30
 """Largest number of Gauss-Newton steps."""
-MOST = 30
+MOST_FOR_TOOL = 30
 """Largest number of poses from which an unknown tool is estimated."""
 FITS = (1e-4, 1e-3)
 """Largest misfit (m, rad) of a pose that counts as reached."""
@@ -183,9 +183,10 @@ def _with_tool(
 ) -> Transform:
     """Return flange_from_tool that lets the arm reach all poses best, estimated together with the joint angles.
 
-    `joints` (rad) and `flange_from_tool` are the initial estimates. At most MOST poses, evenly spaced, are used.
+    `joints` (rad) and `flange_from_tool` are the initial estimates. At most MOST_FOR_TOOL poses, evenly spaced, are
+    used.
     """
-    some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST)).astype(int))
+    some = np.unique(np.linspace(0, len(joints) - 1, min(len(joints), MOST_FOR_TOOL)).astype(int))
     poses, n, dof = base_from_tool[some], len(some), arm.dof
     weight = 1e-3 / np.repeat(TOOL_STD, 3)
 

@@ -15,8 +15,9 @@ SHARE = 0.8
 """Share of the images that the misfit counts; the worst fifth may have wrong poses."""
 MM_PER_DEG = 5.0
 """Millimetres of translation that count as much as one degree, as at a gripper 0.3 m from the scene."""
-LIMIT = (0.02, float(np.radians(3.0)))
-"""Largest rms error per axis (m, rad) of a working robot, as jcr.calibration.hand_eye accepts."""
+MAX_NOISE = (0.02, float(np.radians(3.0)))
+"""Largest error per axis (m, rad) of a working robot. Servo arms have less, so that larger errors mean that poses and
+images do not belong together."""
 
 
 class Misfit(NamedTuple):
@@ -38,7 +39,7 @@ class Misfit(NamedTuple):
     @property
     def is_of_robot(self) -> bool:
         """Whether the errors are not larger than those of a working robot."""
-        return self.metres <= LIMIT[0] and self.radians <= LIMIT[1]
+        return self.metres <= MAX_NOISE[0] and self.radians <= MAX_NOISE[1]
 
 
 NO_FIT = Misfit(np.inf, np.inf, np.eye(4), np.eye(4))

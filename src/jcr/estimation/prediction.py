@@ -22,7 +22,7 @@ from jcr.geometry import Poses, Transform, nearest_to_lines, transform
 from jcr.least_squares import one_blas_thread
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
 
-FEWEST = 3
+MIN_PREDICTED_IMAGES = 3
 """Smallest number of poses for a prediction."""
 COLUMNS = 9
 """Number of columns of the pixel grid whose rays give the points of the simulated scene."""

@@ -25,7 +25,7 @@ from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, u
 from jcr.estimation.pixel_noise import Layout, PixelNoise
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.findings import FindingKind
-from jcr.geometry import Poses, Transform, by_similarity, retract, scale_translation, step_between
+from jcr.geometry import Poses, Transform, by_similarity, retract, scale_translation
 from jcr.records import Intrinsics, Tracks
 
 TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
@@ -567,15 +567,12 @@ def stepped(
     state: State,
     arms: Float[ndarray, " u"] | None = None,
     columns: Float[ndarray, " d"] | None = None,
-    points: Float[ndarray, " q"] | None = None,
-    log_sizes: Float[ndarray, " c"] | None = None,
 ) -> State:
-    """Return the state after steps of the arms' unknowns, of cameras, boards and rigs, of points and of model errors.
+    """Return the state after steps of the arms' unknowns, and of cameras, boards and rigs.
 
     `arms` holds X (gripper_from_camera), log scale and Z (base_from_world) of the first arm, then X and Z of further
     arms; `columns` (d,) has the order of `Problem.columns`. Six numbers of a transform are translation, then rotation
-    (rad), as in geometry.retract. `points` has three numbers for each point. `log_sizes` are steps of log
-    `model_error_std`. None: no step.
+    (rad), as in geometry.retract. None: no step. Points and sizes of errors stay.
     """
     if columns is not None:
         of, mounts = problem.columns, state.rig_from_camera.copy()
@@ -588,10 +585,6 @@ def stepped(
             rig_from_camera=mounts,
             camera_steps=state.camera_steps + columns[: of.boards.stop],
         )
-    if points is not None:
-        state = replace(state, points_in_world=state.points_in_world + points.reshape(-1, 3))
-    if log_sizes is not None:
-        state = replace(state, model_error_std=state.model_error_std * np.exp(log_sizes))
     if arms is None:
         return state
     own = np.stack([arms[columns_of_arm(arm)] for arm in range(len(state.x))])
@@ -607,23 +600,6 @@ def full_step(problem: Problem, state: State, step: Float[ndarray, " p"]) -> Sta
     columns, arms = np.zeros(problem.columns.count), problem.arm_unknowns
     columns[problem.free] = step[arms:]
     return stepped(problem, state, step[:arms], columns if columns.any() else None)
-
-
-def step_to(problem: Problem, state: State, other: State) -> Float[ndarray, " n"]:
-    """Return the steps by which `stepped` turns `state` into `other`: arms, columns, points, then log sizes."""
-    own = np.concatenate([step_between(state.x, other.x), step_between(state.z, other.z)], axis=1)
-    arms = np.zeros(problem.arm_unknowns)
-    arms[SCALE] = np.log(other.scale / state.scale)
-    for arm, step in enumerate(own):
-        arms[columns_of_arm(arm)] = step
-    columns = np.zeros(problem.columns.count)
-    columns[: problem.columns.boards.stop] = other.camera_steps - state.camera_steps
-    for c, of_mount in enumerate(problem.columns.mounts):
-        if of_mount is not None:
-            columns[of_mount] = step_between(state.rig_from_camera[c], other.rig_from_camera[c])
-    columns[problem.columns.first_rig :] = step_between(state.world_from_rig, other.world_from_rig).ravel()
-    points = (other.points_in_world - state.points_in_world).ravel()
-    return np.concatenate([arms, columns, points, np.log(other.model_error_std / state.model_error_std)])
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:

@@ -99,11 +99,11 @@ LEVELS = tuple(1.5 * np.arange(-4, 5))
 """Grid of log sizes along each axis, in standard deviations from the mode; relative error of an average: 3e-4."""
 FARTHEST, LESS_FAR = 21.0, 10.0
 """Largest squared distance (σ²) of grid points from the mode; with 7, 95 % regions of three images hold 81 %."""
-MANY, TOO_MANY = 15, 50
+FINE_GRID_BELOW, MOST_FOR_SIZES = 15, 50
 """Number of poses from which the grid is smaller (LESS_FAR), and above which the mode of the sizes replaces it."""
 AT_ONCE = 4e6
 """Largest number of array elements for the grid points of the sizes that are solved together."""
-SETTLED = 1e-4
+MODE_SETTLED = 1e-4
 """Largest step of the log sizes at which the search of their mode ends."""
 LogSizes = Float[ndarray, "*k c"]
 """c logarithms: for each arm random errors σ_t (m) and σ_r (rad) and systematic error σ_s (rad); then the sizes of
@@ -351,19 +351,19 @@ def left_out(
 def most_likely(
     equations: Equations,
     start: LogSizes | None = None,
-    settled: float = SETTLED,
+    settled: float = MODE_SETTLED,
 ) -> tuple[LogSizes, Information]:
     """Return the logarithms of the c error sizes at the mode of their posterior, and expected information (c,c) there.
 
     Sizes are in the order of `LogSizes`. The search begins at `start` (None: mode of the prior) and ends with a step
-    below `settled`. If there are more than TOO_MANY poses, TOO_MANY of them are used, evenly spaced. Fisher scoring is
-    corrected by the curvature along the last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006, eq. 6.19),
-    because steps oscillate where the expected information is half of the curvature.
+    below `settled`. If there are more than MOST_FOR_SIZES poses, MOST_FOR_SIZES of them are used, evenly spaced. Fisher
+    scoring is corrected by the curvature along the last step (BFGS, Nocedal and Wright, "Numerical optimization", 2006,
+    eq. 6.19), because steps oscillate where the expected information is half of the curvature.
     """
-    if (poses := len(equations.residual) // 6) > TOO_MANY:
-        some = equations.of_poses(np.linspace(0, poses - 1, TOO_MANY).astype(int))
+    if (poses := len(equations.residual) // 6) > MOST_FOR_SIZES:
+        some = equations.of_poses(np.linspace(0, poses - 1, MOST_FOR_SIZES).astype(int))
         at, information = most_likely(some, start, settled)
-        return at, poses / TOO_MANY * information
+        return at, poses / MOST_FOR_SIZES * information
     middle, std = equations.prior[1:]
     at = middle[: len(std)] * std if start is None else start
     value, gradient, information = score(equations, at)
@@ -411,12 +411,12 @@ def over_sizes(
 
     All weights together sum to 1. `density` returns the log posterior of the sizes of a solution, up to a constant;
     `information` is that of `most_likely`. Grid axes are eigenvectors of the information. Each side of an axis has its
-    own step length, because the posterior is skewed: sizes have longer tails on one side. With more than TOO_MANY poses
-    the mode is the only grid point. The sizes of arms other than `arm` stay at the mode.
+    own step length, because the posterior is skewed: sizes have longer tails on one side. With more than MOST_FOR_SIZES
+    poses the mode is the only grid point. The sizes of arms other than `arm` stay at the mode.
     """
     poses = len(equations.residual) // 6
     sizes, log_volumes = mode[None], np.zeros(1)
-    if poses <= TOO_MANY:
+    if poses <= MOST_FOR_SIZES:
         sizes_of_arm = np.arange(OF_ARM * arm, OF_ARM * (arm + 1))
         own = np.r_[sizes_of_arm, np.arange(OF_ARM * equations.arms, len(mode))] if arm == 0 else sizes_of_arm
         values, vectors = np.linalg.eigh(information[np.ix_(own, own)])
@@ -426,7 +426,7 @@ def over_sizes(
         drop = np.maximum(2 * (top - np.array(others)), 1e-3)
         shorter, longer = np.clip(probe / np.sqrt(drop), 0.3, 3.0).reshape(2, -1)
         z = np.array(list(product(LEVELS, repeat=len(own))))
-        z = z[(z**2).sum(1) < (FARTHEST if poses < MANY else LESS_FAR)]
+        z = z[(z**2).sum(1) < (FARTHEST if poses < FINE_GRID_BELOW else LESS_FAR)]
         lengths = np.where(z < 0, shorter, longer)
         sizes, log_volumes = mode + (lengths * z) @ axes.T, np.log(lengths).sum(1)
     together = max(1, int(AT_ONCE / len(equations.residual) ** 2))

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
 from jcr.estimation.problem import LinearPrior, Problem, State, pose_problem
-from jcr.estimation.robot_noise import TOO_MANY, of_poses
+from jcr.estimation.robot_noise import MOST_FOR_SIZES, of_poses
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import ARM, Poses, Transform, inverse, rotation_angle
 
@@ -28,9 +28,6 @@ SHARE_RIGHT = 0.65
 """Share of the images that the least-trimmed-squares fit uses; the others may be wrong."""
 MAX_TRIPLES, MOST_TRIPLES = 1500, 30_000
 """Largest number of triples that are solved in closed form, and of triples to choose from (all, up to 57 images)."""
-MANY = 50
-"""Largest number of images of which some are removed from all in a second search; it needs a fit for each image that
-is wrong."""
 CONCENTRATED = 20
 """Number of best triples that start a trimmed fit; its cost is 0.1 % above the best known one, with 5 it is 2 %."""
 WRONG = 1e-5
@@ -70,7 +67,7 @@ def robust_fit(
 
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
     evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
-    they are more than MANY. Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`:
+    they are more than MOST_FOR_SIZES. Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`:
     error_covariance).
     """
     n, fits = len(base_from_gripper), dict[bytes, _Trial]()
@@ -97,14 +94,14 @@ def robust_fit(
     def fitted(used: Images) -> _Trial:
         """Return the fit with the used images, without averaging over error sizes.
 
-        With more than TOO_MANY images it starts from the solution with as many of them, evenly spaced, because a step
-        takes the cube of their number.
+        With more than MOST_FOR_SIZES images it starts from the solution with as many of them, evenly spaced, because a
+        step takes the cube of their number.
         """
         if used.tobytes() not in fits:
             x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
             start = {"x": x[None], "scale": scale, "z": z[None]}
-            if (rows := np.flatnonzero(used)).size > TOO_MANY:
-                some, begin = problem_of(rows[np.linspace(0, len(rows) - 1, TOO_MANY).astype(int)])
+            if (rows := np.flatnonzero(used)).size > MOST_FOR_SIZES:
+                some, begin = problem_of(rows[np.linspace(0, len(rows) - 1, MOST_FOR_SIZES).astype(int)])
                 near = solve(some, replace(begin, **start), averaged=False).most_likely
                 start = {name: getattr(near, name) for name in (*start, "robot_log_sizes")}
             fits[used.tobytes()] = _trial(
@@ -112,7 +109,7 @@ def robust_fit(
             )
         return fits[used.tobytes()]
 
-    best = fitted(np.ones(n, dtype=bool)) if n <= MANY else None
+    best = fitted(np.ones(n, dtype=bool)) if n <= MOST_FOR_SIZES else None
     if n >= 5:
         if agreeing is None:
             agreeing = least_trimmed(moving, recon_from_camera)[0]

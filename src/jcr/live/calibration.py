@@ -18,7 +18,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibration_of, checked_case
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
-from jcr.estimation.prediction import FEWEST
+from jcr.estimation.prediction import MIN_PREDICTED_IMAGES
 from jcr.files import locked
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
@@ -175,11 +175,15 @@ class LiveCalibration:
         rows = np.zeros(0, int) if made is None else made.image_index
         robot, case = robot_errors(capture, self._options), None
         findings = [self._blurred[name] for name in names if name in self._blurred]
-        for row in sorted(set(range(len(names))) - set(self._map.registered)) if len(names) >= FEWEST else ():
+        for row in (
+            sorted(set(range(len(names))) - set(self._map.registered))
+            if len(names) >= MIN_PREDICTED_IMAGES
+            else ()
+        ):
             matches = float(self._map.matched_with(row))
             kind = FindingKind.NOT_REGISTERED
             findings.append(Finding.of(kind, "warns", "images", names[row], value=matches))
-        if made is not None and len(rows) >= FEWEST:
+        if made is not None and len(rows) >= MIN_PREDICTED_IMAGES:
             most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
             some = replace(made, tracks=_longest(made.tracks, most))
             with suppress(RejectedError):

@@ -21,7 +21,7 @@ from jcr.capture.read import read_source
 from jcr.errors import RejectedError
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import (
-    FEWEST,
+    MIN_PREDICTED_IMAGES,
     Assumptions,
     PredictedCamera,
     assumed,
@@ -131,7 +131,7 @@ def check_capture(
         if look and verdict_of(views) != "rejected":
             shown = _compare(capture, robot, options, progress, thorough)
     counted = clear if shown.registered is None else shown.registered
-    rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
+    rows = counted if len(counted) >= MIN_PREDICTED_IMAGES else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
     seen = observability(gripper, assumptions and assumptions.gripper_from_camera)
     if hand_eye is not None and shown.registered is not None:
@@ -143,7 +143,7 @@ def check_capture(
     if isinstance(capture, PosePairs):
         # This is the calibration itself, which needs no prediction.
         expected = shown.hand_eye and shown.hand_eye.uncertainty
-    elif len(counted) >= FEWEST:
+    elif len(counted) >= MIN_PREDICTED_IMAGES:
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
         if assumptions is not None:

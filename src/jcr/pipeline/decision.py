@@ -20,7 +20,7 @@ from jcr.capture.readings import text_of, undecided
 from jcr.errors import InputError, RejectedError, first_few
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_misfit import (
-    LIMIT,
+    MAX_NOISE,
     MM_PER_DEG,
     NO_FIT,
     Misfit,
@@ -39,7 +39,7 @@ FEWEST = 5
 """Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
 SAME_ROW = 1e-3
 """Largest difference (m, and of the entries of a rotation) of two poses of an arm at rest."""
-NO_ROBOT = float(2 * np.sqrt(3) * LIMIT[1])
+NO_ROBOT = float(2 * np.sqrt(3) * MAX_NOISE[1])
 """Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
 have the largest error on three axes."""
 SHOWN = 10

@@ -20,10 +20,6 @@ from jcr.records import Capture
 
 SAME = (10e-3, float(np.radians(1.0)))
 """Largest difference (m, rad) of a reported from a predicted gripper pose for which both count as the same pose."""
-LEAST_OF_PIECE = 3
-"""Fewest images of a piece of a reconstruction apart from the largest one; two images agree by chance."""
-CONCENTRATED = 4
-"""Number of concentration steps of the least trimmed squares (Rousseeuw and Van Driessen 1999)."""
 MOST_IN_PIECES = 2 / 3
 """Smallest fraction of the images outside the largest piece that must belong to other pieces."""
 STILL = (20e-3, np.radians(5.0))
@@ -33,7 +29,7 @@ REPETITIVE = 0.9
 TWINS, MIN_TWINS, APART_PX, TWINS_AT = 3, 100, 8.0, 640
 """Similar features that make a feature repetitive, fewest features of an image, smallest distance of two distinct
 features (px), and long side of the shrunk image (px)."""
-MANY = 1 / 4
+BLURRED_CAUSE = 1 / 4
 """Fraction of blurred images above which blur counts as the cause of a rejection."""
 
 
@@ -58,10 +54,10 @@ def check_pieces(case: Case) -> Case:
     predict differ by at most SAME. Accepted calibrations are not tested.
     """
     gripper, camera = case.moving, case.recon_from_camera
-    if case.calibration.converged or not case.is_open or len(gripper) < LEAST_OF_PIECE + MIN_IMAGES:
+    if case.calibration.converged or not case.is_open or len(gripper) < MIN_IMAGES + MIN_IMAGES:
         return case
     agree, _ = least_trimmed(gripper, camera)
-    for _ in range(CONCENTRATED):
+    for _ in range(4):  # concentration steps (Rousseeuw and Van Driessen 1999)
         x, scale, z = initial_estimate(gripper[agree], camera[agree])
         off = np.linalg.norm(
             step_between(gripper, predicted_gripper_poses(x, scale, z, camera)) / np.repeat(SAME, 3), axis=1
@@ -74,8 +70,8 @@ def check_pieces(case: Case) -> Case:
     near = (off < SAME).all(-1)
     largest = near[int(near.sum(1).argmax())]
     others = np.flatnonzero(~largest)
-    in_pieces = near[np.ix_(others, others)].sum(1) >= LEAST_OF_PIECE
-    if largest.sum() < MIN_IMAGES or in_pieces.sum() < max(LEAST_OF_PIECE, MOST_IN_PIECES * len(others)):
+    in_pieces = near[np.ix_(others, others)].sum(1) >= MIN_IMAGES
+    if largest.sum() < MIN_IMAGES or in_pieces.sum() < max(MIN_IMAGES, MOST_IN_PIECES * len(others)):
         return case
     names = [case.names[row] for row in others[in_pieces]]
     counts = {"value": float(len(names)), "of": float(len(gripper))}
@@ -145,12 +141,12 @@ def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return the findings on a rejected calibration's images, of which some now have the severity "rejects".
 
-    These are repetitive texture, and blur of more than a fraction MANY of the images.
+    These are repetitive texture, and blur of more than a fraction BLURRED_CAUSE of the images.
     """
     return tuple(
         replace(one, severity="rejects")
         if one.kind is FindingKind.REPETITIVE
-        or (one.kind is FindingKind.BLURRED and len(one.images) > MANY * float(one.details["of"]))
+        or (one.kind is FindingKind.BLURRED and len(one.images) > BLURRED_CAUSE * float(one.details["of"]))
         else one
         for one in findings
     )

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import solution_of, solved
-from jcr.calibration.case import Case, with_prism
+from jcr.calibration.case import MATERIAL, Case, with_prism
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
 from jcr.calibration.verdict import poses_agree
@@ -43,9 +43,7 @@ from jcr.rounding import significant
 
 AT_ONCE = 3
 """Largest number of effects that are reported for one capture."""
-MATERIAL = 0.5
-"""Smallest shift of the camera, in standard deviations on at least one axis, for which an effect is reported."""
-MIN_IMAGES = 6
+EXAMINED_FROM = 6
 """Fewest images with which effects other than wrong intrinsics are tested."""
 MOST_POINTS = 800
 """Largest number of points in these tests; more points do not make them more sensitive."""
@@ -165,7 +163,7 @@ def examined_case(case: Case) -> Examined:
     """Return the solution of a case in the form that the tests of effects need (hypotheses.Examined).
 
     A case with more than MOST_POINTS points, or too many observations for MOST_BYTES of memory, is adjusted again with
-    a random subset of its points. This applies to cases with MIN_IMAGES or more used images.
+    a random subset of its points. This applies to cases with EXAMINED_FROM or more used images.
     """
     tracks, most, solution = (
         case.model.observations,
@@ -173,7 +171,7 @@ def examined_case(case: Case) -> Examined:
         case.solution,
     )
     is_many = len(np.unique(tracks.point)) > MOST_POINTS or len(tracks.image) > most
-    if len(case.used) >= MIN_IMAGES and is_many:
+    if len(case.used) >= EXAMINED_FROM and is_many:
         fewer = min(most, case.model.most)
         solution = solution_of(case, replace(case.model, most=fewer, most_points=MOST_POINTS))
     assert solution is not None
@@ -321,13 +319,13 @@ def _promising(model: Examined, passed: Collection[FindingKind], of_camera: bool
     """
     if of_camera and model.camera is not None:
         passed = {*passed, *(FOCUS if FOCUS & {*passed} else ())}
-        ranked = rank(model, [one for one in camera_effects(model, MIN_IMAGES) if one.kind not in passed])
+        ranked = rank(model, [one for one in camera_effects(model, EXAMINED_FROM) if one.kind not in passed])
         likely = [one for one, log_p in ranked if log_p <= _log_alpha(one.kind, model)]
         if not likely and not any(one.of_camera for one in model.effects):
             limit = _log_alpha(FindingKind.INTRINSICS, model)
             is_off = log_p_of_given(model) <= limit
             likely = [one for one, _ in ranked if one.kind is FindingKind.INTRINSICS and is_off]
-    elif not of_camera and model.arm is not None and len(model.poses[0]) >= MIN_IMAGES:
+    elif not of_camera and model.arm is not None and len(model.poses[0]) >= EXAMINED_FROM:
         likely = [
             one for one, _ in rank(model, [one for one in pose_effects(model) if one.kind not in passed])
         ]

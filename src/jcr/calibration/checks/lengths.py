@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.adjust import solved
-from jcr.calibration.case import Case
+from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.record import Calibration
 from jcr.calibration.verdict import with_uncertainty
 from jcr.capture.images import read_depth_images
@@ -32,7 +32,7 @@ ROBOT_STD = 0.002
 """Relative standard deviation of a common scale error of all robot positions, which the poses cannot show."""
 SIGMAS = 3.5
 """Difference of two lengths, in standard deviations, above which they contradict each other."""
-LEAST = 0.005
+LEAST_CONTRADICTION = 0.005
 """Relative difference of two lengths above which they contradict each other; SIGMAS must be exceeded too."""
 AGREES = 2.0
 """Difference of a length from the robot's, in standard deviations, below which the length is a prior of the scale. At a
@@ -49,8 +49,8 @@ exact one hardly changes the scale and is only compared."""
 
 OF_NETWORK = 1.64
 """Reported difference of a network's from the given focal length (standard deviations); one in ten correct ones."""
-MIN_IMAGES, MIN_FEATURES = 3, 60
-"""Fewest images and features with which depth images are compared with the robot."""
+MIN_FEATURES = 60
+"""Fewest features with which depth images are compared with the robot."""
 OUTSIDE = 0.3
 """Log ratio of a measured to a predicted depth, relative to the median one, above which the surfaces differ."""
 BINS = 8
@@ -63,8 +63,8 @@ def check_lengths(case: Case) -> Case:
     """Return the case with known lengths as priors of the scale, or with a finding that two lengths contradict.
 
     A known length comes from a board, a depth camera or a network; the robot's positions count as another length. Two
-    of them contradict if they differ by more than SIGMAS standard deviations and by more than LEAST. The comparison is
-    recorded in `Calibration.lengths`.
+    of them contradict if they differ by more than SIGMAS standard deviations and by more than LEAST_CONTRADICTION. The
+    comparison is recorded in `Calibration.lengths`.
     """
     depth, lengths = _measured(case)
     converged, percent = case.calibration.converged, case.calibration.uncertainty.scale_std_percent
@@ -75,7 +75,7 @@ def check_lengths(case: Case) -> Case:
         return abs(pair[0].off - pair[1].off) / float(np.hypot(pair[0].std, pair[1].std))
 
     pair = max(combinations([robot, *lengths], 2), key=sigmas, default=None) if converged else None
-    if pair is not None and (sigmas(pair) <= SIGMAS or abs(pair[0].off - pair[1].off) <= LEAST):
+    if pair is not None and (sigmas(pair) <= SIGMAS or abs(pair[0].off - pair[1].off) <= LEAST_CONTRADICTION):
         pair = None
     of_images = converged and case.numbers.source == "images"
     weighed = [
