@@ -11,7 +11,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import TYPICAL_RAD, camera_error_part
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.pose_equations import pose_equations, reported_poses
-from jcr.estimation.problem import pose_problem
+from jcr.estimation.problem import PoseModel, pose_problem
 from jcr.estimation.robot_noise import arm_errors, smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import solve
@@ -58,7 +58,9 @@ def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     for seed in range(8):
         problem = bent_problem(arm, "typical", 30, seed)
         alike = arm_errors(arm, problem.joints) if joints_known else None
-        fit = robust_fit(problem.base_from_gripper, problem.recon_from_camera, systematic=alike)
+        fit = robust_fit(
+            problem.base_from_gripper, problem.recon_from_camera, PoseModel(error_covariance=alike)
+        )
         assert fit.problem.used is not None and fit.problem.used.sum() >= 28
         errors = error(problem, fit.state.x[0], fit.state.scale)[:6]
         worst.append(np.abs(errors / np.sqrt(np.diag(fit.covariance)[:6])).max())
@@ -130,7 +132,9 @@ def examined(preset: PresetName, seed: int):
     robot = errors_of(gripper, problem.bent.arm, problem.joints)
     solved = solve_hand_eye(gripper, camera, systematic=robot.systematic)
     start = solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid
-    poses = pose_equations(*pose_problem(gripper, camera, start, error_covariance=robot.systematic), None)
+    poses = pose_equations(
+        *pose_problem(gripper, camera, start, PoseModel(error_covariance=robot.systematic)), None
+    )
     return problem.bent.errors[:6], joint_offsets(poses, robot.arm, robot.joints)
 
 
@@ -153,7 +157,7 @@ def test_problem_and_state_of_a_robust_fit_are_in_the_given_frame(camera_std: fl
     away = transform(np.eye(3), np.array([5.0, -3.0, 2.0]))
     given = away @ problem.recon_from_camera
     covariance = camera_std**2 * np.eye(60) if camera_std else None
-    fit = robust_fit(problem.base_from_gripper, given, camera_covariance=covariance)
+    fit = robust_fit(problem.base_from_gripper, given, PoseModel(camera_covariance=covariance))
     assert np.linalg.norm(reported_poses(fit.problem, fit.state)[0], axis=1).max() < 5e-3
     assert np.abs(fit.equations.residual).max() < 5e-3
     again = solve(fit.problem, fit.state)

@@ -23,8 +23,7 @@ from jcr.estimation.intrinsics_prior import (
     camera_with_prior,
 )
 from jcr.estimation.observability import observability
-from jcr.estimation.problem import Effect, LinearPrior
-from jcr.estimation.robot_noise import of_poses
+from jcr.estimation.problem import Effect, LinearPrior, PoseModel
 from jcr.estimation.solve import Solution
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, inverse
@@ -142,13 +141,16 @@ class Case:
         return [self.capture.images[row] for row in self.reconstruction.image_index]
 
     @property
-    def systematic(self) -> Float[ndarray, "s s"]:
-        """Covariance of the used gripper poses' systematic errors for an error size of 1 rad.
-
-        Each pose has six rows: translation (m), then rotation vector (rad), in base axes. The size is the standard
-        deviation of a joint's error or, for an unknown arm, of the gripper's rotation.
-        """
-        return of_poses(self.robot.systematic, self.used)
+    def pose_model(self) -> PoseModel:
+        """Assumptions of a fit to the poses of the registered images."""
+        evidence = self.reconstruction.evidence
+        return PoseModel(
+            camera_covariance=None if evidence is None else evidence.covariance,
+            error_covariance=self.robot.systematic,
+            noise_floor=self.options.robot_noise_m_rad,
+            priors=self.priors,
+            carries=self.carries,
+        )
 
     @cached_property
     def calibration(self) -> Calibration:

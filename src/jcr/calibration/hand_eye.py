@@ -1,6 +1,7 @@
 """Hand-eye calibration from poses: robust fit, uncertainty, observability, leave-one-out error and findings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,11 +19,11 @@ from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
-from jcr.estimation.problem import SCALE, LinearPrior, Start, offset_prior, scale_prior
+from jcr.estimation.problem import SCALE, PoseModel, Start, offset_prior, scale_prior
 from jcr.estimation.robot_noise import of_poses
 from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
-from jcr.geometry import Poses, Transform, inverse, require_rigid, step_between, transform
+from jcr.geometry import Poses, Transform, require_rigid, step_between, transform
 from jcr.least_squares import one_blas_thread
 from jcr.records import ImageVerdict, LeaveOneOut, Mount, PaperResiduals, Uncertainty
 
@@ -32,6 +33,8 @@ SCALE_STD = 0.002
 
 Offset = tuple[Float[ndarray, "3"], float, float]
 """Known coordinate of the camera: a unit axis in the gripper frame, the camera's position along it (m), and std (m)."""
+CameraErrors = Literal["none", "independent", "in sequence"]
+"""Errors of the camera poses that are tested."""
 
 
 @one_blas_thread
@@ -47,7 +50,7 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     joints: ArrayLike | None = None,
     robot: str | Arm | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
-    camera_errors: Literal["none", "independent", "in sequence"] = "in sequence",
+    camera_errors: CameraErrors = "in sequence",
     names: Sequence[str] | None = None,
 ) -> Calibration:
     """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
@@ -78,67 +81,62 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
-    if (n := len(gripper)) != len(camera):
-        raise InputError(
-            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
-        )
-    if n < 2:
-        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
-    priors = () if offset is None else (offset_prior(*offset),)
-    if scale is not None:
-        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
-            raise InputError(
-                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
-            )
-        priors = (*priors, scale_prior(scale, scale_std))
-    if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
-        raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
+    n = len(gripper)
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
         raise InputError(
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
-    if systematic is None:
-        systematic = _systematic(gripper, robot, joints)
-    if camera_covariance is not None:
-        camera_errors = "none"
-    named = [f"pose {k}" for k in range(n)] if names is None else names
-    fit = fit_poses(
-        gripper,
-        camera,
-        named,
-        robot_noise,
-        priors,
-        camera_covariance,
-        systematic,
-        camera_errors=camera_errors,
+    known = None if scale is None else (scale, scale_std)
+    _require_possible(n, len(camera), known, robot_noise)
+    offsets = () if offset is None else (offset_prior(*offset),)
+    model = PoseModel(
+        camera_covariance=camera_covariance,
+        error_covariance=_systematic(gripper, robot, joints) if systematic is None else systematic,
+        noise_floor=robot_noise,
+        priors=offsets if known is None else (*offsets, scale_prior(*known)),
     )
+    names = [f"pose {k}" for k in range(n)] if names is None else names
+    fit = fit_poses(gripper, camera, names, model, camera_errors)
     return judged(fit, fit.findings)
+
+
+def _require_possible(
+    grippers: int,
+    cameras: int,
+    scale: tuple[float, float] | None,
+    robot_noise: tuple[float, float] | None,
+) -> None:
+    """Raise InputError unless poses are as many, and known sizes are positive, as `solve_hand_eye` needs."""
+    if grippers != cameras:
+        raise InputError(
+            f"recon_from_camera: {cameras} camera poses for {grippers} gripper poses; give one per image"
+        )
+    if grippers < 2:
+        raise InputError(f"base_from_gripper: {grippers} pose; a hand-eye calibration needs three or more")
+    if scale is not None and not (np.isfinite(scale).all() and min(scale) > 0):
+        raise InputError(
+            f"scale: {scale[0]} ± {scale[1]} must be two positive numbers (m per unit, relative)"
+        )
+    if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
+        raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
 
 
 def fit_poses(
     gripper: Poses,
     camera: Poses,
     names: Sequence[str],
-    noise: tuple[float, float] | None,
-    priors: tuple[LinearPrior, ...],
-    camera_covariance: Float[ndarray, "r r"] | None,
-    systematic: Float[ndarray, "r r"],
-    *,
-    carries: Literal["camera", "scene"] = "camera",
-    camera_errors: Literal["none", "independent", "in sequence"] = "none",
+    model: PoseModel,
+    camera_errors: CameraErrors = "none",
 ) -> Calibration:
     """Return the numbers of a robust fit to n pairs of poses, and as findings what the motions do not determine.
 
-    Arguments are those of `solve_hand_eye`, by other names: base_from_gripper, recon_from_camera, names of the poses,
-    lower bound on the robot noise, priors of X and scale. With `carries` "scene" the camera is fixed and the gripper
-    carries what it sees.
+    `gripper` is base_from_gripper, `camera` recon_from_camera, `names` are those of the pairs. If `model` has no
+    covariance of the camera poses, errors of the kinds `camera_errors` are tested, and included if the poses show them.
     """
-    fit, (x, scale, z), distinct = _fitted(
-        gripper, camera, noise, priors, camera_covariance, systematic, carries, camera_errors
-    )
+    fit, (x, scale, z), distinct = _fitted(gripper, camera, model, camera_errors)
     assert fit.problem.used is not None
-    used, of_arm = fit.problem.used[distinct], inverse if carries == "scene" else np.asarray
-    predicted = of_arm(predicted_gripper_poses(x, scale, z, camera))
+    used = fit.problem.used[distinct]
+    predicted = model.moving(predicted_gripper_poses(x, scale, z, camera))
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     noise_m, noise_rad = fit.noise.together
     typical = f"(their noise: {1e3 * noise_m:.1f} mm, {np.degrees(noise_rad):.2f}°)"
@@ -146,9 +144,9 @@ def fit_poses(
         f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it {typical}"
         for m, rad in zip(metres, radians, strict=True)
     ]
-    left_out, moving = fit.leave_one_out[0][fit.problem.used], of_arm(gripper)
+    left_out, moving = fit.leave_one_out[0][fit.problem.used], model.moving(gripper)
     return Calibration(
-        **transforms("base" if carries == "scene" else "gripper", x, z),
+        **transforms("base" if model.carries == "scene" else "gripper", x, z),
         scale=scale,
         uncertainty=Uncertainty(covariance=fit.covariance[:7, :7], budget=fit.budget),
         backend="poses given",
@@ -156,7 +154,7 @@ def fit_poses(
         residuals=PaperResiduals(*paper_residuals(moving, camera, x, scale, used)),
         robot_noise=fit.noise,
         held_out=leave_one_out(left_out, "each image predicted by the others"),
-        findings=observability(moving[used], x, camera[used], priors).findings,
+        findings=observability(moving[used], x, camera[used], model.priors).findings,
     )
 
 
@@ -168,65 +166,53 @@ def transforms(mount: Mount, x: Transform, z: Transform) -> dict[str, Any]:
 
 
 def _fitted(
-    gripper: Poses,
-    camera: Poses,
-    noise: tuple[float, float] | None,
-    priors: tuple[LinearPrior, ...],
-    camera_covariance: Float[ndarray, "r r"] | None,
-    systematic: Float[ndarray, "r r"],
-    carries: Literal["camera", "scene"],
-    camera_errors: Literal["none", "independent", "in sequence"],
+    gripper: Poses, camera: Poses, model: PoseModel, camera_errors: CameraErrors
 ) -> tuple[Solution, Start, Int[ndarray, " n"]]:
     """Return the robust fit to the poses without duplicates, X, scale and Z, and for each pose its index in that fit.
 
-    `gripper` and `camera` are n pose pairs, `noise` a lower bound on the robot noise (m, rad). `camera_covariance`
-    (6n,6n; None: exact) is that of the camera poses, `systematic` that of the systematic robot errors. Errors of the
-    camera poses of the kinds `camera_errors` are tested, and included if the poses show them. The gripper moves what
-    `carries` says.
+    The arguments are those of `fit_poses`.
     """
     n = len(gripper)
     # Poses that occur twice count once, because an error that occurs twice would look like agreement. They are sorted,
     # so that the result does not depend on their order.
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, distinct = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-    moving = inverse(gripper) if carries == "scene" else gripper
+    moving = model.moving(gripper)
     agreeing = least_trimmed(moving[order], camera[order])[0] if len(order) >= MIN_FOR_OUTLIERS else None
 
     # A frame at the centre of the cameras with their extent as unit keeps the digits.
-    centres, of_robot = camera[:, :3, 3], of_poses(systematic, order)
+    centres, own = camera[:, :3, 3], model.of(order)
     middle = centres[order].mean(0)
     unit = float(np.sqrt(((centres[order] - middle) ** 2).sum(1).mean()))
     unit = unit if unit > 1e-12 * np.abs(centres).max() else 1.0
     central = transform(camera[order, :3, :3], (centres[order] - middle) / unit)
-    of_unit = tuple(
-        one._replace(value=one.value + np.log(unit) * float(one.row[SCALE].item())) for one in priors
-    )
+    log_unit, per_unit = np.log(unit), np.tile(np.repeat([1 / unit, 1.0], 3), len(order))
+    priors = (one._replace(value=one.value + log_unit * float(one.row[SCALE].item())) for one in own.priors)
+    own = replace(own, priors=tuple(priors))
 
     def fitted(covariance: Float[ndarray, "r r"] | None) -> tuple[Solution, Start]:
         """Return the robust fit to the distinct poses, and X, scale and Z in the given frame.
 
-        `covariance` (6n,6n) is that of the camera poses.
+        `covariance` is that of the distinct camera poses.
         """
         if covariance is not None:
-            per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), len(order))
-            covariance = per_unit[:, None] * of_poses(covariance, order) * per_unit
-        fit = robust_fit(gripper[order], central, noise, of_unit, covariance, of_robot, agreeing, carries)
+            covariance = per_unit[:, None] * covariance * per_unit
+        fit = robust_fit(gripper[order], central, replace(own, camera_covariance=covariance), agreeing)
         scale, z = fit.state.scale / unit, fit.state.z[0].copy()
         z[:3, 3] -= z[:3, :3] @ (scale * middle)
         return fit, (fit.state.x[0], scale, z)
 
-    fit, start = fitted(camera_covariance)
-    if camera_errors != "none":
+    fit, start = fitted(own.camera_covariance)
+    if camera_errors != "none" and own.camera_covariance is None:
         assert fit.problem.used is not None
         likely, used = start, fit.problem.used[distinct]
         if not poses_agree(fit.noise):
             # The fit may have explained camera errors by systematic robot errors; the closed form has neither.
             likely, used = initial_estimate(gripper, camera), np.ones(n, dtype=bool)
-        errors = camera_error_covariance(
-            gripper, camera, likely, used, systematic, noise, priors, camera_errors == "in sequence"
-        )
+        in_sequence = camera_errors == "in sequence"
+        errors = camera_error_covariance(gripper, camera, likely, used, model, in_sequence)
         if errors is not None:
-            fit, start = fitted(errors)
+            fit, start = fitted(of_poses(errors, order))
     return fit, start, distinct
 
 

@@ -29,7 +29,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.closed_form import ONE_AXIS
 from jcr.estimation.point_uncertainty import scene_points, scene_uncertainty, with_given_intrinsics
 from jcr.estimation.pose_misfit import pose_misfit
-from jcr.estimation.problem import LinearPrior, offset_prior, scale_prior
+from jcr.estimation.problem import PoseModel, offset_prior, scale_prior
 from jcr.findings import Finding, FindingKind, is_explained
 from jcr.geometry import Poses, rotation_angle
 from jcr.least_squares import one_blas_thread
@@ -133,31 +133,25 @@ def fitted_case(
     height = options.known_height
     priors = () if height is None else (offset_prior(*height_cue(gripper, height / 1e3)),)
 
-    def fitted(*more: LinearPrior) -> Calibration:
-        """Return the fit with the known height and further priors."""
-        return fit_poses(
-            gripper,
-            reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
-            [capture.images[row] for row in rows],
-            options.robot_noise_m_rad,
-            (*priors, *more),
-            None if evidence is None else evidence.covariance,
-            robot.systematic,
-            carries="scene" if capture.mount == "base" else "camera",
-        )
-
-    if metric_std is None:
-        fit = fitted()
-    else:
-        free = fitted()
+    assumed = PoseModel(
+        camera_covariance=None if evidence is None else evidence.covariance,
+        error_covariance=robot.systematic,
+        noise_floor=options.robot_noise_m_rad,
+        priors=priors,
+        carries="scene" if capture.mount == "base" else "camera",
+    )
+    camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
+    names = [capture.images[row] for row in rows]
+    fit = free = fit_poses(gripper, camera, names, assumed)
+    if metric_std is not None:
         off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
         sigmas, share = CONTRADICTED
         is_accepted = judged(free, free.findings).converged
         if is_accepted and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
             size = {"value": float(np.expm1(off)), "std": std}
             found.append(Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", **size))
-        fit = fitted(scale_prior(1.0, metric_std))
         priors = (scale_prior(1.0, metric_std), *priors)
+        fit = fit_poses(gripper, camera, names, replace(assumed, priors=priors))
     fit = replace(fit, intrinsics=reconstruction.intrinsics.with_std(None))
     model = Model(tracks=reconstruction.tracks, used=fit.inliers, camera=camera_of(capture, reconstruction))
     return Case(
@@ -206,8 +200,8 @@ def calibrate_pose_pairs(pairs: PosePairs, options: CalibrateOptions | None = No
     robot = errors_of(gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
     if hand_eye.observability.observable and not is_explained(hand_eye.findings):
-        known = {"error_covariance": robot.systematic, "noise_floor": options.robot_noise_m_rad}
-        found = effects_of_fit(gripper, pairs.recon_from_camera, hand_eye, pairs.images, **known)
+        model = PoseModel(error_covariance=robot.systematic, noise_floor=options.robot_noise_m_rad)
+        found = effects_of_fit(gripper, pairs.recon_from_camera, hand_eye, pairs.images, model)
 
         def calibration(findings: Sequence[Finding]) -> Calibration:
             shifted = with_uncertainty(hand_eye, with_shifts(hand_eye.uncertainty, findings))

@@ -23,7 +23,7 @@ from jcr.capture.images import read_image
 from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_effects
-from jcr.estimation.problem import Effect, ReportedPoses, State, scale_prior, wrist_arm
+from jcr.estimation.problem import Effect, PoseModel, ReportedPoses, State, scale_prior, wrist_arm
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
@@ -260,7 +260,10 @@ class Rigs:
         """
         case = self.case
         rows = np.array(list(self.rig_of))
-        poses, systematic = case.capture.base_from_gripper[rows], case.systematic
+        poses, systematic = (
+            case.capture.base_from_gripper[rows],
+            case.pose_model.of(case.used).error_covariance,
+        )
         if len(rows) > len(self.rows):
             systematic = robot_errors(case.capture, case.options).of(rows).systematic
         own = replace(wrist_arm(poses, systematic), carries=case.carries)
@@ -287,5 +290,5 @@ def fit_views(
     standard deviation of the scale between them. The second result is the findings on effects such as a slip.
     """
     found = solve_hand_eye(carrier, seen.places, scale=1.0, scale_std=scale_std, camera_errors="none")
-    known = (scale_prior(1.0, scale_std),)
-    return found, effects_of_fit(carrier, seen.places, found, seen.names, priors=known)
+    model = PoseModel(priors=(scale_prior(1.0, scale_std),))
+    return found, effects_of_fit(carrier, seen.places, found, seen.names, model)

@@ -34,7 +34,6 @@ from jcr.geometry import Transform, apply, inverse, step_between
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, Reconstruction
-from jcr.sfm.register import Registration
 
 CONTRADICTS = 5.0
 """Reprojection error of an image, as a multiple of the median of all images, from which it contradicts the pose."""
@@ -76,34 +75,12 @@ def place_cameras(
         ),
     )
     rigs = Rigs(case)
-    found = {camera.name: list[tuple[Registration | None, int]]() for camera in others}
-    todo = [(camera, image) for camera in others for image in camera.images if case.carries == "camera"]
-    for camera, image in steps(progress or silent, "other cameras", todo):
-        pixels = read_image((camera.folder or capture.folder) / image)
-        found[camera.name].append(localise(rigs.known, pixels, camera))
-    shown_by_board = case.carries == "scene"
-    shown, points = case.model.tracks.boards, hand_eye.scale * case.model.tracks.points_in_recon.astype(float)
-    for camera in steps(progress or silent, "other cameras", others if shown_by_board else ()):
-        at = replace(camera, folder=camera.folder or capture.folder)
-        found[camera.name] = [] if shown is None else located_by_board(shown, points, at)
     cameras, mounted = dict[str, CameraPlacement](), list[CameraViews]()
-    for camera in others:
-        if not found[camera.name]:
+    for camera, views in zip(others, _registered(rigs, others, progress or silent), strict=True):
+        if views is None:
             no_board = Finding.of(FindingKind.BOARD_NEEDED, "rejects", "images")
             cameras[camera.name] = CameraPlacement.of(camera, (no_board,))
             continue
-        shared = list(enumerate(found[camera.name]))
-        why = (
-            "shows {} corners of the board, too few"
-            if shown_by_board
-            else "shares {} points with the mapped scene"
-        )
-        views = CameraViews(
-            camera=camera,
-            points=[count for _, (_, count) in shared],
-            used={k: one for k, (one, _) in shared if one is not None},
-            reasons={k: why.format(n) for k, (one, n) in shared if one is None},
-        )
         moved = _moved(rigs, views) if views.is_fixed and len(views.used) > 1 else ()
         refused = any(one.severity == "rejects" for one in moved)
         views = views.refused(*moved) if refused else rigs.add(replace(views, findings=moved))
@@ -124,6 +101,33 @@ def place_cameras(
     poses = {one.camera.name: one.parent_from_camera for one in mounted}
     placed = [cameras[camera.name] for camera in others]
     return CamerasFile(cameras=placed, arms=arms, version=__version__), solution, poses
+
+
+def _registered(rigs: Rigs, others: Sequence[CellCamera], progress: Progress) -> list[CameraViews | None]:
+    """Return the registrations of each camera's images; None for one before a gripper whose board is unknown.
+
+    Images are registered by the features of the scene or, before the gripper, by the board that it carries.
+    """
+    case, every = rigs.case, list[CameraViews | None]()
+    tracks, is_fixed = case.model.tracks, case.carries == "scene"
+    points = case.numbers.scale * tracks.points_in_recon.astype(float)
+    why = "shows {} corners of the board, too few" if is_fixed else "shares {} points with the mapped scene"
+    for camera in steps(progress, "other cameras", others):
+        folder = camera.folder or case.capture.folder
+        if not is_fixed:
+            found = [localise(rigs.known, read_image(folder / image), camera) for image in camera.images]
+        elif tracks.boards is not None:
+            found = located_by_board(tracks.boards, points, replace(camera, folder=folder))
+        else:
+            found = []
+        views = CameraViews(
+            camera=camera,
+            points=[count for _, count in found],
+            used={k: one for k, (one, _) in enumerate(found) if one is not None},
+            reasons={k: why.format(n) for k, (one, n) in enumerate(found) if one is None},
+        )
+        every.append(views if found else None)
+    return every
 
 
 def _moved(rigs: Rigs, views: CameraViews) -> tuple[Finding, ...]:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from scipy.linalg import block_diag
 
 from jcr.estimation.pose_equations import pose_by_pose, pose_equations, reported_poses
-from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, LinearPrior, Start, pose_problem
+from jcr.estimation.problem import ROTATION, SCALE, TRANSLATION, PoseModel, Start, pose_problem
 from jcr.estimation.robot_noise import (
     MOST_FOR_SIZES,
     OF_ARM,
@@ -22,7 +22,6 @@ from jcr.estimation.robot_noise import (
     LogSizes,
     log_evidence,
     most_likely,
-    of_poses,
     solve_equations,
 )
 from jcr.geometry import Poses, by_similarity, nearest_to_lines
@@ -69,9 +68,7 @@ def camera_error_covariance(
     recon_from_camera: Poses,
     fit: Start,
     used: Bool[ndarray, " n"],
-    error_covariance: Float[ndarray, "s s"],
-    noise_floor: tuple[float, float] | None,
-    priors: tuple[LinearPrior, ...],
+    model: PoseModel,
     adding_up: bool,
 ) -> Float[ndarray, "s s"] | None:
     """Return the estimated covariance (6n,6n) of the errors of n camera poses; None if the poses show none.
@@ -79,8 +76,8 @@ def camera_error_covariance(
     Rows are the steps of each pose (geometry.retract; recon axes and unit, rad). Components are added one by one, each
     with the largest log evidence of the `used` poses, while the gain exceeds CLEAR. Fewer than MIN_TESTED_POSES used
     poses give None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
-    `error_covariance`, `noise_floor` and `priors` are those of `pose_problem`. `adding_up`: errors that accumulate
-    along the images are tested too.
+    `model` is that of the pairs with exact camera poses. `adding_up`: errors that accumulate along the images are
+    tested too.
     """
     rows = np.flatnonzero(used)
     if len(rows) < MIN_TESTED_POSES:
@@ -90,14 +87,12 @@ def camera_error_covariance(
         base_from_gripper[rows],
         recon_from_camera[rows],
         fit,
-        error_covariance=of_poses(error_covariance, rows),
-        noise_floor=noise_floor,
-        priors=priors,
+        model.of(rows),
     )
     by_camera = reported_poses(problem, state)[2]
     components: dict[tuple[Part, ...], list[Float[ndarray, "s s"]]] = {}
     # The scale of metric poses does not drift; where a camera hardly moves, its drift would explain any error.
-    is_metric = any(prior.row[SCALE].item() for prior in priors)
+    is_metric = any(prior.row[SCALE].item() for prior in model.priors)
     for parts in [*INDEPENDENT, *(ADDING_UP[: 1 if is_metric else 2] if adding_up else ())]:
         of_cameras = (camera_error_part(part, recon_from_camera, fit[1], rows) for part in parts)
         components[parts] = [pose_by_pose(by_camera, pose_by_pose(by_camera, one).T) for one in of_cameras]

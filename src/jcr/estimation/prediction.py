@@ -15,7 +15,7 @@ from jcr.estimation.image_equations import image_evidence
 from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
-from jcr.estimation.problem import pose_problem, scale_prior, wrist_arm, wrist_problem
+from jcr.estimation.problem import PoseModel, pose_problem, scale_prior, wrist_arm, wrist_problem
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import Solution, uncertainty_of, with_covariance
 from jcr.geometry import Poses, Transform, nearest_to_lines, transform
@@ -129,14 +129,8 @@ def predict(
     cameras = base_from_gripper @ x
     if camera is None:
         known = () if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),)
-        problem, state = pose_problem(
-            base_from_gripper,
-            cameras,
-            (x, 1.0, np.eye(4)),
-            error_covariance=systematic,
-            noise_floor=noise.given,
-            priors=known,
-        )
+        model = PoseModel(error_covariance=systematic, noise_floor=noise.given, priors=known)
+        problem, state = pose_problem(base_from_gripper, cameras, (x, 1.0, np.eye(4)), model)
         found = with_covariance(problem, state, None, expected=noise)
         uncertainty = Uncertainty(covariance=found.covariance[:7, :7])
     else:

@@ -23,9 +23,9 @@ from jcr.estimation.boards import BoardShapes, shapes_of
 from jcr.estimation.elimination import Sightings
 from jcr.estimation.intrinsics_prior import POLYNOMIALS, TYPICAL, CameraPrior, unmodelled
 from jcr.estimation.pixel_noise import Layout, PixelNoise
-from jcr.estimation.robot_noise import smooth_errors
+from jcr.estimation.robot_noise import of_poses, smooth_errors
 from jcr.findings import FindingKind
-from jcr.geometry import Poses, Transform, by_similarity, retract, scale_translation
+from jcr.geometry import Poses, Transform, by_similarity, inverse, retract, scale_translation
 from jcr.records import Intrinsics, Tracks
 
 TRANSLATION, ROTATION, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
@@ -632,31 +632,47 @@ def wrist_arm(
     return ReportedPoses(rigs=rigs, base_from_gripper=base_from_gripper, error_covariance=error_covariance)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseModel:
+    """Assumptions of a fit to n pairs of poses: errors of both, priors of X and scale, and what the gripper moves."""
+
+    camera_covariance: Float[ndarray, "r r"] | None = None
+    """Covariance (6n,6n) of steps of the camera poses (geometry.retract; recon axes and unit, rad); None: exact."""
+    error_covariance: Float[ndarray, "s s"] | None = None
+    """Covariance (6n,6n) of the systematic errors of the gripper poses, as in `wrist_arm`."""
+    noise_floor: tuple[float, float] | None = None
+    """Lower bound (m, rad) on the random errors of the gripper poses."""
+    priors: tuple[LinearPrior, ...] = ()
+    """Linear priors on X and scale."""
+    carries: Literal["camera", "scene"] = "camera"
+    """Object that the gripper moves (ReportedPoses)."""
+
+    def of(self, poses: Int[ndarray, " k"]) -> "PoseModel":
+        """Return the model of k of the pairs, given by their indices, in their order."""
+        both = (self.camera_covariance, self.error_covariance)
+        camera, gripper = (None if one is None else of_poses(one, poses) for one in both)
+        return replace(self, camera_covariance=camera, error_covariance=gripper)
+
+    def moving(self, base_from_gripper: Poses) -> Poses:
+        """Return the poses of what the gripper moves against the scene: base_from_gripper or its inverse."""
+        return inverse(base_from_gripper) if self.carries == "scene" else base_from_gripper
+
+
 def pose_problem(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    start: Start,
-    *,
-    camera_covariance: Float[ndarray, "r r"] | None = None,
-    error_covariance: Float[ndarray, "s s"] | None = None,
-    noise_floor: tuple[float, float] | None = None,
-    priors: tuple[LinearPrior, ...] = (),
-    carries: Literal["camera", "scene"] = "camera",
+    base_from_gripper: Poses, recon_from_camera: Poses, start: Start, model: PoseModel | None = None
 ) -> tuple[Problem, State]:
     """Return the problem of reported gripper poses and given camera poses, without images, and its initial state.
 
-    `start` is the initial (gripper_from_camera, scale, base_from_recon). `camera_covariance` (6n,6n) is of the steps of
-    the camera poses (geometry.retract; recon axes and unit, rad); None: exact. `error_covariance` is that of
-    `wrist_arm`, `noise_floor` a lower bound (m, rad) on the random errors. `priors` are linear priors on X and scale.
-    The gripper moves what `carries` says (ReportedPoses).
+    `start` is the initial (gripper_from_camera, scale, base_from_recon); `model` None: exact camera poses, no priors.
     """
-    x, scale, z = start
+    (x, scale, z), model = start, model or PoseModel()
+    arm = wrist_arm(base_from_gripper, model.error_covariance)
     problem = Problem(
-        arms=(replace(wrist_arm(base_from_gripper, error_covariance), carries=carries),),
+        arms=(replace(arm, carries=model.carries),),
         n_rigs=len(base_from_gripper),
-        known_rigs=(recon_from_camera, camera_covariance),
-        priors=priors,
-        robot_noise_floor=noise_floor,
+        known_rigs=(recon_from_camera, model.camera_covariance),
+        priors=model.priors,
+        robot_noise_floor=model.noise_floor,
     )
     return problem, State(x=x[None], scale=scale, z=z[None], world_from_rig=recon_from_camera)
 

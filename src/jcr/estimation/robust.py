@@ -9,15 +9,15 @@ therefore give a larger estimated noise rather than many rejected poses.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.estimation.problem import LinearPrior, Problem, State, pose_problem
-from jcr.estimation.robot_noise import MOST_FOR_SIZES, of_poses
+from jcr.estimation.problem import PoseModel, State, pose_problem
+from jcr.estimation.robot_noise import MOST_FOR_SIZES
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import ARM, Poses, Transform, inverse, rotation_angle
 
@@ -56,40 +56,18 @@ class _Trial(NamedTuple):
 def robust_fit(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-    noise: tuple[float, float] | None = None,
-    priors: tuple[LinearPrior, ...] = (),
-    camera_covariance: Float[ndarray, "r r"] | None = None,
-    systematic: Float[ndarray, "r r"] | None = None,
+    model: PoseModel | None = None,
     agreeing: Images | None = None,
-    carries: Literal["camera", "scene"] = "camera",
 ) -> Solution:
     """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
     evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
-    they are more than MOST_FOR_SIZES. Other arguments are those of pose_problem (`noise`: noise_floor; `systematic`:
-    error_covariance).
+    they are more than MOST_FOR_SIZES. `model` is that of `pose_problem`.
     """
-    n, fits = len(base_from_gripper), dict[bytes, _Trial]()
-    moving = inverse(base_from_gripper) if carries == "scene" else base_from_gripper
-
-    def problem_of(rows: Int[ndarray, " k"]) -> tuple[Problem, State]:
-        """Return the problem with k of the n images, and an initial state to complete."""
-        some = len(rows) < n
-        return pose_problem(
-            base_from_gripper[rows],
-            recon_from_camera[rows],
-            (np.eye(4), 1.0, np.eye(4)),
-            camera_covariance=of_poses(camera_covariance, rows)
-            if some and camera_covariance is not None
-            else camera_covariance,
-            error_covariance=of_poses(systematic, rows) if some and systematic is not None else systematic,
-            noise_floor=noise,
-            priors=priors,
-            carries=carries,
-        )
-
-    every, state = problem_of(np.arange(n))
+    n, fits, model = len(base_from_gripper), dict[bytes, _Trial](), model or PoseModel()
+    moving, unknown = model.moving(base_from_gripper), (np.eye(4), 1.0, np.eye(4))
+    every, state = pose_problem(base_from_gripper, recon_from_camera, unknown, model)
 
     def fitted(used: Images) -> _Trial:
         """Return the fit with the used images, without averaging over error sizes.
@@ -101,8 +79,10 @@ def robust_fit(
             x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
             start = {"x": x[None], "scale": scale, "z": z[None]}
             if (rows := np.flatnonzero(used)).size > MOST_FOR_SIZES:
-                some, begin = problem_of(rows[np.linspace(0, len(rows) - 1, MOST_FOR_SIZES).astype(int)])
-                near = solve(some, replace(begin, **start), averaged=False).most_likely
+                few = rows[np.linspace(0, len(rows) - 1, MOST_FOR_SIZES).astype(int)]
+                first = x, scale, z
+                some = pose_problem(base_from_gripper[few], recon_from_camera[few], first, model.of(few))
+                near = solve(*some, averaged=False).most_likely
                 start = {name: getattr(near, name) for name in (*start, "robot_log_sizes")}
             fits[used.tobytes()] = _trial(
                 solve(replace(every, used=used), replace(state, **start), averaged=False), used

@@ -34,7 +34,7 @@ from jcr.estimation.hypotheses import (
     squared_length,
     tested_intrinsics,
 )
-from jcr.estimation.problem import OF_IMAGE, SCALE, Effect, pose_problem
+from jcr.estimation.problem import OF_IMAGE, SCALE, Effect, PoseModel, pose_problem
 from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
@@ -142,18 +142,8 @@ def check_effects(case: Case) -> Case:
             if case.solution is not None:
                 longer = replace(longer, solution=solution_of(case, longer.model))
     if longer.solution is None or not case.shows_camera:
-        evidence = case.reconstruction.evidence
-        found = effects_of_fit(
-            case.base_from_gripper,
-            case.recon_from_camera,
-            case.calibration,
-            case.names,
-            camera_covariance=None if evidence is None else evidence.covariance,
-            error_covariance=case.robot.systematic,
-            noise_floor=case.options.robot_noise_m_rad,
-            priors=case.priors,
-            carries=case.carries,
-        )
+        poses = case.base_from_gripper, case.recon_from_camera
+        found = effects_of_fit(*poses, case.calibration, case.names, case.pose_model)
         return case.found(*found)
     confirmed, findings = effects(examined_case(longer))
     return case.found(*findings) if longer is not case else _adopted(case, confirmed, findings)
@@ -189,26 +179,25 @@ def effects_of_fit(
     recon_from_camera: Poses,
     hand_eye: Calibration,
     names: Sequence[str],
-    **known: Any,
+    model: PoseModel,
 ) -> tuple[Finding, ...]:
     """Return a finding of the most significant effect of the image order on a fit to camera poses, or an empty tuple.
 
     Both pose arrays (n,4,4) are those of the fit `hand_eye` in the order of the images, whose names are `names`.
-    `known` are further keyword arguments of `pose_problem`: `camera_covariance`, `error_covariance`, `noise_floor`,
-    `priors`, `carries`.
+    `model` is that of the fit.
     """
     start = hand_eye.parent_from_camera, hand_eye.scale, hand_eye.body_from_recon.rigid
-    problem, state = pose_problem(base_from_gripper, recon_from_camera, start, **known)
+    problem, state = pose_problem(base_from_gripper, recon_from_camera, start, model)
     used = with_rejected_runs(hand_eye.inliers)
     solution = solve(replace(problem, used=used), state, averaged=False)
-    model = Examined(
+    examined = Examined(
         solution=solution,
         names=[names[k] for k in np.flatnonzero(used).tolist()],
         std=np.sqrt(np.diag(hand_eye.covariance)[:6]) * hand_eye.converged,
         camera=None,
     )
     # Errors of camera poses resemble effects of the arm, which only a bundle adjustment separates from them.
-    return effects(model, kinds_of("strain"), at_most=1)[1]
+    return effects(examined, kinds_of("strain"), at_most=1)[1]
 
 
 def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:

@@ -9,7 +9,6 @@ from jcr.calibration.case import Case
 from jcr.estimation.hypotheses import joint_offsets
 from jcr.estimation.pose_equations import PoseEquations, pose_equations
 from jcr.estimation.problem import pose_problem
-from jcr.estimation.robot_noise import of_poses
 from jcr.findings import Finding, FindingKind, joined
 from jcr.geometry import ARM
 
@@ -28,16 +27,12 @@ def _equations(case: Case) -> PoseEquations:
     """Return the equations of the used gripper poses, with the errors of the camera poses: of images, or as stated."""
     if case.solution is not None and case.numbers.source == "images":
         return case.solution.poses
-    fit, used, evidence = case.fit, case.used, case.reconstruction.evidence
+    fit, used = case.fit, case.used
     problem, state = pose_problem(
         case.base_from_gripper[used],
         case.recon_from_camera[used],
         (fit.parent_from_camera, fit.scale, fit.body_from_recon.rigid),
-        camera_covariance=None if evidence is None else of_poses(evidence.covariance, used),
-        error_covariance=case.systematic,
-        noise_floor=fit.robot_noise.given,
-        priors=case.priors,
-        carries=case.carries,
+        case.pose_model.of(used),
     )
     return pose_equations(problem, state, None)
 
