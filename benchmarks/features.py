@@ -15,7 +15,7 @@ from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.features.matchers import FeatureName, Matcher
-from jcr.features.stage import MatchedPairs
+from jcr.features.pair_search import MatchedPairs
 from jcr.records import Intrinsics
 from jcr.sfm import colmap
 from jcr.sfm.colmap import reconstruct_colmap

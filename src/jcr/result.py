@@ -25,7 +25,7 @@ from jcr.calibration.record import (
 )
 from jcr.capture.added import read_added
 from jcr.capture.read import read_capture
-from jcr.cell.added import read_added_cameras
+from jcr.cell.added_cameras import read_added_cameras
 from jcr.cell.placement import CamerasFile, read_cameras
 from jcr.depth.depth_npz import FILE as DEPTH
 from jcr.depth.depth_npz import read_depth

@@ -14,7 +14,7 @@ from jcr.calibration.checks.effects import effects
 from jcr.calibration.record import Calibration
 from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
-from jcr.cell.added import added_camera
+from jcr.cell.added_cameras import added_camera
 from jcr.cell.placement import (
     CameraPlacement,
     CamerasFile,

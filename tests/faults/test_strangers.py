@@ -603,7 +603,7 @@ def test_an_image_of_a_model_is_one_of_the_capture(
 
 
 def test_an_added_image_that_sees_no_point_is_named(tmp_path: Path):
-    from jcr.depth.added import extend
+    from jcr.depth.added_images import extend
     from jcr.depth.densify import densify, sweep_planes
     from scenes import no_depth
 

@@ -14,7 +14,7 @@ from jcr.capture.added import read_added, with_added_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture
-from jcr.depth.added import extend
+from jcr.depth.added_images import extend
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, scale_translation, transform

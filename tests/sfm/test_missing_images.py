@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.camera import project, unproject
 from jcr.features.gate import Key
 from jcr.features.matchers import Matcher
-from jcr.features.stage import MatchedPairs, match_with_robot
+from jcr.features.pair_search import MatchedPairs, match_with_robot
 from jcr.geometry import (
     Transforms,
     apply,

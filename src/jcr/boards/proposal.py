@@ -17,7 +17,7 @@ LOOKED_AT = 3
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "APRILTAG_25h9")
 """Largest dictionary of OpenCV with tags of each kind, without DICT_."""
 SIZES = (50, 100, 250, 1000)
-FEWEST = 2
+FEWEST_SHOWN = 2
 """Least number of images that must show the same tags or chessboard; in a single image, texture may look like one."""
 SMALLEST = 4
 """Least number of inner corners on a side of a chessboard; windows and keyboards also show 3x3 corners."""
@@ -40,7 +40,7 @@ def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
 def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     """Return the value of --board for the tag dictionary with most tags in the images; None without tags.
 
-    A tag counts if two or more images (FEWEST) show it. The tags of a ChArUco board are proposed as single tags,
+    A tag counts if two or more images (FEWEST_SHOWN) show it. The tags of a ChArUco board are proposed as single tags,
     because the user has to count its squares.
     """
     family, numbers = "", list[int]()
@@ -50,7 +50,7 @@ def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
         seen = Counter(
             number for _, ids, _ in detected if ids is not None for number in np.unique(ids).tolist()
         )
-        again = [number for number, images in seen.items() if images >= FEWEST]
+        again = [number for number, images in seen.items() if images >= FEWEST_SHOWN]
         if len(again) > len(numbers):
             family, numbers = name, again
     if not numbers:
@@ -69,7 +69,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
         )
         if found and meta is not None and min(meta.shape[:2]) >= SMALLEST:
             sizes.append(tuple(sorted(meta.shape[:2], reverse=True)))
-    if len(sizes) < FEWEST:
+    if len(sizes) < FEWEST_SHOWN:
         return None
     # A board that is partly outside of the image is detected as smaller.
     across, down = max(set(sizes), key=lambda size: (sizes.count(size), size))

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from jcr.camera import rays, resized
 from jcr.compiled import random_state
-from jcr.depth.patch_match import UNKNOWN, random_planes, spread_planes
+from jcr.depth.patch_match import NOT_COMPARED, random_planes, spread_planes
 from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
@@ -20,7 +20,7 @@ COMPARED = 5
 _COARSE = ((0.2, 2), (0.1, 2), (0.05, 2), (0.025, 2))
 _FINE = ((0.01, 2), (0.003, 1))
 """Passes of PatchMatch at half (`_COARSE`) and full resolution: relative change of inverse depth, and trials."""
-LEAST = 0.25
+LEAST_INVERSE_DEPTH = 0.25
 """Least inverse depth of the search, as a share of the largest inverse depth of the search planes."""
 
 
@@ -110,16 +110,16 @@ def match_depth(
         others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i])
         reach = np.einsum("di,hwi->dhw", family, ray)
-        span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
+        span = max(float(reach.min()), LEAST_INVERSE_DEPTH * float(reach.max())), float(reach.max())
 
         views = half.views(i, others, recon_from_camera)
-        found = np.full((4, h, blocks_of(w)), UNKNOWN, np.float32)
+        found = np.full((4, h, blocks_of(w)), NOT_COMPARED, np.float32)
         random_planes(found, family, span, views[-1], random_state(i))
         for n, (size, tries) in enumerate(_COARSE):
             spread_planes(found, *views, (*span, size, tries), n, random_state(seed + n))
         found = full.enlarged(found)
         views = full.views(i, others, recon_from_camera)
-        found[3] = UNKNOWN
+        found[3] = NOT_COMPARED
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, *views, (*span, size, tries), n, random_state(seed + n))
         found = found[..., : pinhole.width]

@@ -17,7 +17,7 @@ AGREES = 3.0
 """Number of standard deviations up to which matched and measured depth count as the same surface."""
 SLOPE = 0.05
 """Relative difference of depth between neighbouring pixels above which a pixel mixes the two surfaces at an edge."""
-UNKNOWN = 0.02
+UNSTATED_STD = 0.02
 """Relative standard deviation of depths that come without one."""
 REACH_M = (0.1, 6.0)
 """Range of depths that are used, m: depth cameras for robot arms measure between these limits."""
@@ -61,7 +61,7 @@ def with_measured_depth(
         recon_from_camera = reconstruction.recon_from_camera[k]
         there = scale * apply(inverse(recon_from_camera), points[k].astype(float))[..., 2]
         matched = known[k] & (reason[k] != PRIOR)
-        of_matched = np.where(std[k] > 0, scale * std[k].astype(float), UNKNOWN * there)
+        of_matched = np.where(std[k] > 0, scale * std[k].astype(float), UNSTATED_STD * there)
         agrees = inside & matched & (np.abs(z - there) < AGREES * np.hypot(sigma, of_matched))
         against += int((inside & matched & ~agrees).sum())
         both += int((inside & matched).sum())

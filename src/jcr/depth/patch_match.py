@@ -25,7 +25,7 @@ MOST_SLANTED = 0.12
 """Least cosine between a plane's normal and the ray; a more slanted surface shows too few pixels to be matched."""
 BEST = 2
 """Number of neighbours, the best ones, whose correlations are averaged at a pixel; others are taken to be occluded."""
-UNKNOWN = -2.0
+NOT_COMPARED = -2.0
 """Score of a plane that has not been compared yet."""
 _PASSED = 3
 """Number of planes that a pixel tries from the row before: that of its own column, and the best one to either side."""

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from jcr.depth.consistency import colours_agree
 from jcr.depth.matched import Relative, grid
-from jcr.depth.regions import FEWEST, colour_regions, region_planes
+from jcr.depth.regions import FEWEST_MATCHED, colour_regions, region_planes
 from jcr.records import Intrinsics
 
 ON_PLANE = 0.006
@@ -145,7 +145,7 @@ def planar_prior(
     away = np.sqrt(np.maximum(uu[label] * u * u + 2 * uv[label] * u * v + vv[label] * v * v, 0))
     # Shadows and prints on the support plane are small regions without a plane of their own.
     size = np.bincount(label.ravel(), minlength=count)
-    lonely = _beside(label, found.is_support) & (found.inliers == 0) & (found.matched < FEWEST)
+    lonely = _beside(label, found.is_support) & (found.inliers == 0) & (found.matched < FEWEST_MATCHED)
     lonely &= size < PATCH * label.size
     found.plane[lonely] = plane
     predicted = np.einsum("hwi,hwi->hw", found.plane[label], ray).astype(np.float32)

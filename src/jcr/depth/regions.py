@@ -16,7 +16,7 @@ SMALLEST = 12
 """Least number of pixels of a region; smaller ones are merged with the neighbour of most similar colour."""
 TRIALS = 60
 """Number of RANSAC trials for the plane of a region."""
-FEWEST = 12
+FEWEST_MATCHED = 12
 """Least number of matched pixels from which a region's plane is fitted."""
 SAMPLED = 400
 """Approximate largest number of matched pixels of a region among which RANSAC counts inliers."""
@@ -115,9 +115,9 @@ def region_planes(
     """
     pixel = np.stack(np.nonzero(label >= 0)[::-1], -1).astype(float)
     fixed = np.bincount(label[matched], minlength=count)
-    chosen = np.flatnonzero(matched & (fixed >= FEWEST)[label])
+    chosen = np.flatnonzero(matched & (fixed >= FEWEST_MATCHED)[label])
     chosen = chosen[np.argsort(label.ravel()[chosen], kind="stable")]
-    regions = np.flatnonzero(fixed >= FEWEST)
+    regions = np.flatnonzero(fixed >= FEWEST_MATCHED)
     size, n = fixed[regions], len(regions)
     start, of = np.cumsum(size) - size, np.repeat(np.arange(n), size)
     ray, depth = rays.reshape(-1, 3)[chosen], inverse_depth.ravel()[chosen].astype(float)
@@ -144,7 +144,7 @@ def region_planes(
     number, mean, covariance = _moments(of[carries], pixel[chosen[carries]], n)
     whole = _moments(label.ravel(), pixel, count)[2][regions]
     narrow, wide = (np.linalg.eigvalsh(one)[:, 0] for one in (covariance, whole))
-    good = (on | fitted) & (number >= FEWEST) & (narrow >= SPREAD * wide)
+    good = (on | fitted) & (number >= FEWEST_MATCHED) & (narrow >= SPREAD * wide)
     kept = regions[good]
     found.plane[kept], found.is_support[kept], found.inliers[kept] = best[good], on[good], number[good]
     found.std[kept] = np.sqrt(np.bincount(of[carries], off[carries] ** 2, n)[good] / number[good])

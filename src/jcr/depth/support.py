@@ -6,7 +6,7 @@ from numpy import ndarray
 
 PLANES, SAMPLE = 400, 20_000
 """Number of planes through three random points that are tried, and number of points on which each is tested."""
-LEAST_SHARE, FEWEST = 0.1, 10
+LEAST_SHARE, FEWEST_ON_PLANE = 0.1, 10
 """Least share and least number of the points tested that must lie on the plane."""
 LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
 """Smallest cosine between a level plane's normal and the z axis, and weight of the points of level planes."""
@@ -38,7 +38,7 @@ def support_plane(
         count[k] = np.count_nonzero(np.abs(some @ normal[k] - offset[k]) < 0.005 * far)
     level = z_is_up & (np.abs(normal[:, 2]) > LEAST_LEVEL)
     best = int((count * np.where(level, LEVEL_WEIGHT, 1)).argmax())
-    if count[best] < max(LEAST_SHARE * len(some), FEWEST):
+    if count[best] < max(LEAST_SHARE * len(some), FEWEST_ON_PLANE):
         return None
     # By these weights, a sheet of board or a tray that lies on the table does not lift the plane.
     up, middle = normal[best] * side[0, best], a[best]

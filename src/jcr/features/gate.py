@@ -37,7 +37,7 @@ LEAST_PAIRS = 4
 MAX_HYPOTHESES = 3000
 LEAST_INFORMATION = 6.25e-3
 """Least information of the pairs on R_X along any axis, in units of one residual; with less, R_X is not determined."""
-ROUNDS = 20
+MOST_ROTATION_ROUNDS = 20
 """Largest number of least-squares estimates of R_X, each with new weights (Cauchy) of the pairs that agree."""
 
 
@@ -192,7 +192,7 @@ def rotation_of_x(
     )
     x = hypotheses[int(score.argmax())]
     information, agreeing = np.zeros((3, 3)), np.zeros(len(gripper), dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROTATION_ROUNDS):
         gap = _gap(x, gripper, camera)
         agreeing = gap < tolerance
         if agreeing.sum() < 3:

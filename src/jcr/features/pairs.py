@@ -14,7 +14,7 @@ from jcr.records import Intrinsics
 
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
 """Numbers of near viewpoints that each image is paired with: in the first search, and where this does not find R_X."""
-FEW = 16
+ALL_PAIRS_UP_TO = 16
 """Largest number of images whose pairs are all matched at once. This is cheap, and a pair that happens to match may
 register a camera far from all others (doosan_bench: 12 mm from its gripper with near pairs alone, 7 mm with all)."""
 PARTNERS = 8
@@ -30,8 +30,10 @@ PRIOR_STD_M = 0.2
 ROBOT_STD_M = 2e-3
 LEAST_DIRECTION_STD = 0.01
 """Least standard deviation, rad, of a two-view translation's direction, which plane scenes determine weakly."""
-ROUNDS = 15
+TRANSLATION_ROUNDS = 15
+"""Number of weighted least-squares estimates of t_X, each with new weights (Cauchy)."""
 POINTS_OF_PAIR = 60
+"""Approximate number of matches of a pair that are used with the pairs' poses."""
 
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
@@ -122,7 +124,7 @@ def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[n
     loose = np.sqrt([max(np.trace(r.covariance[3:, 3:]) / 2, LEAST_DIRECTION_STD**2) for r in best])
     a, b = cross @ turn, (cross @ moved[..., None])[..., 0]
     t = np.zeros(3)
-    for _ in range(ROUNDS):
+    for _ in range(TRANSLATION_ROUNDS):
         std = np.hypot(ROBOT_STD_M, loose * np.linalg.norm(turn @ t + moved, axis=1))
         residual = np.linalg.norm(a @ t + b, axis=1) / std
         weight = 1 / (1 + (residual / 3) ** 2) / std**2

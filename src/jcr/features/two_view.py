@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.geometry import rotation_exp, skew
 from jcr.least_squares import minimise
 
-ROUNDS, ENOUGH = 2, 1e-4
+NOISE_ROUNDS, ENOUGH = 2, 1e-4
 """Number of estimates of the noise, and relative change of the cost that ends the optimisation after each."""
 LEAST_SIGMA_PX = 0.3
 """Least standard deviation of a match, px; no detector is better over a whole image."""
@@ -144,7 +144,7 @@ def _least_squares_motion(
     if len(ray_i) < 8:
         return None
     at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)
-    for _ in range(ROUNDS):
+    for _ in range(NOISE_ROUNDS):
         residual, _ = _sampson_px(*at, ray_i, ray_j, focal_px)
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
         scaled = focal_px / (2 * sigma)

@@ -32,7 +32,7 @@ IMAGES_AT_FULL = 10
 """Largest number of images that each get all points; more images see each point more often and get fewer."""
 STEPS, ENOUGH = 8, 3e-4
 """Largest number of damped steps in a round, and the relative change of the cost below which the round ends."""
-SETTLED = 0.995
+SETTLED_COST_RATIO = 0.995
 """Ratio of the costs of successive rounds above which the rounds end."""
 
 
@@ -125,7 +125,7 @@ def align_photometrically(
     before, points = np.inf, None
     for _ in range(stage.rounds):
         points, cost = search_depths(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
-        if cost > SETTLED * before:
+        if cost > SETTLED_COST_RATIO * before:
             break
         before = cost
         (cameras, points), _, _ = damped_gauss_newton(

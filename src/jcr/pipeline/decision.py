@@ -35,7 +35,7 @@ from jcr.rounding import significant
 
 LEAST_MISFIT = 0.3
 """Misfit (mm) below which two readings are not told apart: 0.1 mm and 0.04°, the best of structure from motion."""
-FEWEST = 5
+FEWEST_TO_DECIDE = 5
 """Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
 SAME_ROW = 1e-3
 """Largest difference (m, and of the entries of a rotation) of two poses of an arm at rest."""
@@ -137,10 +137,10 @@ def _taken(
             f"turn: the images fit them all ({sizes}); or add images, rotated by 20° or more about other axes"
         )
     known = int(np.isfinite(best.poses[image_index]).all((1, 2)).sum())
-    if known < FEWEST:
+    if known < FEWEST_TO_DECIDE:
         raise InputError(
-            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {known} images are too few to decide, {FEWEST} are "
-            "needed"
+            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {known} images are too few to decide, "
+            f"{FEWEST_TO_DECIDE} are needed"
         )
     observed = observability(best.poses[np.isfinite(best.poses).all((1, 2))], best.misfit.x)
     if not observed.observable and capture.candidates[1:]:

@@ -320,7 +320,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     no points for a map.
     """
     # These imports take seconds, which a calibration without a map does not need.
-    from jcr.depth.added import extend
+    from jcr.depth.added_images import extend
     from jcr.depth.measured import with_measured_depth
     from jcr.paper.fields import published_scene
     from jcr.scene.build import build_scene

@@ -24,7 +24,7 @@ COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 CLICK_PX = 1.0
 """Standard deviation of a selected pixel, and of the nearest pixel of a pointmap, along each axis (px of the image). At
 0.5 m and 600 px focal length it moves a point by 0.8 mm; half or twice of it matters only beside robots below 1 mm."""
-LEAST = 3
+LEAST_TOUCHES = 3
 """Smallest number of points with which a wrong calibration can be distinguished from one bad touch."""
 
 
@@ -186,6 +186,8 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
             raise InputError(f"{path}: line {line}: positions are finite and in metres")
         images.append(str(cell_of["image"] or ""))
         numbers.append(own)
-    if len(images) < LEAST:
-        raise InputError(f"{path}: {len(images)} points; touch {LEAST} or more, spread over the scene")
+    if len(images) < LEAST_TOUCHES:
+        raise InputError(
+            f"{path}: {len(images)} points; touch {LEAST_TOUCHES} or more, spread over the scene"
+        )
     return images, numbers

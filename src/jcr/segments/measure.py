@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
-from jcr.segments.tabletop import FEWEST, Support, fit_support
+from jcr.segments.tabletop import FEWEST_POINTS, Support, fit_support
 
 SHARPEST = 0.0005
 """Smallest width (m) over which heights are smoothed; twice the roughness of the plane if that is larger."""
@@ -79,7 +79,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     sizes = []
     for label in np.unique(cloud.label):
         rows = cloud.label == label
-        if label in (0, plane_label) or rows.sum() < FEWEST:
+        if label in (0, plane_label) or rows.sum() < FEWEST_POINTS:
             continue
         x, image = x_in_support[rows], cloud.image[rows]
         top, spread, rotation_rad, center, sides, within = _shape(x, support.roughness)
@@ -87,7 +87,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
             continue
         parts = []
         for k in np.unique(image):
-            if (image != k).sum() >= FEWEST:
+            if (image != k).sum() >= FEWEST_POINTS:
                 part = _shape(x[image != k], support.roughness, rotation_rad)
                 parts.append([*part[4], part[0] - plane_without[k]])
         size, jackknife = np.array([*sides, top]), np.zeros(3)

@@ -31,7 +31,7 @@ class Support:
     """Mask of the n points of the cloud that lie on the plane."""
 
 
-FEWEST, LEAST_SHARE = 30, 1e-3
+FEWEST_POINTS, LEAST_SHARE = 30, 1e-3
 """Smallest number of points of an object, and smallest share of all points."""
 NOISE_REACH = 4.0
 """Largest height of a point on the plane, in standard deviations of the plane's noise."""
@@ -115,7 +115,7 @@ def label_tabletop(
         beneath = np.asarray(ndimage.binary_dilation(parts > 0, np.ones((3, 3))), bool)
         bare = support.on_plane & ~beneath[place]
         reaching = np.bincount(part, height > CLEARLY * founding, minlength=part.max() + 1)
-        part[reaching[part] < FEWEST] = 0
+        part[reaching[part] < FEWEST_POINTS] = 0
         object_of = _objects(part, x_in_support, bare, options)
     table = (np.abs(height) <= noise) & (object_of == 0)
     label = np.where(object_of > 0, object_of + 1, np.where(table, 1, 0))
@@ -160,7 +160,7 @@ def _objects(
     count = np.bincount(part)
     # A part mostly outside of the bare plane is background, such as a wall; a small part is noise.
     plane_xy = x_in_support[bare, :2]
-    if bare.sum() < FEWEST or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < PATCH**2 / 12:
+    if bare.sum() < FEWEST_POINTS or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < PATCH**2 / 12:
         raise InputError(
             "no bare part of the support plane is in view, so objects cannot be told from what lies beside it; leave a "
             "hand's width of it free, or give label images"
@@ -171,7 +171,9 @@ def _objects(
         [np.ptp(x_in_support[part == k], axis=0).max() if count[k] else 0.0 for k in range(len(count))]
     )
     good = (
-        (span >= options.object_smallest) & (count >= max(FEWEST, LEAST_SHARE * len(part))) & (beside <= 0.7)
+        (span >= options.object_smallest)
+        & (count >= max(FEWEST_POINTS, LEAST_SHARE * len(part)))
+        & (beside <= 0.7)
     )
     good[0] = False
     rank = np.zeros(len(count), int)

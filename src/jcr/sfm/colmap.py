@@ -33,8 +33,8 @@ from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.extras import extra
 from jcr.features.matchers import FeatureName, Geometries, Matcher
+from jcr.features.pair_search import MatchedPairs, match_alone, match_with_robot
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
-from jcr.features.stage import MatchedPairs, match_alone, match_with_robot
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.missing_images import model_near_cameras, nearer_to_robot, with_missing_images
@@ -88,10 +88,10 @@ def reconstruct_colmap(
 ) -> Reconstruction:
     """Reconstruct camera poses and tracks of a capture; frame and unit are arbitrary, and a seed fixes every bit.
 
-    The gripper poses check the matches (`features.stage`). The images are reduced to a long side of `working_size_px`.
-    Known intrinsics are held, unknown ones are estimated. Known ones with which fewer than half of the images register
-    are estimated too, if most images register then. Raises RejectedError when fewer than three images register,
-    with their number, the likely reason and a remedy.
+    The gripper poses check the matches (features/pair_search.py). The images are reduced to a long side of
+    `working_size_px`. Known intrinsics are held, unknown ones are estimated. Known ones with which fewer than half of
+    the images register are estimated too, if most images register then. Raises RejectedError when fewer than three
+    images register, with their number, the likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]

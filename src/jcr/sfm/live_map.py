@@ -20,7 +20,7 @@ from jcr.sfm.model import (
     working_cameras,
 )
 
-FEW = 5
+REMAPPED_UP_TO = 5
 """Largest number of images for which every update maps from scratch, because the first pair may have been a poor one."""
 
 
@@ -52,8 +52,8 @@ class LiveMap:
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
-        Images that are no longer in the capture are removed, and the map then begins anew. With FEW images or fewer,
-        every update begins anew.
+        Images that are no longer in the capture are removed, and the map then begins anew. With REMAPPED_UP_TO images or
+        fewer, every update begins anew.
         """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
@@ -66,7 +66,7 @@ class LiveMap:
                 self._features.add(new[name])
                 self._names.append(name)
         self._places = [capture.images.index(name) for name in self._names]
-        begun = self._model if len(self._names) > FEW else None
+        begun = self._model if len(self._names) > REMAPPED_UP_TO else None
         with quiet_colmap():
             matched, self._model = map_images(
                 self._matcher,

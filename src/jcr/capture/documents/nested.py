@@ -10,7 +10,7 @@ from typing import Any
 from jcr.capture.documents.table import LONGEST_NAME, MAX_TABLES, Cell, Table, cell_of, table_of
 from jcr.errors import InputError, shown
 
-FEWEST = 3
+FEWEST_CHILDREN = 3
 """Smallest number of children of a table in nested data; two are rather a pair than a table."""
 Family = tuple[str, Sequence[Any], Sequence[str] | None]
 """Name, children and keys of the rows of a possible table; keys are None for the children of a list."""
@@ -102,7 +102,7 @@ def _families(value: Any) -> Iterator[Family]:
     for key, child in value.items():
         if is_container(child) and any(map(str.isdigit, key)):
             numbered[re.sub(r"\d+", "#", key)].append(key)
-        if isinstance(child, list) and len(child) >= FEWEST:
+        if isinstance(child, list) and len(child) >= FEWEST_CHILDREN:
             parallel[len(child)][key] = child
     for keys in numbered.values():
         if len(keys) < len(value) and _are_alike([value[key] for key in keys]):
@@ -122,7 +122,7 @@ def _are_alike(children: Sequence[Any]) -> bool:
     Lists of numbers must have one length: those of different lengths are parts of one pose.
     """
     full = [child for child in children if child is not None]
-    if len(children) < FEWEST or 2 * len(full) < len(children) or not all(map(is_container, full)):
+    if len(children) < FEWEST_CHILDREN or 2 * len(full) < len(children) or not all(map(is_container, full)):
         return False
     flat = [len(child) for child in full if not any(map(is_container, child))]
     return not isinstance(full[0], list) or len(flat) < len(full) or len(set(flat)) == 1

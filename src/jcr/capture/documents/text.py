@@ -14,7 +14,7 @@ from jcr.capture.documents.nested import has_tables, nested_tables
 from jcr.capture.documents.table import MAX_ITEMS, MAX_TABLES, Cell, Table, cell_of, table_of, tidy_words
 from jcr.errors import InputError
 
-_FEWEST = 5
+_FEWEST_ROWS = 5
 """Smallest number of rows of a section that is a table of its own beside that of all sections; a capture has five."""
 _LONGEST_HEADER = 10_000
 """Largest length of a line with names of columns, in characters."""
@@ -204,7 +204,7 @@ def _line_tables(file: Path, lines: Sequence[str], comments: dict[int, str]) -> 
             section = rows[first:end]
             around = {k: text for k, text in others.items() if after < k < section[-1][0]}
             after = section[-1][0]
-            if len(section) >= _FEWEST:
+            if len(section) >= _FEWEST_ROWS:
                 table = _table_of_rows(file, section, around, separator)
                 tables.append(replace(table, place=f"line {section[0][0] + 1}"))
     return tables

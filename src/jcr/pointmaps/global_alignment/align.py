@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jcr.camera import rays
 from jcr.errors import InputError
-from jcr.pointmaps.global_alignment.gauss_newton import ROUNDS, AlignmentSolution, solve
+from jcr.pointmaps.global_alignment.gauss_newton import WEIGHT_ROUNDS, AlignmentSolution, solve
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import fitted_depth
 from jcr.pointmaps.pairs import PairPredictions, read_pairs
@@ -126,7 +126,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
             f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",
         )
     if not solution.settled:
-        warnings += (f"the alignment had not settled after {ROUNDS} rounds and may be wrong",)
+        warnings += (f"the alignment had not settled after {WEIGHT_ROUNDS} rounds and may be wrong",)
     if middle > USELESS:
         warnings += (f"the pairs disagree by {100 * middle:.0f} % of distance; nothing can be built on them",)
     return Alignment(

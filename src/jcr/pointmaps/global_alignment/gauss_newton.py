@@ -29,7 +29,7 @@ from jcr.pointmaps.global_alignment.residuals import (
 
 TOLERANCE = 1e-4
 """Largest last step (rad, or relative), a tenth of the noise of the predictions."""
-ROUNDS, STEPS = 30, 10
+WEIGHT_ROUNDS, STEPS = 30, 10
 """Largest number of estimates of the weights, and of Gauss-Newton steps with the same weights."""
 ENOUGH = 0.1
 """Relative change of the cost below which the weights are estimated again."""
@@ -99,7 +99,7 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
     pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
     at: Iterate = (state, _residuals(images, state))
     noise, equations, settled = list[ResidualSpread](), list[ImageEquations](), False
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         before, noise = at[0], measure_noise(images, at[1])
         at, equations = _least_squares(images, at, noise, pair_spread)
         # σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30), with medians in place of the

@@ -29,7 +29,7 @@ from jcr.features.gate import (
 )
 from jcr.features.matchers import Geometries, Matcher, matrices, still_cells
 from jcr.features.pairs import (
-    FEW,
+    ALL_PAIRS_UP_TO,
     FIRST_NEIGHBOURS,
     NEIGHBOURS,
     hand_eye_of_pairs,
@@ -234,7 +234,7 @@ def match_with_robot(
     everything = (
         list(combinations(range(n), 2)) if n <= features.every_pair else near_pairs(motion, NEIGHBOURS)
     )
-    at_once = n <= FEW and not features.needs_upright
+    at_once = n <= ALL_PAIRS_UP_TO and not features.needs_upright
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     as_taken = (0.0, 0.0)
     search.match({key: as_taken for key in first if not features.needs_upright or angle[key] < AS_TAKEN})
