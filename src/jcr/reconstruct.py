@@ -219,26 +219,26 @@ class ReconstructOptions:
     """Options of the reconstruction."""
 
     backend: BackendName = "auto"
-    """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
-    (jcr models), in this order, and the next only if the result is rejected."""
+    """Method that computes the camera poses. auto tries those of this list that need no extra input and are installed
+    with their weights (jcr models), in this order, until a result is not rejected."""
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
-    """The board or tags in view, in metres (SIDE where the side is unknown), used beside the features, or alone where
-    these fail (--backend marker: only alone): charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025 (inner corners),
-    aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    """The board or tags in view, in metres; write SIDE for an unknown side. It is used together with the features, and
+    alone if these fail or with --backend marker. Examples: charuco:7x5:0.030:0.022:DICT_4X4_50, chessboard:9x6:0.025
+    (inner corners), aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     features: Literal["auto", "sift", "xfeat"] = "auto"
-    """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
-    texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""
+    """Features that are matched between images; selects the back end colmap. xfeat are learned features for little
+    texture (extra match). auto tries sift and, if the result is rejected and xfeat is installed, xfeat."""
     seed: int = 0
-    """Same seed, same result on the same machine."""
+    """Seed of all random numbers; the same seed gives the same result on the same machine."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device on which networks run and the map is trained."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
-    """A network's weights, as path or hub id; unset: the published ones. With --backend auto they must be DUSt3R's or
-    MASt3R's."""
+    """Path or hub id of a network's weights; by default the published ones. With --backend auto they must be those of
+    DUSt3R or MASt3R."""
     predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
+    """File (npz) with the output of a network (jcr docs predictions); selects the back end predictions."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Camera poses from another tool, a COLMAP model; selects the back end given."""
+    """COLMAP model with camera poses from another tool; selects the back end given."""
 
 
 def reconstruct(

@@ -296,8 +296,6 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     unknown = replace(moving, name="unknown", intrinsics=None)
     found = placed(calibrated, another, moving, unknown)
     assert [camera.converged for camera in found.cameras] == [False, False, False]
-    assert "must see the same scene" in found.cameras[0].warnings[0]
-    assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
     kinds = [camera.findings[0].kind for camera in found.cameras]
     assert kinds == [FindingKind.FEW_POINTS_SHARED, FindingKind.NOT_FIXED, FindingKind.NOT_FIXED]
     uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})

@@ -20,19 +20,19 @@ class CalibrateOptions:
     """Required accuracy, checks and priors of a hand-eye calibration."""
 
     require: RequiredAccuracy = GRASPING
-    """Required accuracy of a point at the image centre, at the working distance: 95 % of its errors are smaller, else
-    the verdict is "accepted, but not as exact as needed" and the exit status 3. 5 mm and 1° are enough for grasping.
-    none: every sound calibration is accepted."""
+    """Required bound on 95 % of the errors of a point at the image centre, at the working distance. If it is missed, the
+    verdict is "accepted, but not as exact as needed" and the exit status 3. 5 mm and 1° are enough for grasping. With
+    none, every sound calibration is accepted."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
+    """Least noise (1 sigma per axis) of the gripper poses; the estimated noise may be larger."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, otherwise
-    estimated."""
+    """Metres per unit of the camera poses of samples, known to 0.2 %. By default 1 for a marker of known size; otherwise
+    it is estimated."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ARM")] = None
-    """Name of the arm (see `jcr capture --help`), to model its joint offsets and link errors; unset: the arm named in
-    the capture, if any."""
+    """Name of the arm (see `jcr capture --help`), to model its joint offsets and link errors. By default the arm
+    that the capture names, if any."""
     known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
-    """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""
+    """Height of the camera above the gripper's origin along the rotation axis, for planar or SCARA arms."""
 
     @property
     def robot_noise_m_rad(self) -> tuple[float, float] | None:

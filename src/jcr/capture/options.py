@@ -25,38 +25,38 @@ class ReadOptions:
     pose_convention: str = "auto"
     """Notation of the rotations in a pose file: matrix, matrix:columns, quat:xyzw, quat:wxyz, rotvec, euler:SEQUENCE
     (xyz about fixed axes, ZYX about moving ones), or a maker: ur, franka, kuka, fanuc, abb, … (jcr docs captures).
-    auto: by names and numbers, else by the images."""
+    auto decides by names and numbers, otherwise by the images."""
     pose_units: UnitsName = "auto"
-    """Units of positions and angles in a pose file, or of joint angles; auto: by names and sizes of the numbers."""
+    """Units of positions and angles in a pose file, or of joint angles; auto decides by names and sizes of numbers."""
     pose_inverted: bool = False
-    """The poses are gripper_from_base, the base in the gripper frame: invert them."""
+    """Invert the poses; this is needed if they are gripper_from_base (the base in the gripper frame)."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of gripper poses, or folder with one file for each image; unset: found among all files of the capture."""
+    """File of gripper poses, or folder with one file for each image; by default found in the capture."""
     pose_columns: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """First part of the names of the columns that hold the gripper poses, where a file has several poses."""
+    """First part of the names of the columns with the gripper poses, if a file has several poses."""
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File with the intrinsics (OpenCV, ROS, Kalibr, RealSense, COLMAP, a 3x3 matrix); unset: found in the capture."""
+    """File with the intrinsics (OpenCV, ROS, Kalibr, RealSense, COLMAP, a 3x3 matrix); by default the capture's."""
     format: FormatName = "auto"
     """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
-    """Number of frames to take from a recording: still, sharp, and chosen to determine the calibration best."""
+    """Number of frames to take from a recording. They are sharp, at rest, and determine the calibration best."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Name of the robot's base in tf; of recordings, the tf frame or URDF link whose poses are read."""
+    """Name of the robot's base frame; in recordings, the tf frame or URDF link."""
     gripper_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Name of the frame whose poses these are, such as tool0 or flange; of recordings, the tf frame or URDF link on
-    which the camera is mounted."""
+    """Name of the frame of the gripper poses, such as tool0 or flange; in recordings, the tf frame or URDF link on which
+    the camera is mounted."""
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
-    """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
+    """Topic of the images in a bag, or key of the camera in a LeRobot data set (observation.images.wrist)."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
-    """Bags: topic of the joint states, read when --urdf is given, or of the gripper's PoseStamped. LeRobot: key of the
-    state."""
+    """Topic of the joint states (with --urdf) or of the gripper's PoseStamped in a bag, or key of the state in a LeRobot
+    data set."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Robot description, for recordings with joint angles instead of gripper poses."""
+    """Robot description for recordings with joint angles instead of gripper poses."""
     max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0
-    """Recordings: largest gap between two poses across which one is interpolated; beyond it the image is left out."""
+    """Largest gap between two poses of a recording for interpolation; images in larger gaps are not used."""
     episode: tuple[int | Literal["all"], ...] = (0,)
-    """LeRobot: the episode to take frames from. `jcr batch` and `jcr verify` take several, or all (of many, 200 at even
-    steps), each as a capture of its own."""
+    """Episode of a LeRobot data set. `jcr batch` and `jcr verify` take several or all, each as a capture of its own; of
+    more than 200 they take 200 at even steps."""
 
 
 def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], what: str, option: str) -> str:

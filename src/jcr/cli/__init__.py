@@ -23,8 +23,8 @@ from jcr.errors import InputError, RejectedError, did_you_mean, printable
 
 GROUPS = {
     "calibrate": {
-        "run.run": "everything: reconstruct, calibrate, map, report",
-        "run.calibrate": "reconstruct and calibrate only: calibration.json",
+        "run.run": "calibrate a capture, build the map, and write the report",
+        "run.calibrate": "calibrate a capture without the map",
         "run.add-camera": "locate a fixed camera from its images of a run's scene",
         "run.batch": "run many captures, on this machine or a Ray cluster",
     },
@@ -36,14 +36,14 @@ GROUPS = {
         "use.map": "build or rebuild the map of a run",
     },
     "check": {
-        "check.check": "check a capture before any heavy work",
-        "check.verify": "has the camera moved? test a calibration with a few new images",
-        "check.compare": "compare two calibrations: do their uncertainties explain the difference?",
-        "check.touch": "touch test: compare points touched with the robot's tip with the map",
+        "check.check": "check a capture in seconds, before the calibration",
+        "check.verify": "test with a few new images whether the camera has moved",
+        "check.compare": "test whether the uncertainties of two calibrations explain their difference",
+        "check.touch": "compare points that the robot's tip touches with the map",
     },
     "prepare": {
         "capture.capture": "take a capture live, with its accuracy after each image",
-        "prepare.board": "draw a calibration board to print, if you want one",
+        "prepare.board": "draw a calibration board to print",
     },
     "more": {
         "prepare.models": "list back ends with their licences; download weights",
@@ -57,13 +57,13 @@ COMMANDS = {key.split(".")[1]: about for group in GROUPS.values() for key, about
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-Eye-in-hand calibration without a target: estimate the hand-eye transform, the metric scale and a map in the robot's
-base frame, from images of a wrist camera and the gripper pose at each.
+jcr calibrates a wrist camera without a target. From images and the gripper pose at each, it estimates the hand-eye
+transform, the metric scale and a map in the robot's base frame.
 
 {commands}
 
-jcr COMMAND --help     arguments, options and examples of a command
-jcr --version          the version
+jcr COMMAND --help     print arguments, options and examples of a command
+jcr --version          print the version
 
 for example:
   jcr run captures/table out/table

@@ -28,12 +28,12 @@ VERIFIED = 5
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureCommand:
-    """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
+    """Take a capture live with a camera and a robot, and show after each image what is still missing.
 
-    An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the calibration is
-    updated, and its accuracy, its faults and what would improve it are printed. OUT/result is the calibration of all
-    images. After Ctrl-C the same command resumes. The live page, whose address is printed, has buttons to take, retake
-    and remove images, to undo, and to finish.
+    An image is taken when the arm rests, and kept if it is sharp and nothing moves. After each image the command prints
+    the accuracy of the calibration, its faults, and what would improve it. OUT/result is the calibration of all images.
+    After Ctrl-C the same command resumes. The live page, whose address is printed, has buttons to take, retake and
+    remove images, to undo, and to finish.
 
     for example:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -49,20 +49,20 @@ class CaptureCommand:
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     camera_size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
-    """Resolution in pixels; unset: the camera's default (RealSense: 1280 720)."""
+    """Resolution in pixels; by default that of the camera (1280 720 for a RealSense)."""
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "http"
     """Source of gripper poses: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, or http (a program posts
     them, jcr docs http)."""
     robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
-    """The arm, to model its joint offsets and link errors."""
+    """Name of the arm, to model its joint offsets and link errors."""
     page_port: Annotated[int, tyro.conf.arg(metavar="PORT")] = 0
-    """Port of the live page and of samples on this machine; 0: any free one. The key is random, or that of the
+    """Port of the live page and of samples on this machine; 0 selects a free one. The key is random, or that of the
     environment variable JCR_TOKEN."""
     intrinsics_from: Path | None = None
-    """File with the camera's intrinsics, as for --camera-info, or a capture.json or calibration.json; unset: those of
-    the camera (RealSense), otherwise estimated."""
+    """File with the camera's intrinsics, as for --camera-info, or a capture.json or calibration.json. By default
+    those of a RealSense are used, and those of other cameras are estimated."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
-    """Verify this run with the images (default: 5) instead of calibrating them: at the end, and at each POST /verify."""
+    """Run to verify with the images (default: 5), at the end and at each POST /verify, instead of calibrating them."""
     session: SessionOptions = field(default_factory=SessionOptions)
     output: Output = field(default_factory=Output)
 

@@ -48,13 +48,13 @@ class CheckCommand:
     """Folder of the capture, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     poses_only: bool = False
-    """Check files, units and motion only; look for no features in the images."""
+    """Check files, units and motion only, without features of the images."""
     thorough: bool = False
-    """Register all images at full size. By default 8 are registered, in seconds, and all only if these show a fault."""
+    """Register all images at full size. By default 8 are registered, and all only if these show a fault."""
     require: RequiredAccuracy = GRASPING
-    """Required accuracy of a point at the image centre, as of `jcr run`; compared with the expected one."""
+    """Required accuracy of a point at the image centre, as for `jcr run`, for the comparison with the expected one."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Noise (1 sigma per axis) of the gripper poses; unset: estimated, or 0.5 mm and 0.1°."""
+    """Noise (1 sigma per axis) of the gripper poses; by default it is estimated, or 0.5 mm and 0.1°."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -180,11 +180,10 @@ def _check_facts(found: "Examination") -> dict[str, Any]:
 class CompareCommand:
     """Compare two calibrations: their difference in mm and degrees, and whether their covariances explain it.
 
-    Each is a run folder, a calibration.json, any JSON with a `gripper_from_camera` (a capture's reference.json, or
-    the folder that holds one; with `std_mm` and `std_deg` if its errors are known), a file of `jcr export` or
-    easy_handeye, or a document with a 4×4 matrix. With --verbose: χ², the squared
-    difference in units of both covariances, and p, the probability of a larger one if nothing else is wrong. For two
-    calibrations of one arm p is too large, because they share systematic errors. The exit status is 3 if one of the
+    Each is a run folder, a calibration.json, a file of `jcr export` or easy_handeye, a document with a 4×4 matrix, or a
+    JSON file (or its folder) with `gripper_from_camera` and, if its errors are known, `std_mm` and `std_deg`. --verbose
+    adds χ², the squared difference in units of both covariances, and p, the probability of a larger one by chance. For
+    two calibrations of one arm p is too large, because they share systematic errors. The exit status is 3 if one of the
     two is rejected, or if the reported errors do not explain the difference.
 
     for example:
@@ -226,7 +225,7 @@ class CompareCommand:
         remedy = []
         if is_contradiction:
             explained = "; more than the reported errors explain"
-            remedy = ["find out what moved between the two, or which error they do not report"]
+            remedy = ["find what moved between the two, or which error they do not report"]
         if found.likely_cause is not None:
             remedy = [f"compare first {found.likely_cause}", *(f"otherwise {one}" for one in remedy)]
         verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"
@@ -247,13 +246,13 @@ class CompareCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyCommand:
-    """Test a calibration with later captures: has the camera moved on the gripper since?
+    """Test with later captures whether the camera has moved on the gripper since its calibration.
 
     OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURES are captures in any
-    format, oldest first, or a folder of captures, with one or more new images of the same scene; three to five images
-    with the wrist rotated distinguish a moved camera from a moved table. Each capture is tested with those that were
+    format, oldest first, or a folder of captures, with one or more new images of the same scene. Three to five images
+    with a rotated wrist distinguish a moved camera from a moved table. Each capture is tested with those that were
     verified before (OUT/verify.json), with at most 0.1 false alarms per hundred captures; OUT/verify.html shows all.
-    Fixed cameras of the run that the last capture names in `cameras` are tested too. The exit status is 3 if something
+    The fixed cameras that the last capture names in `cameras` are also tested. The exit status is 3 if something
     has moved, or if the images cannot decide.
 
     for example:
@@ -271,14 +270,14 @@ class VerifyCommand:
     """The new images and their poses: capture folders, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     tolerance: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = TOLERANCE
-    """Changes smaller than both raise no alarm, however significant."""
+    """Largest translation and rotation that raise no alarm, even if they are significant."""
     new_scene: bool = False
-    """The images show another scene: calibrate the capture by itself (8 images or more) and compare it with the run."""
+    """Calibrate the capture (8 images or more of another scene) alone, and compare it with the run."""
     recalibrate: Annotated[Path | None, tyro.conf.arg(metavar="NEW_OUT")] = None
-    """Calibrate again into this run folder: old and new images together if nothing has moved, else those since then. The
-    exit status is that of the new calibration."""
+    """Folder of a new run of old and new images if nothing has moved, otherwise of the images since the change. The exit
+    status is that of the new calibration."""
     check_poses: bool = False
-    """Print the gripper poses of the run at which new images tell most, and what they would find; verify nothing."""
+    """Print the gripper poses of the run at which new images are most useful, and the change that they would find."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
@@ -349,7 +348,7 @@ class VerifyCommand:
             lines += [] if joints is None else [f"{'':<20} joints (rad) {numbers(joints, 4)}"]
             facts.append({"image": image, "base_from_gripper": pose, "joints": joints})
             facts[-1] |= {"detectable_mm": mm, "detectable_deg": deg}
-        head = "go to these poses (m, quaternion xyzw); so many images find 9 of 10 bumps of the camera from"
+        head = "go to these poses (m, quaternion xyzw); the images up to each find 9 of 10 changes of the camera above"
         self.output.result([head, *lines], {"poses": facts})
         return 0
 
@@ -393,7 +392,7 @@ def verification_lines(found: "Verification", verbose: bool) -> list[str]:
         f"{verdict}: {found.finding}" + ("" if found.moves else f", {drift}"),
         *(labelled("Remedy", found.advice) if found.moved else ()),
         *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
-        *labelled("Images", f"{len(found.images)}; 9 of 10 changes of {noticed} are found"),
+        *labelled("Images", f"{len(found.images)}; they find 9 of 10 changes of {noticed}"),
         *(line for note in found.notes for line in labelled("WARNING", note)),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
@@ -403,7 +402,7 @@ def verification_lines(found: "Verification", verbose: bool) -> list[str]:
 def _series(rows: Sequence["Verified"]) -> list[str]:
     """Return the table of captures: drift of camera and scene, the smallest change that is found, scene left."""
     width = max(len("capture"), *(len(row.name) for row in rows))
-    lines = [f"{'capture':<{width}}  {'camera':>16}  {'scene':>16}  {'found from':>16}  scene left"]
+    lines = [f"{'capture':<{width}}  {'camera':>16}  {'scene':>16}  {'smallest found':>16}  scene left"]
     for row in rows:
         steps = (row.camera.step, row.scene.step)
         pairs = [(float(np.linalg.norm(one[:3])), float(np.linalg.norm(one[3:]))) for one in steps]
@@ -415,7 +414,7 @@ def _series(rows: Sequence["Verified"]) -> list[str]:
 
 @dataclass(frozen=True)
 class TouchCommand:
-    """Measure the error in task space: touch points with a calibrated tip and compare them with the map.
+    """Compare points that a calibrated tip touches with the map, to measure the error in task space.
 
     OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the
     run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). report.html shows
@@ -447,7 +446,9 @@ class TouchCommand:
         verdict = "REJECTED: larger than" if is_larger else "ACCEPTED: within"
         lines = [f"{verdict} the reported uncertainty: {rms:.2f} mm (rms), {expected:.2f} mm expected"]
         if is_larger:
-            remedy = "check the tip's calibration (a constant error), then calibrate again (jcr run)"
+            remedy = (
+                "check the calibration of the tip if the error is constant, then calibrate again (jcr run)"
+            )
             lines += labelled("Remedy", remedy)
         lines += labelled("Mean", f"{numbers(mean, 2, '+')} mm")
         points = []

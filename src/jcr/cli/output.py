@@ -17,7 +17,7 @@ class Output:
     json: bool = False
     """Print the result as one JSON object."""
     quiet: bool = False
-    """Print only errors and warnings on stderr: no progress, no notes."""
+    """Print only errors and warnings on stderr, without progress and notes."""
 
     def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
         """Print the result: with --json `facts` as one JSON object (arrays as lists), otherwise the `lines`."""
@@ -32,7 +32,7 @@ class VerboseOutput(Output):
     """Options of the output of a command that prints details only with --verbose."""
 
     verbose: bool = False
-    """Print the details as well: what uncertainty comes from, images left out, notes, p-values."""
+    """Also print the details: the uncertainty budget, the use of each image, notes and p-values."""
 
 
 class Quiet(io.TextIOWrapper):

@@ -36,7 +36,7 @@ class BoardCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """PDF to write."""
     board: Annotated[str, tyro.conf.Positional] = "charuco:8x5:0.030:0.022:DICT_4X4_50"
-    """charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, lengths in metres."""
+    """Board as charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, with lengths in metres."""
     paper: Literal["a4", "a3", "a2", "letter"] = "a4"
     """Paper size; the long side is horizontal."""
     output: Output = field(default_factory=Output)

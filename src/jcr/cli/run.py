@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateCommand:
-    """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
+    """Calibrate a capture without dense depth and map; write calibration.json, report.html and log.txt.
 
     CAPTURE may also be a samples file of easy_handeye2 or MoveIt Calibration, whose marker poses need no images.
 
@@ -45,8 +45,8 @@ class CalibrateCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     method: Literal["default", "paper"] = "default"
-    """default; paper: the method as published, without uncertainty and checks: back end dust3r, mast3r, predictions, or
-    colmap as its baseline without the gripper poses; published alignment, solver and networks."""
+    """default; or paper, the published method without uncertainty and checks. paper takes the back ends dust3r, mast3r,
+    predictions, or colmap as its baseline without the gripper poses."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
@@ -90,7 +90,7 @@ class RunCommand(CalibrateCommand):
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     no_map: bool = False
-    """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
+    """Calibrate and write the report only, without dense depth, cloud and map; this needs no torch."""
 
     def main(self) -> int:
         """Run every stage, print the result and return the exit status of `show`."""
@@ -114,7 +114,7 @@ class RunCommand(CalibrateCommand):
 class BatchCommand:
     """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 
-    A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
+    A capture that fails does not stop the others. The same command again runs only missing or changed ones. The
     exit status is 3 if any capture failed, was rejected, or is not as exact as needed.
 
     for example:
@@ -127,8 +127,8 @@ class BatchCommand:
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]
     """Folders of the captures, then the folder for the results."""
     method: Literal["default", "paper"] = "default"
-    """default; paper: the method as published, without uncertainty and checks: back end dust3r, mast3r, predictions, or
-    colmap as its baseline without the gripper poses; published alignment, solver and networks."""
+    """default; or paper, the published method without uncertainty and checks. paper takes the back ends dust3r, mast3r,
+    predictions, or colmap as its baseline without the gripper poses."""
     output: Output = field(default_factory=Output)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
@@ -166,8 +166,8 @@ class AddCameraCommand:
     """Locate a fixed camera (base_from_camera) from its images of the scene of a run.
 
     OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
-    matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated too,
-    and the output names it if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
+    matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated, and
+    the output says if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
     report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
 
     for example:
@@ -182,7 +182,7 @@ class AddCameraCommand:
     name: str | None = None
     """Name of the camera; by default the file name of the first image."""
     intrinsics: Path | None = None
-    """File with the intrinsics, as for --camera-info, in pixels of these images; unset: estimated."""
+    """File with the intrinsics, as for --camera-info, in pixels of these images; by default they are estimated."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:

@@ -29,7 +29,7 @@ _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d,%.5f"
 
 @dataclass(frozen=True, kw_only=True)
 class MapCommand:
-    """(Re)build cloud, map and report of a run with other options, or with further images.
+    """Build cloud, map and report of a run again, with other options or further images.
 
     for example:
       jcr map out/tabletop --preset paper
@@ -41,9 +41,9 @@ class MapCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     add: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="CAPTURE")] = ()
-    """A capture of new images, in any format; repeat for more, oldest first. The calibration is not changed. Parts of
-    the map that a new image sees through are removed; a new object needs two new images. The images are kept for every
-    later map of the run (OUT/added)."""
+    """A capture of new images, in any format; repeat the option for more, oldest first. The calibration does not change.
+    Parts of the map that a new image sees through are removed. A new object needs two new images. Every later map of the
+    run uses the images (OUT/added)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
@@ -81,12 +81,10 @@ class ExportCommand:
     format: Annotated[
         ExportName | None,
         tyro.conf.Positional,
-        tyro.conf.arg(
-            help=f"{', '.join(get_args(ExportName))}; without it, all are listed with their contents."
-        ),
+        tyro.conf.arg(help=f"{', '.join(get_args(ExportName))}; without it, all formats are listed."),
     ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None
-    """File or (nerfstudio, colmap, depth) new folder to write; by default in OUT/export."""
+    """File to write, or new folder for nerfstudio, colmap and depth; by default in OUT/export."""
     export: ExportOptions = field(default_factory=ExportOptions)
     output: Output = field(default_factory=Output)
 
@@ -98,7 +96,7 @@ class ExportCommand:
         if self.format is None:
             formats = {row.name: row.about for row in FORMATS}
             lines = [f"{name:<14} {about}" for name, about in formats.items()]
-            self.output.result([*lines, f"for one: jcr export {self.out} FORMAT"], {"formats": formats})
+            self.output.result([*lines, f"choose one: jcr export {self.out} FORMAT"], {"formats": formats})
             return 0
         run, row, path = write_run(self.out, self.format, self.path, self.export)
         sys.stderr.write(f"wrote {path}: {row.about}\n")
@@ -111,7 +109,7 @@ class ExportCommand:
         if pair is not None:
             sys.stderr.write(f"{pair}\n")
         if run.doubt is not None:
-            warn(f"the calibration is rejected, as the file says too: {run.doubt}")
+            warn(f"the calibration is rejected, and the file states the reason: {run.doubt}")
         elif (short := run.calibration.short) is not None:
             warn(sentence(short))
         return 0
@@ -133,12 +131,12 @@ class QueryCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run, with its map.safetensors."""
     points: Annotated[Path, tyro.conf.Positional]
-    """.csv (three columns, header line optional) or .npy of shape (n, 3)."""
+    """Points in a .csv file (three columns, header line optional) or .npy file of shape (n, 3)."""
     write: Path | None = None
-    """File to write, .csv; by default points.answers.csv beside the points, or none with --json, which prints the
-    answers."""
+    """File (.csv) to write; by default points.answers.csv in the folder of the points. --json prints the answers
+    instead."""
     unknown: Literal["occupied", "free", "report"] = "report"
-    """Treatment of unseen space: occupied (solid), free (empty), or report (occupancy 0.5)."""
+    """Treatment of unseen space as solid (occupied), empty (free), or of occupancy 0.5 (report)."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
@@ -250,8 +248,8 @@ class MeasureCommand:
 class ViewCommand:
     """Show a run in the browser: points, cameras, grippers, robot, layers of the map, and a sphere to query it.
 
-    The page is served until Ctrl-C, and only to this machine; from another one use
-    ssh -L 8080:127.0.0.1:8080. Needs viser: pip install 'jcr-handeye[view]'.
+    The page is served until Ctrl-C, and only to this machine. From another one use ssh -L 8080:127.0.0.1:8080. The
+    command needs viser: pip install 'jcr-handeye[view]'.
 
     for example:
       jcr view out/table
@@ -261,7 +259,7 @@ class ViewCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     urdf: Path | None = None
-    """The robot, shown at the capture's joint values of each image; unset: the capture's URDF. Its root link is the
+    """Robot to show at the capture's joint angles of each image; by default that of the capture. Its root link is the
     base of the gripper poses."""
     port: int = 8080
     """Port of 127.0.0.1 to listen on; 0 selects a free one."""

@@ -13,8 +13,8 @@ class DepthOptions:
     priors: Annotated[
         bool,
         tyro.conf.arg(
-            help="Leave plain surfaces without depth. By default they are filled with planes where their colour and "
-            "the matched depth around them support it; the map uses these as surfaces, never as evidence of free space."
+            help="Leave plain surfaces without depth. By default planes fill them where their colour and the matched "
+            "depth around them support it. The map uses these planes as surfaces, not as evidence of free space."
         ),
     ] = True
     """Fill plain surfaces with planes. Networks predict them anyway."""

@@ -19,43 +19,43 @@ class ExportOptions:
     """Frames, resolution and images of an exported file; each format uses the options that concern it."""
 
     parent_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """The gripper frame whose poses the capture contains; unset: the one that the capture names."""
+    """The gripper frame of the capture's poses; by default the one that the capture names."""
     child_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """The camera's optical frame: x right, y down, z forward; unset: the one that the capture names, else
+    """The camera's optical frame (x right, y down, z forward); by default the one that the capture names, otherwise
     camera_color_optical_frame."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """The robot's base, the frame of the map; unset: the one that the capture names, else base."""
+    """The robot's base frame, which is that of the map; by default the one that the capture names, otherwise base."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Another camera of the cell (cameras.json), for formats with one camera; unset: the run's own camera, and for ros2
-    and urdf all cameras. The parent of a fixed camera is the base frame."""
+    """Another camera of the cell (cameras.json), for formats with one camera. By default it is the run's own camera;
+    ros2 and urdf contain all cameras. The parent of a fixed camera is the base frame."""
     to_root: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Export the transform to this link instead, the root of the camera's own frames (e.g. camera_link)."""
+    """Link to which the transform is exported instead: the root of the camera's own frames (e.g. camera_link)."""
     root_from_optical: Annotated[
         tuple[float, float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="X Y Z QX QY QZ QW"),
     ] = None
-    """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
-    prints it; by default the same origin, with axes as in REP-103."""
+    """Pose of the optical frame in the link --to-root: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK
+    OPTICAL` prints it. By default both have the same origin, and the link has the axes of REP-103."""
     intrinsics: Literal["estimated", "given"] = "estimated"
-    """Intrinsics that the camera is used with: estimated by the run, or given by the capture. Each of the two
-    has a transform of its own, and files state the intrinsics of theirs."""
+    """Intrinsics with which you use the camera: estimated by the run, or given by the capture. Each of the two has
+    a transform of its own; every file states its intrinsics."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Voxel size (m) for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None
-    """State of unseen space: by default occupied in esdf, free (left out) in spheres."""
+    """State of unseen space; by default it is occupied in esdf, and free (without spheres) in spheres."""
     excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres by which spheres may extend into free space; by default two cells of the map."""
     into: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """urdf: a copy of this URDF or xacro of a robot, in which the origin of the camera's joint is replaced, and all else
-    is kept. The joint is the one whose child is the camera's frame (--child-frame, --to-root)."""
+    """URDF or xacro of a robot that format urdf copies with a new origin of the camera's joint. Its child is the
+    camera's frame (--child-frame, --to-root). All else is kept."""
     float_depth: bool = False
-    """Depth images of `depth` as .npy in metres (float32) instead of 16-bit PNG in millimetres."""
+    """Write the images of format depth as .npy in metres (float32) instead of 16-bit PNG in millimetres."""
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     force: bool = False
-    """Export a calibration that is rejected, too; the file then has the reason."""
+    """Export a rejected calibration; the file then contains the reason."""
     overwrite: bool = False
-    """Replace a file of other content at the path."""
+    """Replace a file with other content at the path."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""
 

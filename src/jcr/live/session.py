@@ -43,14 +43,14 @@ class SessionOptions:
     """Options of a live capture: number of images, waiting time, and required accuracy."""
 
     images: int | None = None
-    """Stop with this many images; unset: 12, and with --until-accurate 40."""
+    """Number of images at which the capture stops; by default 12, and with --until-accurate 40."""
     patience: float = 5.0
-    """Seconds to wait for an image at rest."""
+    """Longest time (s) to wait for an image at rest."""
     require: RequiredAccuracy = GRASPING
-    """Required accuracy: 95 % of errors of a point seen at the distance of the scene are smaller."""
+    """Required bound on 95 % of the errors of a point at the working distance."""
     until_accurate: bool = False
-    """End, with exit status 0, as soon as the requirement is met and the leave-one-out error confirms it; with
-    status 3 where it is not met with the last image."""
+    """End with exit status 0 as soon as the requirement is met and the leave-one-out error confirms it. If it is not met
+    with the last image, the exit status is 3."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,13 +11,13 @@ class BatchOptions:
     """Options of a batch of runs: processes, Ray cluster, and resources of each capture."""
 
     processes: int | None = None
-    """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""
+    """Number of captures that run at a time on this machine and share its cores; by default one for every two cores."""
     calibrate_only: bool = False
-    """Calibration and report alone: no cloud and no map."""
+    """Calibrate and write the report only, without cloud and map."""
     ray: str | None = None
-    """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
-    folders. Needs the extra jcr-handeye[cluster]."""
+    """Address of a Ray cluster to run on; auto is the cluster of this machine. Every node must see the same folders.
+    This needs the extra jcr-handeye[cluster]."""
     cpus_per_task: int = 2
-    """Cores that a capture takes, with --ray."""
+    """Number of cores for a capture, with --ray."""
     gpus_per_task: float = 0.0
-    """GPUs that a capture takes, with --ray; 0.25 lets four share one."""
+    """Number of GPUs for a capture, with --ray; with 0.25 four captures share one."""

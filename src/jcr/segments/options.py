@@ -13,13 +13,13 @@ class TabletopOptions:
     """Limits of an object on the table."""
 
     object_lowest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.008
-    """Height (m) above the plane that an object must reach; then lower points may belong to it, too."""
+    """Height (m) above the plane that an object must reach; lower points then also belong to it."""
     object_highest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.6
     """Height (m) above the plane beyond which nothing belongs to an object."""
     object_gap: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
-    """Objects with this much space (m) between them, seen from above, are separated."""
+    """Space (m) between objects in the view from above that separates them."""
     object_smallest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.015
-    """Objects whose points span less (m) than this are treated as noise."""
+    """Extent (m) of the points below which an object is treated as noise."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,9 @@ class SegmentOptions:
     """Method that divides the scene into objects."""
 
     segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
-    """labels: labels/NAME.png in the capture's folder; tabletop: the support plane and what stands on it; sam: Segment
-    Anything 2 (pip install 'jcr-handeye[sam]'); auto: labels if there are any, otherwise tabletop."""
+    """Source of the labels. labels are images labels/NAME.png in the capture's folder. tabletop finds the support plane
+    and the objects on it. sam is Segment Anything 2 (pip install 'jcr-handeye[sam]'). auto uses labels if there are any,
+    otherwise tabletop."""
     sam_weights: Annotated[str, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)
