@@ -191,7 +191,7 @@ class AddCameraCommand:
         from jcr.pipeline.run import add_camera
 
         if not self.images:
-            raise InputError("no image; name one or more of the camera to place")
+            raise InputError("add-camera: no images; name one or more images of the camera")
         name = self.name or re.sub(r"^[^A-Za-z]+|[^A-Za-z0-9_]+", "_", self.images[0].stem).strip("_")
         with progress_bars() as progress:
             result = add_camera(self.out, name or "camera", self.images, self.intrinsics, progress=progress)

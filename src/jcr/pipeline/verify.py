@@ -114,15 +114,15 @@ class Verification:
         causes, anew = self.moves[-1].causes, "calibrate again from 8 or more images (jcr run)"
         if causes[1:]:
             return (
-                "two more images with the wrist rotated decide what has moved; if it is the camera, tighten the mount, "
-                f"then {anew}"
+                "take two more images with a rotated wrist, which show what has moved; if it is the camera, tighten "
+                f"the mount, then {anew}"
             )
         return {
             "camera": f"tighten the mount, then {anew}",
-            "scene": "the scene or the robot's base was moved as a whole; the camera's calibration is still valid, the "
-            "map is not: build it again (jcr run)",
-            "robot": "the robot reports other poses than before (joints set to zero again, another tool frame or "
-            f"payload); the calibration does not belong to these: {anew}",
+            "scene": "the scene or the robot's base has moved as a whole; the camera's calibration is still valid, but "
+            "the map is not: build it again (jcr run)",
+            "robot": "the robot reports other poses than before (new joint zeros, another tool frame or "
+            f"payload), and the calibration is not valid for these; {anew}",
         }[str(causes[0])]
 
 
@@ -254,7 +254,7 @@ def _blindness(noticed: tuple[float, float]) -> list[str]:
     if mm <= GRASPING[0] and deg <= GRASPING[1]:
         return []
     return [
-        f"drifts of less than {mm:.0f} mm or {deg:.1f}° would not be noticed; take more images, with the wrist rotated "
+        f"drifts of less than {mm:.0f} mm or {deg:.1f}° would not be noticed; take more images, with a rotated wrist "
         "and at other distances"
     ]
 

@@ -48,12 +48,12 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     elif short is not None:
         reason = sentence(short)
     else:
-        reason = "nothing contradicts it" if required is None else reached_in_words(required)
+        reason = "no check contradicts it" if required is None else reached_in_words(required)
     evidence = _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
         reason, evidence = (
             text(calibration.findings[0]),
-            "Small residuals do not prove accuracy: X is on both sides.",
+            "Small residuals do not prove accuracy, because X is on both sides of AX = XB.",
         )
     if isinstance(calibration, Calibration):
         worst = worst_direction(calibration)
@@ -64,7 +64,7 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
 def _leave_one_out(calibration: AnyCalibration) -> str:
     """Return a sentence with the leave-one-out error, and the errors that it cannot show."""
     if (held_out := calibration.held_out) is None:
-        return "There were too few images for a leave-one-out error."
+        return "There are too few images for a leave-one-out error."
     error = f"Leave-one-out error {leave_one_out_text(held_out)} ({held_out.how})"
     if not calibration.observability.observable:
         return f"{error}; it does not support the result, because no image can contradict an unobservable direction."

@@ -475,7 +475,7 @@ def _intrinsics(after: Examined, stds: Float[ndarray, " p"]) -> dict[str, Any]:
             found, was = (", ".join(f"{of[name]:.{digits}f}" for name in pair) for of in (now, given))
             surest = significant(max(std[name] for name in pair if name in std))
             shown.append(f"{what} ({found}) ± {surest}{unit} where ({was}) {before}")
-    unsure = "other intrinsics than those used, no one of them surely by itself"
+    unsure = "other intrinsics than the used ones, but no single parameter is certain"
     details: dict[str, Any] = {"source": "images", "shown": joined(shown or [unsure])}
     for name in filter(now.__contains__, TESTED_IF_GIVEN):
         details |= {name: now[name], f"{name}_given": given[name]}
