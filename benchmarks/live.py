@@ -22,7 +22,7 @@ from jcr.estimation.arms import RobotName, arm_named
 from jcr.estimation.inverse_kinematics import reach_toward
 from jcr.geometry import apply, inverse, retract, rotation_angle, step_between
 from jcr.live.calibration import LiveCalibration
-from jcr.live.progress import Progress
+from jcr.live.progress import LiveProgress
 from jcr.pipeline.run import calibrate
 from jcr.records import Intrinsics
 from jcr.result import RunResult
@@ -148,7 +148,7 @@ def run_of(cell: Cell, way: str) -> Run:
     """Take a capture by one way until its claim is confirmed."""
     white = np.repeat(PRESETS["typical"].white, 3)
     rng = np.random.default_rng([cell.seed, 70])
-    state, seconds, joints = Progress(images=()), 0.0, cell.varied[0]
+    state, seconds, joints = LiveProgress(images=()), 0.0, cell.varied[0]
     places, visited, arm = list[Float[ndarray, "4 4"]](), list[Float[ndarray, " dof"]](), cell.arm.arm
     seen = render(cell.scene, cell.camera, (places[-1] for _ in range(MOST)), with_truth=False)
     with tempfile.TemporaryDirectory() as folder:

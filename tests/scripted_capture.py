@@ -18,7 +18,7 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import rotation_exp, transform
 from jcr.live.cameras import Camera, Frame
 from jcr.live.folder import LiveFolder
-from jcr.live.progress import Progress
+from jcr.live.progress import LiveProgress
 from jcr.live.robot import RobotState
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.records import LeaveOneOut, PointUncertainty, PointUncertaintyOverImage, Requirement
@@ -64,9 +64,9 @@ class Scripted:
     fault: Exception | None = None
     """Raised by the next update."""
     finished: int = 0
-    progress: Progress = field(default_factory=lambda: Progress(images=()))
+    progress: LiveProgress = field(default_factory=lambda: LiveProgress(images=()))
 
-    def update(self) -> Progress:
+    def update(self) -> LiveProgress:
         if self.fault is not None:
             fault, self.fault = self.fault, None
             raise fault
@@ -86,7 +86,7 @@ class Scripted:
                     details={"rotation": 0.1},
                 ),
             )
-        self.progress = Progress(
+        self.progress = LiveProgress(
             images=images,
             added=images[-1] if images else None,
             registered=images,

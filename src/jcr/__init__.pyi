@@ -27,7 +27,7 @@ from .geometry import Similarity as Similarity
 from .live.calibration import LiveCalibration as LiveCalibration
 from .live.cameras import Camera as Camera
 from .live.cameras import Frame as Frame
-from .live.progress import Progress as Progress
+from .live.progress import LiveProgress as LiveProgress
 from .live.robot import RobotState as RobotState
 from .live.server import LiveServer as LiveServer
 from .live.session import LiveSession as LiveSession

@@ -18,7 +18,7 @@ from jcr.findings import FindingKind, sentence
 from jcr.geometry import rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.page import verdict_lines
-from jcr.live.progress import Progress
+from jcr.live.progress import LiveProgress
 from jcr.live.session import SessionState
 from jcr.records import Capture
 from scripted_capture import REQUIRED, still
@@ -35,7 +35,7 @@ def image_of(capture: Capture, k: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def grown(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
+def grown(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[LiveProgress]]:
     """The capture fed image by image, and the state after each."""
     folder = tmp_path_factory.mktemp("live") / "capture"
     live = LiveCalibration(folder, intrinsics=capture.intrinsics, options={"require": REQUIRED})
@@ -46,7 +46,7 @@ def grown(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 
 @pytest.fixture(scope="module")
 def resumed(
-    grown: tuple[Path, list[Progress]], tmp_path_factory: pytest.TempPathFactory
+    grown: tuple[Path, list[LiveProgress]], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[LiveCalibration]:
     """The same capture without its last image, begun again from its files; the last of its tests changes it."""
     folder = shutil.copytree(grown[0], tmp_path_factory.mktemp("resumed") / "capture")
@@ -105,7 +105,7 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_
     before = grown[1][7]
     std = np.sqrt(np.diag(before.hand_eye.covariance)[:6])
 
-    def sigmas(state: Progress) -> float:
+    def sigmas(state: LiveProgress) -> float:
         """Return the largest difference from the calibration before."""
         assert state.hand_eye is not None
         away = step_between(state.hand_eye.gripper_from_camera, before.hand_eye.gripper_from_camera)
@@ -128,7 +128,7 @@ def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_
 def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibration, capture: Capture):
     pose, image = capture.base_from_gripper[8], image_of(capture, 8)
 
-    def against(state: Progress) -> dict[FindingKind, Any]:
+    def against(state: LiveProgress) -> dict[FindingKind, Any]:
         return {one.kind: one for one in state.findings if one.images == (state.added,)}
 
     noise = np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8)

@@ -23,7 +23,7 @@ from jcr.files import locked
 from jcr.findings import Finding, FindingKind, strongest_first
 from jcr.least_squares import one_blas_thread
 from jcr.live.folder import Channels, LiveFolder
-from jcr.live.progress import Progress
+from jcr.live.progress import LiveProgress
 from jcr.options import checked_options
 from jcr.records import Capture, FrameNames, Intrinsics, Tracks
 from jcr.records.capture_json import IntrinsicsEntry
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 OBSERVATIONS = 300, 8000
 """Largest mean number of observations per image, and largest total, while images are taken; `finish` uses all."""
-FEW = 5
+LEAST_IMAGES_TO_REJECT = 5
 """Smallest number of images with which a missing calibration is a finding that rejects."""
 MOST_POINTS = 3000
-"""Largest number of points in `Progress.points_in_base`."""
+"""Largest number of points in `LiveProgress.points_in_base`."""
 
 
 class LiveCalibration:
@@ -77,7 +77,7 @@ class LiveCalibration:
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
-        self.progress = Progress(images=tuple(self.live.names))
+        self.progress = LiveProgress(images=tuple(self.live.names))
 
     def add(
         self,
@@ -88,7 +88,7 @@ class LiveCalibration:
         depth_mm: UInt16[ndarray, "h w"] | None = None,
         *,
         color: Channels = "rgb",
-    ) -> Progress:
+    ) -> LiveProgress:
         """Add an image (h,w,3) uint8 and its gripper pose (4,4) to the capture, and calibrate all images again.
 
         Returns the new state of the calibration. `joints` are the joint angles of the arm (rad), `time_s` is the time
@@ -101,7 +101,7 @@ class LiveCalibration:
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
-    def remove(self, index: int) -> Progress:
+    def remove(self, index: int) -> LiveProgress:
         """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image.
 
         Returns the new state of the calibration. A negative `index` counts from the end. Raises InputError if there is
@@ -114,7 +114,7 @@ class LiveCalibration:
             self.live.remove(names[index])
             return self.update()
 
-    def undo(self) -> Progress:
+    def undo(self) -> LiveProgress:
         """Undo the last addition or removal of an image since this object was made, and calibrate again.
 
         Returns the new state of the calibration, which is the same if there is nothing to undo.
@@ -136,7 +136,7 @@ class LiveCalibration:
             return calibrate(self.live.folder, out or self.live.folder / "result", options)
 
     @one_blas_thread
-    def update(self) -> Progress:
+    def update(self) -> LiveProgress:
         """Calibrate the images that the folder (`live`) has now, and return the new state of the calibration."""
         with self._lock:
             capture, before = self.live.capture(), self._mapped
@@ -162,13 +162,13 @@ class LiveCalibration:
             self.live.close()
             self._opened.close()
 
-    def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
+    def _calibrated(self, capture: Capture | None, added: str | None) -> LiveProgress:
         """Return the state of the calibration; without a calibration if fewer than three images are registered.
 
         `capture` has all images (None: there are none); `added` is the name of the image added last, None if none was.
         """
         names = self._mapped
-        state = Progress(images=names, added=added)
+        state = LiveProgress(images=names, added=added)
         if capture is None or self._map is None:
             return state
         made = self._map.reconstruction()
@@ -192,7 +192,7 @@ class LiveCalibration:
         if case is None:
             findings += [] if robot.unused is None else [robot.unused]
             few = Finding.of(FindingKind.FEW_IMAGES, "informs", "images", value=float(len(names)))
-            if len(names) >= FEW:
+            if len(names) >= LEAST_IMAGES_TO_REJECT:
                 why, then = "fewer than three images are registered", "let the views overlap more"
                 kind = FindingKind.NO_RECONSTRUCTION
                 few = Finding.of(kind, "rejects", "reconstruction", text=why, remedy=then)

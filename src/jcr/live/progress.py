@@ -19,7 +19,7 @@ FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class LiveProgress:
     """State of a live calibration: its images, findings and calibration."""
 
     images: tuple[str, ...]
@@ -91,7 +91,7 @@ def reached_accuracy(hand_eye: AnyCalibration) -> tuple[float, float] | None:
     return None if seen is None else (float(seen.within_95_mm), float(seen.rotation_95_deg))
 
 
-def faults(state: Progress) -> list[Finding]:
+def faults(state: LiveProgress) -> list[Finding]:
     """Return the findings that reject the calibration or warn, first those about the image added last.
 
     Findings that only state that more images are needed are left out.
@@ -102,7 +102,7 @@ def faults(state: Progress) -> list[Finding]:
     return sorted(found, key=lambda one: one.images != (state.added,))
 
 
-def finding_lines(state: Progress) -> list[str]:
+def finding_lines(state: LiveProgress) -> list[str]:
     """Return each finding of `faults` as a sentence; one about a single image has the commands to retake or remove it.
 
     Images are numbered from 1 in the commands.
@@ -114,7 +114,7 @@ def finding_lines(state: Progress) -> list[str]:
     ]
 
 
-def advice(state: Progress) -> str:
+def advice(state: LiveProgress) -> str:
     """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist."""
     if state.requirement_met:
         return REQUIREMENT_MET
@@ -122,7 +122,7 @@ def advice(state: Progress) -> str:
     return next(map(remedy, missed), FIRST_ADVICE)
 
 
-def progress_lines(state: Progress) -> list[str]:
+def progress_lines(state: LiveProgress) -> list[str]:
     """Return the state as lines of the terminal: accuracy, faults, and advice; advice alone with one image at most."""
     if state.hand_eye is None and len(state.images) <= 1:
         return [FIRST_ADVICE]
@@ -132,7 +132,7 @@ def progress_lines(state: Progress) -> list[str]:
     return [accuracy_line(state), *(f"  {line}" for line in below), advice(state)]
 
 
-def accuracy_line(state: Progress) -> str:
+def accuracy_line(state: LiveProgress) -> str:
     """Return a line with the number of registered images and the reached and required accuracy (95 %; mm, degrees)."""
     images = f"{len(state.registered)} of {len(state.images)} images registered"
     if state.reached is None or state.hand_eye is None:

@@ -17,7 +17,7 @@ from numpy import ndarray
 from jcr.calibration.options import GRASPING, RequiredAccuracy
 from jcr.errors import InputError, RejectedError
 from jcr.live.cameras import Camera, Frame, frame_at_rest
-from jcr.live.progress import Progress, progress_lines
+from jcr.live.progress import LiveProgress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_json import FrameEntry
 
@@ -69,7 +69,7 @@ class SessionState:
     """Whether a change can be undone."""
     replaces: str | None = None
     """Name of the image that the next one replaces; None: the next one is added."""
-    progress: Progress = Progress(images=())
+    progress: LiveProgress = LiveProgress(images=())
     """Last state of the calibration; the newest images may be missing in it."""
     is_over: bool = False
     """Whether the capture has ended: no more images are taken."""
@@ -314,7 +314,7 @@ class LiveSession:
         except Exception as error:
             self.end(error)
 
-    def _report(self, progress: Progress) -> None:
+    def _report(self, progress: LiveProgress) -> None:
         """Publish a new state of the calibration, on the page and through `tell`."""
         with self._changed:
             state = self.state
