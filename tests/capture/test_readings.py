@@ -153,6 +153,8 @@ def test_one_wrong_row_does_not_change_the_unit_of_the_others():
         (POSITION, "mm", "too near for mm; these look like metres: give --pose-units m-rad"),
         (POSITION, "cm", "too near for cm; these look like metres"),
         (1e3 * POSITION, "m", "these look like millimetres: give --pose-units mm-rad"),
+        # Read as millimetres without a word, the hand-eye transform was accepted ten times too small.
+        (1e2 * POSITION, None, "as centimetres: say which with --pose-units mm-rad or cm-rad"),
         # An arm on a vehicle 35 m from the origin of a map, in metres; whatever unit is stated.
         *(
             (POSITION + [35, 2, 0], stated, "base frame is far away: subtract one offset")

@@ -18,6 +18,11 @@ RADIANS_LIMIT = 2 * np.pi + 0.01
 """Largest plausible angle of a pose in radians; larger numbers are degrees."""
 METRES_LIMIT = 10.0
 """Largest plausible distance of a gripper from its base, m: the longest industrial arms reach 5 m, portals 10 m."""
+NEAR_BASE = 200.0
+"""Distance of all grippers from the base, in the unit as written, below which numbers that are no metres may be
+centimetres as well as millimetres: no arm has all its poses within 200 mm of its base, and few reach beyond 2 m. With
+300 the smallest arms (myCobot 280) would be asked; with 100, poses that are written in centimetres and go up to 1.5 m
+are read ten times too small."""
 UNIT_TOLERANCE = 1e-2
 """Largest accepted difference from 1 of a quaternion's length and of a matrix axis; three digits suffice."""
 SEQUENCES = (
@@ -187,6 +192,11 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
             f"{where}: the positions are {far:.4g} from the origin, and all within {spread:.3g} of each other; as "
             "metres the base frame is far away: subtract one offset from all, or give the poses in the arm's own base "
             "frame"
+        )
+    if stated is None and METRES_LIMIT < far < NEAR_BASE:
+        raise InputError(
+            f"{where}: the positions are at most {far:.3g} from the origin, {far / 1e3:.2g} m as millimetres and "
+            f"{far / 1e2:.2g} m as centimetres: say which with --pose-units mm-rad or cm-rad (or mm-deg, cm-deg)"
         )
     if far * per > METRES_LIMIT:
         if stated is None or (len(position) > 1 and spread * per <= METRES_LIMIT):

@@ -1,7 +1,9 @@
 """Command `jcr capture`: take a capture live, image by image, with its accuracy after each."""
 
 import os
+import signal
 import sys
+import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -88,6 +90,9 @@ class CaptureCommand:
             answers.append(answer)
             _print("\n".join(lines))
 
+        # A service manager ends the capture as Ctrl-C does, and not as glog does, with a page of C++ frames.
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
         with locked(out), open_camera(self.camera, self.camera_size) as camera:
             given, limits = given or camera.intrinsics, {"require": options.require}
             calibration = LiveCalibration(out, intrinsics=given, robot=self.robot, options=limits)

@@ -348,7 +348,10 @@ class VerifyCommand:
             lines += [] if joints is None else [f"{'':<20} joints (rad) {numbers(joints, 4)}"]
             facts.append({"image": image, "base_from_gripper": pose, "joints": joints})
             facts[-1] |= {"detectable_mm": mm, "detectable_deg": deg}
-        head = "go to these poses (m, quaternion xyzw); the images up to each find 9 of 10 changes of the camera above"
+        head = (
+            "take an image at these poses (m, quaternion xyzw). After each line, the images so far find 9 of 10 motions "
+            "of the camera of the size at its end"
+        )
         self.output.result([head, *lines], {"poses": facts})
         return 0
 

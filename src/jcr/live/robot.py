@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.notations import poses_of_rows
+from jcr.capture.notations import METRES_LIMIT, RADIANS_LIMIT, poses_of_rows
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import inverse, rotation_angle
@@ -102,6 +102,14 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
     if (named := BY_COUNT.get(len(numbers))) is None:
         forms = "x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; m, rad"
         raise InputError(f"{where}: {len(numbers)} numbers; give {forms}")
+    far_m, largest = float(np.linalg.norm(numbers[:3])), max(map(abs, numbers[3:6]))
+    if len(numbers) == 16:
+        far_m = float(np.linalg.norm(numbers[3:12:4]))
+    if far_m > METRES_LIMIT or (len(numbers) == 6 and largest > RADIANS_LIMIT):
+        said = (
+            f"{far_m:.4g} m from the base" if far_m > METRES_LIMIT else f"turned by up to {largest:.4g} rad"
+        )
+        raise InputError(f"{where}: the gripper is {said}; give metres and radians, not mm or degrees")
     return poses_of_rows(np.array([numbers], np.float64), named, "m-rad", where)[0]
 
 

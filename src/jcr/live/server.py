@@ -284,9 +284,13 @@ def sample_pose(body: bytes) -> Float[ndarray, "4 4"] | None:
             return None
         message = message.get("base_from_gripper")
     if not isinstance(message, list):
-        raise InputError('no "base_from_gripper" in the body; send 4 rows of 4 numbers in metres')
+        raise InputError(
+            'no "base_from_gripper" in the body; send 4 rows of 4 numbers, or 6, 7 or 16 numbers'
+        )
     try:
         numbers = np.array(message, dtype=np.float64).ravel().tolist()
     except (TypeError, ValueError, OverflowError):
-        raise InputError("base_from_gripper: not numbers; send 4 rows of 4 in metres") from None
+        raise InputError(
+            "base_from_gripper: not numbers; send 4 rows of 4 numbers, or 6, 7 or 16 numbers"
+        ) from None
     return pose_of_numbers(numbers, "base_from_gripper")

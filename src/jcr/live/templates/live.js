@@ -27,7 +27,8 @@
         holder.dispatchEvent(new Event("change"));
       }
     } catch {
-      element("away").hidden = false;
+      // After the end that the page has shown, nobody answers any more.
+      element("away").hidden = document.body.dataset.done === "true";
     }
   }
   async function look() {
