@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
+from jcr.capture.frame_choice import best_frames
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.recording import best_frames
 from jcr.capture.ros import image_of, read_ros_depth
 from jcr.records import Capture, FrameNames
 from simulation.problems import hand_eye_problem

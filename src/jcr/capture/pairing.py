@@ -39,7 +39,7 @@ ZONE_NS = 900 * 10**9
 MOMENT_NS = 1_000_000
 """Time (ns) before and after a stamp by which the speed there is measured."""
 AT_REST = 0.005
-"""Largest speed (m/s) of an arm at rest, as in jcr.capture.recording."""
+"""Largest speed (m/s) of an arm at rest, as in jcr.capture.frame_choice."""
 DATE = re.compile(
     r"(?<!\d)(\d{4})[-_.:]?(\d\d)[-_.:]?(\d\d)[T _-]+(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[.,_](\d{1,9}))?"
 )

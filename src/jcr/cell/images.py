@@ -13,6 +13,7 @@ from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.problem import Observations, Problem, State
 from jcr.estimation.robot_noise import of_poses
 from jcr.findings import FindingKind
+from jcr.records import Tracks
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
 EXACT = 1e-6
@@ -29,23 +30,7 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
     # If the calibration does not come from bundle adjustment, the own camera's tracks are not used here either.
     if hand_eye.source == "poses" or tracks.from_pointmaps or not case.model.is_determined:
         prior, tracks = _given_poses(rigs), tracks.only(np.zeros(len(tracks.image), bool))
-    rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
-    image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
-    std_px = [np.full(len(tracks.image), KEYPOINT_STD_PX) if tracks.std_px is None else tracks.std_px]
-    points = [hand_eye.scale * tracks.points_in_recon.astype(float)]
-    count = len(tracks.points_in_recon)
-    for c, member in enumerate(members, start=1):
-        for at, one in zip(member.rig.tolist(), member.used.values(), strict=True):
-            n = len(one.x_px)
-            image += [np.full(n, len(rig)), one.row]
-            x_px += [one.x_px, one.row_x_px]
-            point += [count + np.arange(n) if one.point is None else one.point, count + one.row_point]
-            std_px.append(np.full(n + len(one.row), KEYPOINT_STD_PX))
-            if one.point is None:
-                points.append(one.points_in_recon)
-                count += n
-            rig.append(at)
-            camera.append(c)
+    observations, points_in_world = _observations(rigs, members, tracks)
     contradicted = (one.kind is FindingKind.INTRINSICS and one.shift is None for one in hand_eye.findings)
     given = case.capture.intrinsics is not None and not any(contradicted)
     cameras = [camera_about(case.reconstruction.intrinsics, given, case.capture.intrinsics_std)]
@@ -57,21 +42,13 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
         cameras.append(replace(prior_of_it, mount_free=member.rig_from_camera is not None))
         mounts.append(np.eye(4) if member.rig_from_camera is None else member.rig_from_camera)
     arms, starts, effects = rigs.arm_poses()
-    points_in_world, seen = np.concatenate(points), np.concatenate(point)
-    twice = np.bincount(seen, minlength=len(points_in_world)) >= 2
+    twice = np.bincount(observations.point, minlength=len(points_in_world)) >= 2
     boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(rigs.poses))
     problem = Problem(
         arms=tuple(arms),
         n_rigs=len(rigs.poses) + len(world_from_board),
         cameras=tuple(cameras),
-        observations=Observations(
-            rig=np.array(rig),
-            camera=np.array(camera),
-            image=np.concatenate(image),
-            x_px=np.concatenate(x_px),
-            point=seen,
-            std_px=np.concatenate(std_px),
-        ),
+        observations=observations,
         known_rigs=prior,
         boards=boards,
         effects=effects,
@@ -86,6 +63,38 @@ def cell_images(rigs: Rigs, members: Sequence[CameraViews]) -> tuple[Problem, St
         points_in_world=points_in_world,
     )
     return problem, state
+
+
+def _observations(
+    rigs: Rigs, members: Sequence[CameraViews], tracks: Tracks
+) -> tuple[Observations, Float[ndarray, "p 3"]]:
+    """Return the observations by all cameras, and the p points (m, in the world): those of the own `tracks` first."""
+    rig, camera = list(range(len(rigs.rows))), [0] * len(rigs.rows)
+    image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
+    std_px = [np.full(len(tracks.image), KEYPOINT_STD_PX) if tracks.std_px is None else tracks.std_px]
+    points = [rigs.case.numbers.scale * tracks.points_in_recon.astype(float)]
+    count = len(tracks.points_in_recon)
+    for c, member in enumerate(members, start=1):
+        for at, one in zip(member.rig.tolist(), member.used.values(), strict=True):
+            n = len(one.x_px)
+            image += [np.full(n, len(rig)), one.row]
+            x_px += [one.x_px, one.row_x_px]
+            point += [count + np.arange(n) if one.point is None else one.point, count + one.row_point]
+            std_px.append(np.full(n + len(one.row), KEYPOINT_STD_PX))
+            if one.point is None:
+                points.append(one.points_in_recon)
+                count += n
+            rig.append(at)
+            camera.append(c)
+    observations = Observations(
+        rig=np.array(rig),
+        camera=np.array(camera),
+        image=np.concatenate(image),
+        x_px=np.concatenate(x_px),
+        point=np.concatenate(point),
+        std_px=np.concatenate(std_px),
+    )
+    return observations, np.concatenate(points)
 
 
 def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6*m 6*m"]]:
