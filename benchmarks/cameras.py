@@ -169,7 +169,9 @@ def run(captures: Path, every: int = 1) -> str:
         "Cameras that watch the gripper, each alone, with the board that it carries and without it (by features of what "
         "moves), and all together; `off` is from the pose that the repository states, σ the largest on an axis.",
         "",
-        *table("capture | camera | how | images | verdict | off: mm | ° | ±σ: mm | ° | σ | s", watching),
+        *table(
+            "capture | camera | how | images | verdict | off: mm | ° | ±σ: mm | ° | σ | processor s", watching
+        ),
     ]
     return "\n".join(lines) + "\n"
 
@@ -247,7 +249,7 @@ def _watching(folder: Path) -> Iterator[list[object]]:
         name: str, how: str, images: str, verdict: str, found: Any, covariance: Any, begun: float
     ) -> list[object]:
         """Return the row of one placed camera; `found` is its base_from_camera, None if it has none."""
-        off, seconds = ["–"] * 5, f"{time.perf_counter() - begun:.0f}"
+        off, seconds = ["–"] * 5, f"{time.process_time() - begun:.0f}"
         if found is not None:
             step, sigmas = farthest(found, covariance, [np.array(source["truth"][name])])
             off = [f"{value:.2f}" for value in (*mm_deg(step), *largest_std(covariance), sigmas)]
@@ -257,7 +259,7 @@ def _watching(folder: Path) -> Iterator[list[object]]:
         for (name, capture), (how, options) in product(
             captures.items(), {"board": board, "features": ReconstructOptions()}.items()
         ):
-            begun = time.perf_counter()
+            begun = time.process_time()
             try:
                 result = jcr.calibrate(capture, Path(out) / name / how, RunOptions(reconstruct=options))
             except RejectedError as error:
@@ -266,7 +268,7 @@ def _watching(folder: Path) -> Iterator[list[object]]:
             made = result.found
             used = f"{sum(one.used for one in made.images)} of {len(capture)}"
             yield row(name, how, used, made.verdict, made.base_from_camera, made.covariance[:6, :6], begun)
-        begun = time.perf_counter()
+        begun = time.process_time()
         result = jcr.calibrate(cell, Path(out) / "together", RunOptions(reconstruct=board))
         made = result.found
         used = f"{sum(one.used for one in made.images)} of {len(cell)}"

@@ -42,6 +42,8 @@ from jcr.result import RunResult
 
 WORST_PX = 2.0
 """rms misfit above which an image shows another thing than the board."""
+UNKNOWN_MM = 1000.0
+"""95 % bound of a reference from which it is said not to determine a place; the scenes are 0.3 to 0.8 m away."""
 DRAWS = 100
 """Draws of the errors that a calibration states."""
 
@@ -180,7 +182,7 @@ def _claims(rows: Sequence[Row], halves: Sequence[Apart]) -> Iterator[str]:
             yield (
                 f"> From {what}: {exact} of {len(some)} real captures are accepted, {len(sound) - exact} more are sound "
                 f"but miss 5 mm and 1°; a point is {np.median(mm):.1f} mm from its place by the reference (median "
-                f"of {len(mm)}; worst {worst.mm:.1f} mm, with {worst.other_mm:.1f} mm of the reference), within 2 σ of "
+                f"of {len(mm)}; worst {worst.mm:.1f} mm, {_of_reference(worst.other_mm)}), within 2 σ of "
                 f"both in {sum(one.sigmas < 2 for one in apart)}."
             )
     if halves:
@@ -188,6 +190,15 @@ def _claims(rows: Sequence[Row], halves: Sequence[Apart]) -> Iterator[str]:
             f"> Of {len(halves)} captures cut in halves {sum(one.sigmas < 2 for one in halves)} agree within 2 σ, a "
             f"point within what both state for 95 % in {sum(one.mm < one.stated_mm for one in halves)}."
         )
+
+
+def _of_reference(mm: float) -> str:
+    """Return what a reference with this 95 % bound (mm) can tell about a place, in words."""
+    return (
+        f"known to {mm:.1f} mm by the reference"
+        if mm < UNKNOWN_MM
+        else "which the reference does not determine"
+    )
 
 
 def _calibrated(capture: Capture, board: str | None = None) -> tuple[RunResult | None, float]:
@@ -235,7 +246,10 @@ def _row(
         seconds,
     )
     images = f"{sum(image.used for image in result.calibration.images)} of {len(capture)}"
-    return Row(board is None, verdict, apart, [*head, images, verdict, *map(number, values)])
+    cells = [*head, images, verdict, *map(number, values)]
+    if apart is not None and apart.other_mm >= UNKNOWN_MM:
+        cells[-7] = "over 1 m"
+    return Row(board is None, verdict, apart, cells)
 
 
 def _halves(capture: Capture) -> Iterator[tuple[str, Apart]]:
