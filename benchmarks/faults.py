@@ -38,7 +38,7 @@ SIGMAS, JOINT_P = 3.0, 0.0027
 """Largest error on an axis in stated standard deviations, and least joint chance, of an error that is stated rightly."""
 FOCUS = frozenset({FindingKind.FOCUS_BY_DISTANCE, FindingKind.FOCUS_BY_IMAGE})
 ZOOM = frozenset({FindingKind.ZOOM, FindingKind.FOCUS_BY_IMAGE})
-SHUTTER = frozenset({FindingKind.ROLLING_SHUTTER, FindingKind.ROLLING_SHUTTER_BY_IMAGE})
+SHUTTER = frozenset({FindingKind.ROLLING_SHUTTER})
 INTRINSICS = frozenset({FindingKind.INTRINSICS})
 MOVED = frozenset({FindingKind.SLIP, FindingKind.DRIFT})
 ORDER = frozenset({FindingKind.POSE_CONVENTION, FindingKind.DELAY, FindingKind.POSES_SWAPPED})

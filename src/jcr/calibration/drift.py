@@ -36,7 +36,7 @@ matter for what is just found, the large ones for the cause of an obvious change
 found by 3 %."""
 ROBOT_SIZES = TYPICAL[2] * np.array([0.3, 1.0, 3.0, 10.0])
 """Sizes σ_s (rad) of a change of the robot's systematic errors: from typical ones of good arms to 1° in each joint."""
-CLEAR = 5.0
+CLEAR_CAUSE = 5.0
 """Difference of log evidence from which two causes are distinguished (150 to 1)."""
 POWER = 0.9
 """Probability of detecting a change of the size `detectable`."""
@@ -45,7 +45,7 @@ VIEWS_ALIKE = 0.3
 cause; half or twice of it changes the detectable drift by less than 5 %."""
 LEVELS, FINE, WIDE = (-2.0, 0.0, 2.0), (-2.0, -1.0, 0.0, 1.0, 2.0), 0.5
 """Grid of log error sizes along each axis, in standard deviations from the mode; a finer one for larger ones."""
-WEAK = (0.1, 0.3)
+CHANGE_STD = (0.1, 0.3)
 """Prior standard deviations (m, rad) of a change that is adopted; they exceed those that can be located."""
 BEFORE, COARSE = 4, 0.05
 """Number of captures before the newest from which error sizes are estimated, and the last step (log) of their estimate:
@@ -54,7 +54,7 @@ EQUAL = np.repeat([1e-3, np.radians(0.1)], 3)
 """Steps (m, rad) of equal weight in the choice of poses: at 0.5 m they move a point equally far."""
 MOST_OLD = 30
 """Largest number of images of the calibration that are used; their errors are then a small part of a new image's."""
-STEP_SETTLED, ITERATIONS = 1e-6, 10
+MOTION_SETTLED, ITERATIONS = 1e-6, 10
 """Largest step (m, rad) at which the iterations end, and largest number of iterations."""
 
 Cause = Literal["camera", "scene", "robot", "image"]
@@ -237,7 +237,7 @@ def most_telling(
         list[int](),
         list[tuple[int, tuple[float, float]]](),
     )
-    sizes, scene = None, np.diag(np.r_[np.zeros(6), np.repeat(WEAK, 3) ** -2.0])
+    sizes, scene = None, np.diag(np.r_[np.zeros(6), np.repeat(CHANGE_STD, 3) ** -2.0])
 
     def solved(rows: list[int]) -> _Solved:
         nonlocal sizes
@@ -370,7 +370,9 @@ def _explained(data: _Data, sizes: Sequence[LogSizes], log_factors: Float[ndarra
         evidence["image"] = float(logsumexp(each) - np.log(len(each)))
         made["image"] = Change(cause="image", first=int(each.argmax()), named=last)
     best = max(evidence, key=evidence.__getitem__)
-    near = (one for one in evidence if one not in (best, "image") and evidence[best] - evidence[one] < CLEAR)
+    near = (
+        one for one in evidence if one not in (best, "image") and evidence[best] - evidence[one] < CLEAR_CAUSE
+    )
     return made[best].model_copy(update={"rivals": tuple(near)})
 
 
@@ -413,7 +415,7 @@ def _iterated(
         best = int(np.argmax([one.log_weight + one.log_factor for one in at]))
         step, likeliest = at[best].estimate - motion, [likeliest[best]]
         motion = motion + step
-        if np.abs(step).max() < STEP_SETTLED:
+        if np.abs(step).max() < MOTION_SETTLED:
             break
     return motion, linearised(motion, sizes)
 
@@ -423,7 +425,7 @@ def _sizes(model: _Model) -> list[LogSizes]:
 
     Camera and scene are free in each capture, so that a change does not enlarge the sizes.
     """
-    free = [model.by_capture(one * np.repeat(WEAK, 3)) for one in (model.by_camera, model.by_scene)]
+    free = [model.by_capture(one * np.repeat(CHANGE_STD, 3)) for one in (model.by_camera, model.by_scene)]
     jacobian = np.concatenate([model.equations.jacobian, model.nuisance, *free], axis=1)
     added = jacobian.shape[1] - UNKNOWNS
     whole = replace(
@@ -486,7 +488,7 @@ def _model(
     model = _Model(equations, np.repeat(capture, 6), np.zeros((len(is_new), 0)), by_camera, by_scene)
     columns = [model.nuisance]
     for change in changes:
-        size = change.size if change.cause == "robot" else np.repeat(WEAK, 3)
+        size = change.size if change.cause == "robot" else np.repeat(CHANGE_STD, 3)
         columns.append(model.columns(change.cause) * (model.capture >= change.first)[:, None] * size)
     return model._replace(nuisance=np.concatenate(columns, axis=1))
 

@@ -77,7 +77,7 @@ NAMES = {
     "base": ("base_from_camera", "gripper_from_object"),
 }
 """Names of the two transforms of a calibration, for a camera on the gripper and for one fixed in the base frame."""
-FARTHEST = 30.0
+FARTHEST_DEPTH = 30.0
 """Largest depth of a point, as a multiple of the calibration's working distance: a depth in mm is 1000 times too large,
 and 30 is about the geometric mean of 1 and 1000, so ± 50 % changes nothing."""
 
@@ -380,7 +380,7 @@ class Calibration(Outcome):
                 f"pixel {first}: outside of the image of {size[0]}x{size[1]}; give x, then y, from 0"
             )
         seen = self.uncertainty.seen
-        farthest = np.inf if seen is None else FARTHEST * 1e-3 * seen.distance_mm
+        farthest = np.inf if seen is None else FARTHEST_DEPTH * 1e-3 * seen.distance_mm
         wrong = ~((depth_m > 0) & (depth_m < farthest))
         if wrong.any():
             where = (

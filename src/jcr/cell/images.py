@@ -16,7 +16,7 @@ from jcr.findings import FindingKind
 from jcr.records import Tracks
 from jcr.sfm.track_refinement import KEYPOINT_STD_PX
 
-EXACT = 1e-6
+GIVEN_POSE_STD = 1e-6
 """Standard deviation (m, rad) added to the covariance of given camera poses."""
 
 
@@ -103,7 +103,7 @@ def _given_poses(rigs: Rigs) -> tuple[Float[ndarray, "m 4 4"], Float[ndarray, "6
     The mean is recon_from_camera in metres. The covariance is pose by pose: translation (m), then rotation (rad).
     """
     rows = rigs.case.used
-    covariance = EXACT**2 * np.eye(6 * len(rows))
+    covariance = GIVEN_POSE_STD**2 * np.eye(6 * len(rows))
     if (evidence := rigs.case.reconstruction.evidence) is not None:
         unit = np.tile(np.repeat([rigs.case.numbers.scale, 1.0], 3), len(rows))
         covariance += unit[:, None] * of_poses(evidence.covariance, rows) * unit

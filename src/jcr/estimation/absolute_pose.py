@@ -28,13 +28,13 @@ INEFFICIENCY = 1.09
 """Variance of the estimate with the Cauchy loss over that of least squares, for normal errors (Huber 1981)."""
 LEAST_STD_PX = 0.05
 """Lower bound of the estimated pixel noise."""
-MAX_ROUNDS, POSE_SETTLED = 10, 1e-2
+POSE_ROUNDS, POSE_SETTLED = 10, 1e-2
 """Largest number of rounds of noise estimate and least squares, and the step (in σ) that ends them."""
 BEHIND_PX = 1e4
 """Assumed residual (px) of a point behind the camera."""
 AMBIGUOUS = 1.5
 """Ratio of the rms errors of the two poses of a plane, up to which they are ambiguous."""
-APART = np.radians(5.0)
+POSES_APART = np.radians(5.0)
 """Smallest angle (rad) between the two poses of a plane that counts as an ambiguity."""
 
 
@@ -100,7 +100,7 @@ def absolute_pose(
     for other in others:
         assert best is not None
         apart = float(rotation_angle(best.a_from_camera[:3, :3].T @ other.a_from_camera[:3, :3]))
-        if planar and apart > APART and other.rms_px < AMBIGUOUS * best.rms_px + 0.05:
+        if planar and apart > POSES_APART and other.rms_px < AMBIGUOUS * best.rms_px + 0.05:
             return replace(best, rival=other.a_from_camera)
     return best
 
@@ -144,7 +144,7 @@ def _refined(
     """
     loss, scale, inefficiency = ("linear", 1.0, 1.0) if planar else ("cauchy", LOSS_SCALE, INEFFICIENCY)
     (pose, camera, inlier), found = start, None
-    for _ in range(MAX_ROUNDS):
+    for _ in range(POSE_ROUNDS):
         residual, jacobian = _reprojection(x_px, points, pose, camera, p)
         # The derivative by a point is minus the derivative by the camera's translation.
         added = jacobian[..., :3] @ spread @ np.swapaxes(jacobian[..., :3], 1, 2)

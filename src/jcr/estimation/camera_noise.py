@@ -28,9 +28,9 @@ from jcr.geometry import Poses, by_similarity, nearest_to_lines
 
 MIN_TESTED_POSES = 8
 """Smallest number of poses for a test of camera errors. More than MOST_FOR_SIZES are sampled evenly."""
-CLEAR = 3.0
+CLEAR_GAIN = 3.0
 """Gain of the log evidence from which a component is included: odds of 20 to 1."""
-SETTLED = 0.03
+COARSELY_SETTLED = 0.03
 """Step of the log sizes at which the search of their mode ends; the log evidence changed by at most 0.011 beyond,
 in 42 searches."""
 TYPICAL_M, TYPICAL_RAD, TYPICAL_WALK_M = 1e-3, 1e-3, 3e-4
@@ -74,8 +74,8 @@ def camera_error_covariance(
     """Return the estimated covariance (6n,6n) of the errors of n camera poses; None if the poses show none.
 
     Rows are the steps of each pose (geometry.retract; recon axes and unit, rad). Components are added one by one, each
-    with the largest log evidence of the `used` poses, while the gain exceeds CLEAR. Fewer than MIN_TESTED_POSES used
-    poses give None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
+    with the largest log evidence of the `used` poses, while the gain exceeds CLEAR_GAIN. Fewer than MIN_TESTED_POSES
+    used poses give None. `fit` is the estimate of (gripper_from_camera, scale, base_from_recon) without such errors.
     `model` is that of the pairs with exact camera poses. `adding_up`: errors that accumulate along the images are
     tested too.
     """
@@ -103,10 +103,10 @@ def camera_error_covariance(
         found: list[tuple[float, Equations, LogSizes, tuple[Part, ...]]] = []
         for parts, covariances in components.items():
             tried = replace(equations, camera_errors=(*equations.camera_errors, *covariances))
-            at, information = most_likely(tried, np.r_[sizes, np.zeros(len(covariances))], SETTLED)
+            at, information = most_likely(tried, np.r_[sizes, np.zeros(len(covariances))], COARSELY_SETTLED)
             found.append((log_evidence(tried, solve_equations(tried, at), information), tried, at, parts))
         likeliest = max(found, key=lambda one: one[0], default=None)
-        if likeliest is None or likeliest[0] < best + CLEAR:
+        if likeliest is None or likeliest[0] < best + CLEAR_GAIN:
             break
         best, equations, sizes, parts = likeliest
         adopted += parts

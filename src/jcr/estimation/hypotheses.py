@@ -449,11 +449,8 @@ def camera_effects(model: Examined, min_images: int) -> Iterator[Effect]:
     each = focal @ np.linalg.svd(np.eye(m) - 1 / m)[0][:, : m - 1]
     yield effect(kind=FindingKind.FOCUS_BY_DISTANCE, columns=by_distance, nuisance=common, unit=unit)
     yield effect(kind=FindingKind.FOCUS_BY_IMAGE, columns=each, nuisance=common)
-    for kind, shares in (
-        (FindingKind.ROLLING_SHUTTER, np.ones((m, 1))),
-        (FindingKind.ROLLING_SHUTTER_BY_IMAGE, np.eye(m)),
-    ):
-        yield effect(kind=kind, columns=shear @ shares, nuisance=common, unit=camera.fx)
+    sheared = shear.sum(1, keepdims=True)
+    yield effect(kind=FindingKind.ROLLING_SHUTTER, columns=sheared, nuisance=common, unit=camera.fx)
     places = range(LEAST_ZOOMED, m - LEAST_ZOOMED + 1)
     for k in places:
         after = focal @ ((np.arange(m) >= k) - (m - k) / m)[:, None]

@@ -29,7 +29,7 @@ SIZES_SETTLED = 0.01
 """Relative change of the sizes of errors, of pixels and of robots, that ends the rounds."""
 ENOUGH = 1e-5
 """Change of the cost, in squared standard deviations, that ends an adjustment."""
-STEPS = 60
+MAX_STEPS = 60
 """Largest number of Gauss-Newton steps of one adjustment."""
 FAINT = 1e-6
 """Information added to every column (1/m², 1/rad²): a standard deviation of 1 km for images without observations."""
@@ -157,7 +157,7 @@ def adjusted_images(problem: Problem, state: State, guide: RigInformation) -> St
         lambda now: _cost(problem, *now, weight, known),
         (state, view),
         enough=lambda _: ENOUGH,
-        iterations=STEPS,
+        iterations=MAX_STEPS,
     )[0][0]
 
 

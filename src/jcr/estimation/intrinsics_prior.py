@@ -149,7 +149,7 @@ DEGREE, POLYNOMIALS = 5, 42
 """Total degree of the polynomials of the remaining distortion, and their number (21 for x, 21 for y)."""
 TYPICAL = 1e-4
 """Middle of the weak prior on the size of the remaining distortion, in image widths."""
-UPDATES, SETTLED = 100, 1e-3
+UPDATES, SIZE_SETTLED = 100, 1e-3
 """Largest number of updates of the remaining distortion's size, and the relative change of its square that ends them."""
 WORTH = 2.0
 """Weight of the weak prior on the remaining distortion's size, as a number of polynomials."""
@@ -187,7 +187,7 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
         determined = float((known / information).sum())
         squares = float(((right / information) ** 2).sum())
         before, variance = variance, (squares + WORTH * TYPICAL**2) / (determined + WORTH)
-        if abs(np.log(variance / before)) < SETTLED:
+        if abs(np.log(variance / before)) < SIZE_SETTLED:
             break
     return float(np.sqrt(variance))
 

@@ -31,7 +31,7 @@ from jcr.least_squares import minimise
 
 STARTS = 12
 """Number of sets of initial joint angles for each pose."""
-STEPS = 30
+JOINT_STEPS = 30
 """Largest number of Gauss-Newton steps."""
 MOST_FOR_TOOL = 30
 """Largest number of poses from which an unknown tool is estimated."""
@@ -103,7 +103,9 @@ def reach_toward(arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], start: Jo
     def moved(joints: Joints, step: Joints) -> Joints:
         return np.clip(joints + step / np.abs(step).max(1, keepdims=True).clip(1.0), low, high)
 
-    return minimise(linearised, np.clip(start, low, high), moved, tolerance=1e-9, iterations=STEPS).unknowns
+    return minimise(
+        linearised, np.clip(start, low, high), moved, tolerance=1e-9, iterations=JOINT_STEPS
+    ).unknowns
 
 
 def _error(
@@ -212,7 +214,7 @@ def _with_tool(
         return np.clip(at[0] + step[:-6].reshape(n, dof), *arm.limits.T), retract(at[1], step[-6:])
 
     return minimise(
-        linearised, (joints[some], flange_from_tool), moved, tolerance=1e-9, iterations=STEPS
+        linearised, (joints[some], flange_from_tool), moved, tolerance=1e-9, iterations=JOINT_STEPS
     ).unknowns[1]
 
 
@@ -220,7 +222,7 @@ NOISE = (1e-3, 1e-3 / ARM)
 """Position and rotation errors (m, rad) that have equal weight in the fit of base and tool."""
 AGREE = (0.015, np.radians(1.5))
 """Largest rms difference between forward kinematics and poses, as a share of the reach and in rad."""
-ALIKE, SURE = 0.01, 5.0
+LENGTH_ERROR, LENGTH_SIGMAS = 0.01, 5.0
 """Relative difference of lengths that counts as an error, and the number of standard deviations it must exceed."""
 
 
@@ -249,7 +251,7 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
         noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
         j /= np.repeat(noise, 3)[:, None]
         std = scale * float(np.sqrt(expected_covariance(np.einsum("nij,nik->jk", j, j))[6, 6]))
-        if abs(scale - 1) > max(ALIKE, SURE * std):
+        if abs(scale - 1) > max(LENGTH_ERROR, LENGTH_SIGMAS * std):
             raise LengthError(
                 f"the gripper positions are {100 * abs(scale - 1):.1f} ± {100 * std:.1f} % too "
                 f"{'long' if scale > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "

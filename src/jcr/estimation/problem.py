@@ -498,7 +498,7 @@ def with_observations(problem: Problem, state: State) -> tuple[Problem, State]:
     return problem, state
 
 
-WEAK = 0.3, 0.3, 0.2, 0.2
+WEAK_INTRINSICS = 0.3, 0.3, 0.2, 0.2
 """Weak prior standard deviations of fx, fy (relative), cx, cy (image widths): they keep unobservable ones finite."""
 WEAK_DISTORTION, WEAK_PRISM, WEAK_OF_IMAGE = 1.0, 0.3, (0.05, 0.3)
 """Weak prior standard deviations of distortion, thin prism, and the OF_IMAGE parameters of each image."""
@@ -521,7 +521,8 @@ def rows_of(
     units = np.ones(len(rows))
     units[:4] = intrinsics.fx, intrinsics.fy, intrinsics.width, intrinsics.width
     of_each, more = np.repeat(WEAK_OF_IMAGE, len(images)), own.stop - own.start - 4
-    return rows, units, np.r_[WEAK, np.full(more, WEAK_DISTORTION), of_each, np.full(PRISM, WEAK_PRISM)]
+    of_camera = *WEAK_INTRINSICS, *[WEAK_DISTORTION] * more
+    return rows, units, np.r_[of_camera, of_each, np.full(PRISM, WEAK_PRISM)]
 
 
 OF_OBSERVATIONS = ("model_error_counts", "layout", "seen", "rows", "displacements", "camera_rows", "prism")

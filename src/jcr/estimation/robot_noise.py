@@ -97,11 +97,11 @@ RATIO_STD = np.log(4.0)
 """Prior standard deviation of log(σ_t / (REACH · σ_r)); with log 2, 95 % regions of three images hold 80 to 90 %."""
 LEVELS = tuple(1.5 * np.arange(-4, 5))
 """Grid of log sizes along each axis, in standard deviations from the mode; relative error of an average: 3e-4."""
-FARTHEST, LESS_FAR = 21.0, 10.0
+GRID_RADIUS, SMALL_GRID_RADIUS = 21.0, 10.0
 """Largest squared distance (σ²) of grid points from the mode; with 7, 95 % regions of three images hold 81 %."""
 FINE_GRID_BELOW, MOST_FOR_SIZES = 15, 50
-"""Number of poses from which the grid is smaller (LESS_FAR), and above which the mode of the sizes replaces it."""
-AT_ONCE = 4e6
+"""Number of poses from which the grid is smaller, and above which the mode of the sizes replaces it."""
+ELEMENTS_AT_ONCE = 4e6
 """Largest number of array elements for the grid points of the sizes that are solved together."""
 MODE_SETTLED = 1e-4
 """Largest step of the log sizes at which the search of their mode ends."""
@@ -426,10 +426,10 @@ def over_sizes(
         drop = np.maximum(2 * (top - np.array(others)), 1e-3)
         shorter, longer = np.clip(probe / np.sqrt(drop), 0.3, 3.0).reshape(2, -1)
         z = np.array(list(product(LEVELS, repeat=len(own))))
-        z = z[(z**2).sum(1) < (FARTHEST if poses < FINE_GRID_BELOW else LESS_FAR)]
+        z = z[(z**2).sum(1) < (GRID_RADIUS if poses < FINE_GRID_BELOW else SMALL_GRID_RADIUS)]
         lengths = np.where(z < 0, shorter, longer)
         sizes, log_volumes = mode + (lengths * z) @ axes.T, np.log(lengths).sum(1)
-    together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
+    together = max(1, int(ELEMENTS_AT_ONCE / len(equations.residual) ** 2))
     groups = [sizes[at : at + together] for at in range(0, len(sizes), together)]
     solutions = [solve_equations(equations, group) for group in groups]
     log_weight = np.concatenate([density(each) for each in solutions]) + log_volumes

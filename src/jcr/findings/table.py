@@ -180,9 +180,6 @@ class FindingKind(StrEnum):
     ROLLING_SHUTTER = "images sheared alike", KindRow("camera",
         "the images are sheared by {value:.1f} ± {std:~} px from top to bottom, as by the rolling "
         "shutter of a moving camera", "take the images at rest", explains=MISFIT)
-    ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself", KindRow("camera",
-        "each image is sheared by itself, {value:.1f} px from top to bottom (rms), as by the "
-        "rolling shutter of a moving camera", "take the images at rest", explains=MISFIT)
     THIN_PRISM = "thin prism", KindRow("camera",
         "the images show a thin-prism distortion of up to {value:.1f} ± {std:~} px: the sensor is "
         "tilted, or the lens is decentred",

@@ -56,7 +56,7 @@ LEAST_EIGENVALUE = 1e-14
 """Smallest eigenvalue of a valid correlation matrix; a smaller one means linearly dependent errors or lost digits."""
 LOST_DIGITS = 1e-3
 """Largest rounding error of a part's correlation matrix: its eigenvalues may be that far below 0."""
-EXACT = 1e-15
+ROUNDING_STD = 1e-15
 """Smallest standard deviation by which a part's covariance is normalized; smaller ones are rounding errors."""
 
 
@@ -66,7 +66,7 @@ def _covariance(rows: list[list[float]], *, least: float = -LOST_DIGITS) -> Floa
     Raises ValueError if it is not symmetric, or if an eigenvalue of its correlation matrix is below `least`.
     """
     matrix = np.array(rows)
-    std = np.sqrt(np.maximum(np.diag(matrix), EXACT**2))
+    std = np.sqrt(np.maximum(np.diag(matrix), ROUNDING_STD**2))
     correlation = matrix / np.outer(std, std)
     if not (eigenvalue := np.linalg.eigvalsh(correlation)[0]) >= least:
         what = "no variance" if eigenvalue > -LOST_DIGITS else "a negative variance"

@@ -41,7 +41,7 @@ from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
 from jcr.geometry import Poses, step_between
 from jcr.rounding import significant
 
-AT_ONCE = 3
+MOST_EFFECTS = 3
 """Largest number of effects that are reported for one capture."""
 EXAMINED_FROM = 6
 """Fewest images with which effects other than wrong intrinsics are tested."""
@@ -108,7 +108,6 @@ POLICIES = {
     FindingKind.FOCUS_BY_IMAGE: Policy("images", 1e-6, (LARGEST_FOCUS, np.inf)),
     FindingKind.ZOOM: Policy("images", 1e-6, (LARGEST_FOCUS, np.inf)),
     FindingKind.ROLLING_SHUTTER: Policy("images", 1e-6, (LARGEST_SHEAR, np.inf), least_px=3.0),
-    FindingKind.ROLLING_SHUTTER_BY_IMAGE: Policy("images", 1e-6, (LARGEST_SHEAR, np.inf), least_px=3.0),
     FindingKind.THIN_PRISM: Policy("intrinsics", 1e-6, (LARGEST_PRISM, np.inf), least_px=1.0),
     FindingKind.INTRINSICS: Policy("intrinsics", 1e-6),
 }
@@ -121,8 +120,6 @@ NEARLY_ALL = 0.9
 """Fraction of the squared focal-length differences that a simpler effect must explain to replace FOCUS_BY_IMAGE."""
 CONFIRMED_AT_MOST = {True: 2, False: 3}
 """Number of kinds of effects that are confirmed, on the camera (True), each by an adjustment, and on the poses."""
-OF_EACH = {FindingKind.FOCUS_BY_IMAGE, FindingKind.ROLLING_SHUTTER_BY_IMAGE}
-"""Effects with a separate parameter for each image."""
 
 
 def check_effects(case: Case) -> Case:
@@ -207,7 +204,7 @@ def with_rejected_runs(used: Bool[ndarray, " n"]) -> Bool[ndarray, " n"]:
 
 
 def effects(
-    model: Examined, passed: Collection[FindingKind] = (), at_most: int = AT_ONCE
+    model: Examined, passed: Collection[FindingKind] = (), at_most: int = MOST_EFFECTS
 ) -> tuple[tuple[Effect, ...], tuple[Finding, ...]]:
     """Return the confirmed effects on the tested camera and arm, and one finding for each.
 
@@ -292,7 +289,7 @@ def _is_plausible(test: Test, model: Examined) -> bool:
         most = np.array([PLAUSIBLE[name] for name in tested_intrinsics(model)])
     elif effect.kind is FindingKind.FOCUS_BY_DISTANCE:
         most = most / effect.unit
-    elif effect.kind not in OF_EACH:
+    elif effect.kind is not FindingKind.FOCUS_BY_IMAGE:
         return bool((sizes <= most).all() and (std <= most / 2).all())
     return bool((sizes <= most).all() and np.median(std / most) <= 0.5)
 
@@ -366,7 +363,7 @@ def finding_of(test: Test, model: Examined) -> Finding | None:
         by = (parameters(after.intrinsics) - parameters(model.intrinsics)).tolist()
         known |= {"intrinsics_shift": tuple(by)}
         if kind is not FindingKind.INTRINSICS:
-            least = SURE * known["std"] if kind in OF_EACH else -np.inf
+            least = SURE * known["std"] if kind is FindingKind.FOCUS_BY_IMAGE else -np.inf
             if known["value"] < max(least, policy.least_px or -np.inf):
                 return None
         if kind is FindingKind.INTRINSICS and log_p_of_given(after) < 0:
@@ -433,9 +430,9 @@ def _size_of_strain(test: Test) -> dict[str, Any]:
 def _size_of_camera_effect(test: Test, after: Examined) -> dict[str, Any]:
     """Return the keyword arguments of `Finding.of` for the size of an effect on the camera, and its standard deviation.
 
-    The size `value` is the rms of the effect's parameters: px, or a relative change of the focal length. A single
-    focal-length parameter keeps its sign. For a thin prism the size is the largest displacement of a point (px). For
-    wrong intrinsics each parameter is stated instead. `after` is the adjustment with the effect.
+    The size `value` is the effect's parameter, for one of each image the rms: px, or a relative change of the focal
+    length. A single focal-length parameter keeps its sign. For a thin prism the size is the largest displacement of a
+    point (px). For wrong intrinsics each parameter is stated instead. `after` is the adjustment with the effect.
     """
     effect, value, std = test.effect, test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0.0))
     problem = after.solution.problem
@@ -447,11 +444,10 @@ def _size_of_camera_effect(test: Test, after: Examined) -> dict[str, Any]:
         size = float(np.linalg.norm(moved[k]))
         along = moved[k] / max(size, 1e-12) @ problem.prism[k]
         return {"value": size, "std": float(np.sqrt(along @ test.covariance @ along))}
-    typical, count = effect.unit * float(np.median(std)), len(value)
-    if effect.kind in OF_EACH:
-        return {"value": effect.unit * float(np.sqrt(value @ value / len(after.names))), "std": typical}
-    size = value[0] if effect.kind in FOCUS else np.sqrt(np.mean(value**2))
-    return {"value": effect.unit * float(size), "std": typical / float(np.sqrt(count))}
+    size = value[0] if effect.kind in FOCUS else abs(value[0])
+    if effect.kind is FindingKind.FOCUS_BY_IMAGE:
+        size = np.sqrt(value @ value / len(after.names))
+    return {"value": effect.unit * float(size), "std": effect.unit * float(np.median(std))}
 
 
 def _intrinsics(after: Examined, stds: Float[ndarray, " p"]) -> dict[str, Any]:

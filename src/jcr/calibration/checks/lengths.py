@@ -41,7 +41,7 @@ to 1.4 mm, because the adjustment rotates and shifts the transform."""
 MISPRINTED = 0.1
 """Largest relative difference that a board's print or a mistyped side explains better than an error of the robot, whose
 positions have a common scale error of ROBOT_STD; larger ones come from units."""
-EXACT = 0.015
+EXACT_LENGTH = 0.015
 """Largest relative standard deviation with which a length can reject a calibration."""
 WORTH = 10.0
 """Largest ratio of a length's standard deviation to that of the robot's scale for which the length is a prior; a less
@@ -91,7 +91,7 @@ def check_lengths(case: Case) -> Case:
     # The difference of the most exact length from the robot, as far as it exceeds their uncertainties, is a fault.
     best, fault = min(lengths, key=lambda one: one.std, default=robot), np.zeros((7, 7))
     beyond = best.off**2 - best.std**2 - robot.std**2
-    if pair is None and converged and best.std < EXACT and beyond > 0:
+    if pair is None and converged and best.std < EXACT_LENGTH and beyond > 0:
         shift = _shift(float(np.sqrt(beyond)), case.calibration)
         fault = np.outer(shift, shift)
     before = case.numbers.scale
@@ -138,7 +138,7 @@ def _contradiction(one: LengthCheck, other: LengthCheck, hand_eye: Calibration) 
 
     A board that contradicts the robot by up to MISPRINTED was printed or stated at a wrong size. The finding then
     warns, because the result is that of the robot alone. At a larger difference the finding rejects if both lengths are
-    exact (EXACT).
+    exact (EXACT_LENGTH).
     """
     off, std = other.off - one.off, float(np.hypot(one.std, other.std))
     size: dict[str, Any] = {"value": float(np.expm1(off)), "std": std}
@@ -149,9 +149,9 @@ def _contradiction(one: LengthCheck, other: LengthCheck, hand_eye: Calibration) 
         return Finding.of(FindingKind.SCALES, "warns", "poses", **size, one=one.name, other=other.name)
     if abs(off) <= MISPRINTED:
         return Finding.of(FindingKind.BOARD_SIZE, "warns", "none", **size)
-    if other.std < EXACT:
+    if other.std < EXACT_LENGTH:
         size["shift"] = tuple(_shift(off, hand_eye).tolist())
-    severity = "rejects" if max(one.std, other.std) < EXACT else "warns"
+    severity = "rejects" if max(one.std, other.std) < EXACT_LENGTH else "warns"
     return Finding.of(FindingKind.BOARD_SIZE, severity, "poses", **size)
 
 

@@ -14,7 +14,7 @@ from jcr.geometry import ARM
 
 MIN_EXAMINED = 4
 """Fewest used images with which joint offsets are estimated."""
-SURE = 2.5
+REPORTED_OFFSET = 2.5
 """Size of a joint offset, in standard deviations, above which it is reported."""
 
 INTERPOLATED = 5.0
@@ -40,16 +40,16 @@ def _equations(case: Case) -> PoseEquations:
 def check_robot(case: Case) -> Case:
     """Return the case with estimated joint offsets of a known arm, and a finding on the significant ones.
 
-    An offset (true minus reported angle) is significant above SURE standard deviations. No joint is reported if there
-    are findings about the camera, whose effects also change the camera poses. Nothing is estimated for an unknown arm,
-    or with fewer than MIN_EXAMINED used images.
+    An offset (true minus reported angle) is significant above REPORTED_OFFSET standard deviations. No joint is reported
+    if there are findings about the camera, whose effects also change the camera poses. Nothing is estimated for an
+    unknown arm, or with fewer than MIN_EXAMINED used images.
     """
     used, arm, joints = case.used, case.robot.arm, case.robot.joints
     if not case.is_open or len(used) < MIN_EXAMINED or arm is None or joints is None:
         return case
     found = joint_offsets(_equations(case), arm, joints[used])
     case = replace(case, numbers=replace(case.numbers, joint_offsets=found))
-    off = np.flatnonzero(np.abs(found.offset) > SURE * found.std).tolist()
+    off = np.flatnonzero(np.abs(found.offset) > REPORTED_OFFSET * found.std).tolist()
     if not off or any(one.kind.row.group == "camera" for one in case.findings):
         return case
     degrees = np.degrees([found.offset, found.std]).T
