@@ -83,7 +83,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     ),
     "tool sags": (
         Faults(sag=0.02),
-        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as a tool",
+        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as by a tool",
         [np.degrees(0.02)],
         0.1,
     ),
