@@ -128,6 +128,12 @@ def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: Read
     taken = [rows[k] for k in kept]
     notes = [*found.notes, *(note for source in chosen for note in source.notes)]
     notes.append(f"poses of {source_of(chosen[0].table)}, paired with the images {chosen[0].paired.how}")
+    row = chosen[0].paired.row
+    if row is not None and (alone := np.setdiff1d(np.arange(len(chosen[0].table.rows)), row)).size:
+        numbers = first_few([str(1 + r) for r in alone.tolist()])
+        notes.append(
+            f"{len(alone)} poses of {Path(file).name} have no image in {folder} and are left out (poses {numbers})"
+        )
     if unlisted:
         notes.append(
             f"{len(unlisted)} images have no pose in {Path(file).name} and are left out: {first_few(unlisted)}"
