@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.capture.documents import Table
+from jcr.capture.frame_choice import STILL
 from jcr.capture.pose_track import NEVER, interpolated_poses
 from jcr.errors import InputError, shown
 from jcr.files import LONGEST
@@ -38,8 +39,6 @@ ZONE_NS = 900 * 10**9
 """Step (ns) of the differences between time zones, a quarter of an hour."""
 MOMENT_NS = 1_000_000
 """Time (ns) before and after a stamp by which the speed there is measured."""
-AT_REST = 0.005
-"""Largest speed (m/s) of an arm at rest, as in jcr.capture.frame_choice."""
 DATE = re.compile(
     r"(?<!\d)(\d{4})[-_.:]?(\d\d)[-_.:]?(\d\d)[T _-]+(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[.,_](\d{1,9}))?"
 )
@@ -338,7 +337,7 @@ def _zone(
         at = stamps + step * ZONE_NS
         _, gap = interpolated_poses(times, poses, at)
         before, after = (interpolated_poses(times, poses, at + side * MOMENT_NS)[0] for side in (-1, 1))
-        slow = np.asarray(motion_length(inverse(before) @ after)) / (2e-9 * MOMENT_NS) < AT_REST
+        slow = np.asarray(motion_length(inverse(before) @ after)) / (2e-9 * MOMENT_NS) < STILL
         if (gap != NEVER).all() and slow.mean() >= NEARLY:
             fitting.append(step * ZONE_NS)
     return fitting[0] if len(fitting) == 1 else None

@@ -74,6 +74,13 @@ def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
 
 
+def poses_of_numbers(numbers: Float[ndarray, "n 7"], where: str) -> Float[ndarray, "n 4 4"]:
+    """Return transforms from x, y, z, qx, qy, qz, qw; raise InputError, begun with `where`, if one is no transform."""
+    if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
+        raise InputError(f"{where}: holds a transform that is none; record again")
+    return transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
+
+
 class TfTree:
     """Transforms of the topics /tf and /tf_static, in plain arrays, because an hour of recording has a few million."""
 
@@ -141,10 +148,7 @@ class TfTree:
         """
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
-        if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
-            text = "holds a transform that is none; record again"
-            raise InputError(f"{source}: tf from {self._parent[child]} to {child}: {text}")
-        poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
+        poses = poses_of_numbers(numbers, f"{source}: tf from {self._parent[child]} to {child}")
         if child in self._static or len(stamps) == 1:
             latest = poses[stamps.argmax()]
             return lambda at: (np.tile(latest, (len(at), 1, 1)), np.zeros(len(at), np.int64))

@@ -85,8 +85,7 @@ def fused_depth(
         on_plane = plane.confirms & (np.abs(plane.inverse_depth / inverse_depth - 1) < ON_PLANE)
         pair = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION)
         matched = (matched & ~plane.contradicts) | (pair & on_plane)
-        both = matched & on_plane
-        filled = plane.holds & ~matched
+        both, filled = matched & on_plane, plane.holds & ~matched
         inverse_depth = np.where(filled, plane.inverse_depth, inverse_depth)
         there = matched | filled
         _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)

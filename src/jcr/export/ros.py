@@ -104,7 +104,7 @@ def ros2_launch(mount: CameraMount, others: Sequence[CameraMount] = ()) -> str:
         arguments = " ".join(_publisher_arguments(one))
         name = "hand_eye_publisher" if k == 0 else f"{re.sub('[^A-Za-z0-9_]', '_', one.child)}_publisher"
         nodes.append(
-            f"{_xml_comment(*notes(one))}\n"
+            f"{xml_comment(*notes(one))}\n"
             f'  <node pkg="tf2_ros" exec="static_transform_publisher" name="{name}" args="{arguments}"/>\n'
         )
     return f"<launch>\n{''.join(nodes)}</launch>\n"
@@ -147,10 +147,10 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = (), options: Export
         return _into_robot(options.into, mount)
     every = (mount, *others)
     fixed = [_joint(one.parent, one.child, urdf_origin(one.parent_from_child)) for one in every]
-    joints = [f"{_xml_comment(*notes(one))}\n{joint}" for one, joint in zip(every, fixed, strict=True)]
+    joints = [f"{xml_comment(*notes(one))}\n{joint}" for one, joint in zip(every, fixed, strict=True)]
     moving = [one for one in every if not one.is_fixed] if any(one.is_fixed for one in every) else []
     arms = dict.fromkeys((one.base, one.parent) for one in moving)
-    arm = _xml_comment("stands for the arm, which moves: leave it out where the robot's own URDF has it")
+    arm = xml_comment("stands for the arm, which moves: leave it out where the robot's own URDF has it")
     joints += [f"{arm}\n{_joint(base, gripper)}" for base, gripper in arms]
     pairs = [*arms, *((one.parent, one.child) for one in every)]
     links = dict.fromkeys(name for pair in pairs for name in pair)
@@ -316,7 +316,7 @@ def _comments(mount: CameraMount, *more: str) -> str:
     return "\n".join(f"# {' '.join(line.split())}" for line in [*notes(mount), *more])
 
 
-def _xml_comment(*lines: str) -> str:
+def xml_comment(*lines: str) -> str:
     """Return lines as one XML comment; consecutive hyphens, which would end it, are separated."""
     text = "; ".join(" ".join(line.split()) for line in lines)
     return f"  <!-- {re.sub('-(?=-)', '- ', text)} -->"

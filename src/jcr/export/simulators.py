@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.camera import unproject
 from jcr.errors import InputError
-from jcr.export.ros import CameraMount, notes
+from jcr.export.ros import CameraMount, notes, xml_comment
 from jcr.records import Intrinsics
 
 OPTICAL_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,7 +38,7 @@ def mjcf(mount: CameraMount) -> str:
     }
     words = "\n              ".join(f'{name}="{value}"' for name, value in attributes.items())
     return f"""<mujoco model="hand_eye">
-{_comment(mount, camera)}
+{xml_comment(*_about(mount, camera))}
   <!-- copy the camera into the body {mount.parent} of the robot; pos and quat (w x y z) are of MuJoCo's camera axes.
        For a tool without focal, principal and sensorsize: fovy="{fovy:.6f}" -->
   <worldbody>
@@ -112,12 +112,6 @@ def _about(mount: CameraMount, camera: Intrinsics) -> list[str]:
     rms, largest = residual_px(camera)
     residual = f"the pinhole leaves {rms:.2f} px (rms) and {largest:.2f} px (largest) of the distortion out"
     return [*notes(mount), residual]
-
-
-def _comment(mount: CameraMount, camera: Intrinsics) -> str:
-    """Return the notes as an XML comment; consecutive hyphens, which would end it, are separated."""
-    text = "\n       ".join(" ".join(line.split()) for line in _about(mount, camera))
-    return f"  <!-- {re.sub('-(?=-)', '- ', text)} -->"
 
 
 def _prim(name: str) -> str:

@@ -108,18 +108,13 @@ def check_capture(
     is the required accuracy (mm, degrees); a finding states if the one that is expected from the images misses it.
     Raises InputError if gripper poses and joint angles contradict each other.
     """
-    if isinstance(capture, str | Path):
-        capture = read_source(capture, progress=progress)
-    if isinstance(capture, Capture) and capture.candidates:
-        capture = decided_by_images(capture, progress=progress)[0] if look else first_reading(capture)
+    capture = _read(capture, look, progress)
     given = capture.base_from_gripper
-    (move_m, rotation_rad), notes = largest_motion(given), [*capture.notes]
-    if move_m < 5e-3 and rotation_rad > np.radians(5):
-        moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
-        notes.append(f"the gripper moves {moved}: the positions may have been divided by 1000")
+    move_m, rotation_rad = largest_motion(given)
+    notes = [*capture.notes, *_unit_doubt(move_m, rotation_rad)]
     noise = robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1]))
     options = CalibrateOptions(robot_noise=noise, require=require)
-    camera, views, shown = None, (), _Comparison()
+    camera, views, shown, expected = None, (), _Comparison(), None
     if isinstance(capture, PosePairs):
         robot, clear = errors_of(given), np.arange(len(capture))
         shown = _compare(capture, robot, options, progress, thorough)
@@ -136,10 +131,8 @@ def check_capture(
     seen = observability(gripper, assumptions and assumptions.gripper_from_camera)
     if hand_eye is not None and shown.registered is not None:
         seen = hand_eye.observability
-    of_motion = () if hand_eye is not None else seen.findings
-    found = [*shown.findings, *of_motion, *filter(None, [robot.unused])]
+    found = [*shown.findings, *(() if hand_eye is not None else seen.findings), *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
-    expected = None
     if isinstance(capture, PosePairs):
         # This is the calibration itself, which needs no prediction.
         expected = shown.hand_eye and shown.hand_eye.uncertainty
@@ -160,6 +153,25 @@ def check_capture(
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
     )
+
+
+def _read(
+    capture: Capture | PosePairs | str | Path, look: bool, progress: Progress | None
+) -> Capture | PosePairs:
+    """Return a capture, read if it is a path, with one reading of its poses: decided by the images if `look`."""
+    if isinstance(capture, str | Path):
+        capture = read_source(capture, progress=progress)
+    if isinstance(capture, PosePairs) or not capture.candidates:
+        return capture
+    return decided_by_images(capture, progress=progress)[0] if look else first_reading(capture)
+
+
+def _unit_doubt(move_m: float, rotation_rad: float) -> list[str]:
+    """Return a note if the largest motion of the gripper is below 5 mm, but rotates; empty otherwise."""
+    if move_m >= 5e-3 or rotation_rad <= np.radians(5):
+        return []
+    moved = f"by at most {1e3 * move_m:.2g} mm while it rotates by {np.degrees(rotation_rad):.0f}°"
+    return [f"the gripper moves {moved}: the positions may have been divided by 1000"]
 
 
 def _look(capture: Capture, views: tuple[Finding, ...]) -> tuple[Int[ndarray, " c"], list[str]]:

@@ -175,6 +175,31 @@ def fingerprint(*values: Any) -> str:
     return hashlib.sha256(json.dumps(values, default=identity).encode()).hexdigest()
 
 
+def _kept_failure(result: RunResult, error: NothingFoundError) -> NothingFoundError:
+    """Write calibration.json and the report of a run without a calibration; return the error to raise.
+
+    The error proposes the option `--board` if the images show a board.
+    """
+    capture, tried = result.capture, error.attempts
+    content = FailedCalibration(
+        method=result.state.options.method,
+        mount=capture.mount,
+        backend=tried[-1].backend,
+        images=tuple(
+            ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images
+        ),
+        intrinsics=capture.intrinsics and capture.intrinsics.with_std(None),
+        findings=error.findings,
+        attempts=tried,
+        timings_s=timings_of(tried),
+    ).with_notes()
+    boards = proposed(capture, result.state.options.reconstruct.board)
+    content = content.with_findings(*boards).with_notes() if boards else content
+    keep_calibration(result.out, content)
+    complete(_report(result.with_parts(calibration=content)))
+    return NothingFoundError(error.with_more(*map(sentence, boards)), tried) if boards else error
+
+
 def _select(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with a selected reconstruction and its calibration, and write the reconstruction.
 
@@ -208,26 +233,7 @@ def _select(result: RunResult, progress: Progress) -> RunResult:
     except NothingFoundError as error:
         if not is_same(out):
             forget_reconstruction(out)
-        tried = error.attempts
-        content = FailedCalibration(
-            method=options.method,
-            mount=capture.mount,
-            backend=tried[-1].backend,
-            images=tuple(
-                ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images
-            ),
-            intrinsics=capture.intrinsics and capture.intrinsics.with_std(None),
-            findings=error.findings,
-            attempts=tried,
-            timings_s=timings_of(tried),
-        ).with_notes()
-        boards = proposed(capture, options.reconstruct.board)
-        content = content.with_findings(*boards).with_notes() if boards else content
-        keep_calibration(out, content)
-        complete(_report(result.with_parts(calibration=content)))
-        if not boards:
-            raise
-        raise NothingFoundError(error.with_more(*map(sentence, boards)), tried) from None
+        raise _kept_failure(result, error) from None
     attempts = found.attempts if before is None else before.state.attempts or found.attempts
     state = result.state.model_copy(update={"attempts": attempts})
     result = result.with_parts(state=state, reconstruction=made, calibration=found)

@@ -80,11 +80,23 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     run = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
-    lines = [about]
+    content = {
+        "name": printable(named.resolve().name),
+        "about": [about, *_facts(result), run, printable(str(source))],
+        "sections": shown,
+        "open": OPEN,
+        "links": {name: LINKS[name] for name in shown if name in LINKS},
+    }
+    return render("report.html", content)
+
+
+def _facts(result: RunResult) -> list[str]:
+    """Return lines of text on a run: version of the calibration, intrinsics, and reading of the poses, where known."""
+    lines, capture = list[str](), result.capture
     with suppress(InputError):  # results that are no runs have no state
         if (state := result.state).predecessor is not None:
             lines.append(f"version {state.version} of this calibration, after {printable(state.predecessor)}")
-    if (found := calibration.intrinsics) is not None:
+    if (found := result.calibration.intrinsics) is not None:
         focal, centre = (f" ± {significant(max(found.std[k : k + 2]))}" if found.std else "" for k in (0, 2))
         lines.append(
             f"fx {found.fx:.2f}, fy {found.fy:.2f}{focal} · cx {found.cx:.2f}, cy {found.cy:.2f}{centre} px · "
@@ -92,11 +104,4 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         )
     if isinstance(capture, Capture) and capture.reading is not None:
         lines.append(printable(f"poses: {decision_in_words(capture.reading)}"))
-    content = {
-        "name": printable(named.resolve().name),
-        "about": [*lines, run, printable(str(source))],
-        "sections": shown,
-        "open": OPEN,
-        "links": {name: LINKS[name] for name in shown if name in LINKS},
-    }
-    return render("report.html", content)
+    return lines

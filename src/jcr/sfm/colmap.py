@@ -346,6 +346,26 @@ def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
     return thinned
 
 
+def _incremental_options(matcher: Matcher) -> pycolmap.IncrementalPipelineOptions:
+    """Return COLMAP's options of the incremental mapping; `matcher` has the seed and whether intrinsics are known."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    mapper = pipeline.mapper
+    pipeline.min_model_size = 2
+    pipeline.extract_colors = False
+    # A first pair may distort unknown intrinsics so that no third image fits; other pairs are then tried.
+    pipeline.multiple_models, pipeline.max_num_models = not matcher.known, 3
+    # With one thread a seed fixes the result; the order of sums over threads changes the last bits.
+    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = matcher.seed
+    pipeline.num_threads = mapper.num_threads = 1
+    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
+    refine = not matcher.known
+    pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
+    if len(matcher.features.x_px) > _MANY:
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
+    return pipeline
+
+
 def _map_incrementally(
     database: Path,
     cameras: Sequence[pycolmap.Camera],
@@ -359,25 +379,9 @@ def _map_incrementally(
     relaxed if the model lacks more than half of the images. A model `begun` is continued with the images that it lacks.
     The progress is the share of images in the model; it falls when another camera is tried.
     """
-    n_images, folder, pipeline = (
-        len(matcher.features.x_px),
-        database.parent,
-        pycolmap.IncrementalPipelineOptions(),
-    )
+    n_images, folder = len(matcher.features.x_px), database.parent
+    pipeline = _incremental_options(matcher)
     mapper = pipeline.mapper
-    pipeline.min_model_size = 2
-    pipeline.extract_colors = False
-    # A first pair may distort unknown intrinsics so that no third image fits; other pairs are then tried.
-    pipeline.multiple_models, pipeline.max_num_models = not matcher.known, 3
-    # With one thread a seed fixes the result; the order of sums over threads changes the last bits.
-    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = matcher.seed
-    pipeline.num_threads = mapper.num_threads = 1
-    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
-    refine = not matcher.known
-    pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
-    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
-    if n_images > _MANY:
-        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
     best, registered, done = None, 0, 0
     if begun is not None:
         (folder / "begun").mkdir(exist_ok=True)

@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
 from jcr.capture.documents import read_content
 from jcr.capture.formats import foxglove
 from jcr.capture.options import ReadOptions, chosen_name
-from jcr.capture.pose_track import PosesAt, Stamps, TfTree, interpolated_poses, speed
+from jcr.capture.pose_track import PosesAt, Stamps, TfTree, interpolated_poses, poses_of_numbers, speed
 from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.ros import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.extras import extra
-from jcr.geometry import transform
 from jcr.progress import Progress
 from jcr.records import Capture, FrameNames, Intrinsics
 
@@ -152,10 +150,9 @@ class _Bag:
     def poses_at(self) -> PosesAt:
         """Return the function from time stamps (ns) to the poses of the pose topic and the gaps (ns) of its samples."""
         stamps, numbers = np.array([*self.poses]), np.array([*self.poses.values()])
-        if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
-            raise InputError(f"{self.path}: a topic of poses holds one that is none; record again")
-        poses = transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
-        return partial(interpolated_poses, stamps, poses)
+        return partial(
+            interpolated_poses, stamps, poses_of_numbers(numbers, f"{self.path}: its topic of poses")
+        )
 
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
         """Yield the connection, time of recording (ns) and decoded content of each message of `connections`.
