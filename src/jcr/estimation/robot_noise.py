@@ -289,18 +289,13 @@ class LinearSolution:
         """Covariance C = (JᵀV⁻¹J + prior information)⁻¹ of the p unknowns, for each choice of the error sizes."""
         return over(self.information_root, np.eye(self.step.shape[-1]))
 
-    @cached_property
-    def weight(self) -> Covariance:
-        """Inverse V⁻¹ of the covariance V of the s residuals; only for a solution for one value of the error sizes."""
-        return inverse_of(self.root)
-
     @property
     def projection(self) -> Covariance:
         """Matrix P = V⁻¹ − V⁻¹J C JᵀV⁻¹ of the s residuals; only for a solution for one value of the error sizes.
 
         V is the covariance of the residuals, J the Jacobian and C the covariance of the unknowns.
         """
-        return self.weight - self.weighed @ self.gain
+        return inverse_of(self.root) - self.weighed @ self.gain
 
 
 def solve_equations(equations: Equations, log_sizes: LogSizes) -> LinearSolution:
