@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -17,8 +16,7 @@ from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
 from jcr.findings.finding import text
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.pointmaps import reconstruction
-from jcr.pointmaps.global_alignment.align import global_align
+from jcr.pointmaps.global_alignment import align
 from jcr.pointmaps.grid import ImageGrid, PreparedImages
 from jcr.pointmaps.pairs import PairPredictions, complete_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
@@ -41,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         Image.new("RGB", SIZE).save(made / f"{k:02d}.png")
     Case.folder = made
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reconstruction, "global_align", partial(global_align, pixels=FEW_PIXELS))
+        patch.setattr(align, "PIXELS", FEW_PIXELS)
         yield made
 
 

@@ -22,8 +22,6 @@ from jcr.records import Intrinsics
 
 PIXELS = 2048
 """Number of pixels used per image: the most confident one of each of as many equal cells."""
-LEAST_PIXELS = 50
-"""Least number of pixels per image: several in each coarse cell by which the correlation of residuals is measured."""
 DEPTH_CHUNK = 4096
 """Number of pixels processed at a time, so that their arrays stay in the cache."""
 CONTRADICTION = 4.0
@@ -66,19 +64,15 @@ class Alignment:
         return rays(pinhole).astype(np.float32) * self.depth[..., None]
 
 
-def global_align(
-    pairs: Path | str | PairPredictions, pixels: int = PIXELS, progress: Progress | None = None
-) -> Alignment:
+def global_align(pairs: Path | str | PairPredictions, progress: Progress | None = None) -> Alignment:
     """Estimate camera poses, focal length, depths and pair scales from pairwise pointmaps, or from their npz file.
 
-    `pixels` is the number of pixels used per image. The focal length is estimated from the pointmaps. The principal
-    point and the ratio fy / fx are those of the predictions' intrinsics; without intrinsics they are the image's middle
-    and 1. Raises InputError for a file that cannot be used, images that no chain of pairs connects, and fewer than
-    LEAST_PIXELS pixels. Raises RejectedError where the pointmaps do not determine the cameras.
+    The focal length is estimated from the pointmaps. The principal point and the ratio fy / fx are those of the
+    predictions' intrinsics; without intrinsics they are the image's middle and 1. Raises InputError for a file that
+    cannot be used, and for images that no chain of pairs connects. Raises RejectedError where the pointmaps do not
+    determine the cameras.
     """
     predictions = pairs if isinstance(pairs, PairPredictions) else read_pairs(Path(pairs))
-    if pixels < LEAST_PIXELS:
-        raise InputError(f"{pixels} pixels per image are too few; alignment needs {LEAST_PIXELS} or more")
     count, edges = predictions.image_count, predictions.edges
     if len(edges) == 0:
         raise InputError("the predictions have no pair; predict at least one")
@@ -89,7 +83,7 @@ def global_align(
             f"no chain of pairs joins {names} to the other images; predict pairs between them, or leave these out"
         )
     problem = AlignmentProblem.of(predictions)
-    return _dense_alignment(problem, solve(problem, pixels), progress or silent)
+    return _dense_alignment(problem, solve(problem, PIXELS), progress or silent)
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
