@@ -26,7 +26,7 @@ other = json.loads(Path("examples/tabletop/reference.json").read_text("utf-8"))[
 difference = jcr.compare(result, np.array(other))
 print(f"other transform: {(1e3 * difference.translation_m).round(3)} mm apart")
 
-print(f"exported: {jcr.export_run(result.out, 'urdf')}")
+print(f"exported: {jcr.export_run(result.out, 'camera_info')}")
 scene = jcr.load_map(result.out)
 sample = scene.query(x_in_base[None])
 print(

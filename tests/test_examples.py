@@ -161,7 +161,7 @@ def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_pa
     true = apply(capture.base_from_gripper[0] @ reference_of(EXAMPLES / "tabletop"), 0.45 * ray)
     assert np.linalg.norm(np.array([x, y, z]) - true) < 1e-3 and 0 < max(sigmas_mm) < 1
     assert np.linalg.norm([*map(float, re.findall(r"-?\d+\.\d*", off))]) < 0.5
-    assert (out / "export" / "hand_eye.urdf").is_file() and "map at the point: occupancy" in text
+    assert (out / "export" / "camera_info.yaml").is_file() and "map at the point: occupancy" in text
 
 
 def test_the_notebook_runs(done: Path, tmp_path: Path):

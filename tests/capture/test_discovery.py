@@ -140,6 +140,15 @@ def test_names_in_another_unicode_form_and_rows_in_another_order(tmp_path: Path)
     )
 
 
+def test_poses_without_an_image_are_left_out_with_a_note(tmp_path: Path):
+    """A third of the poses went without a word."""
+    draw(tmp_path, NAMES[2:])
+    write(tmp_path / "p.csv", [f"{HEADER},image", *NAMED_ROWS])
+    got = jcr.read_capture(tmp_path)
+    np.testing.assert_allclose(got.base_from_gripper, POSES[2:], atol=1e-9)
+    assert any("2 poses of p.csv have no image" in note and "(poses 1, 2)" in note for note in got.notes)
+
+
 def test_images_left_out_and_chosen_are_stated(tmp_path: Path):
     draw(tmp_path, [f"rgb/{name}" for name in NAMES])
     draw(tmp_path, [f"other/{name}" for name in (*NAMES, "14.png")], seed=1)

@@ -49,6 +49,14 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     return f"{verdict.upper()}, with {warnings} warning{'s' * (warnings > 1)}"
 
 
+def only_centre_meets(content: AnyCalibration) -> bool:
+    """Test whether the required accuracy is met at the image centre and not in the corners."""
+    required, uncertainty = content.requirement, content.uncertainty
+    if required is None or not required.met or uncertainty is None or uncertainty.corner is None:
+        return False
+    return uncertainty.corner.within_95_mm > required.translation_mm
+
+
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """Return the summary for the terminal: verdict, transform, accuracy and warnings, in at most `most` - 2 lines.
 
@@ -56,9 +64,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """
     limit = ""
     if (required := content.requirement) is not None:
-        corner = None if content.uncertainty is None else content.uncertainty.corner
-        is_less = corner is not None and corner.within_95_mm > required.translation_mm
-        unmet = ", not met in the corners" if required.met and is_less else ""
+        unmet = ", not met in the corners" if only_centre_meets(content) else ""
         limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {len(content.images)} images"
@@ -66,6 +72,9 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
+        if left_out := [f"{one.image}: {one.reason}" for one in content.images if not one.used]:
+            more = [f"and {len(left_out) - 2} more (log.txt)"] if len(left_out) > 2 else []
+            lines += labelled("Left out", "; ".join([*left_out[:2], *more]))
     if isinstance(content, PublishedCalibration):
         lines += _published(content)
     return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines))]) + "\n"

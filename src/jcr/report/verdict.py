@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
-from jcr.calibration.words import leave_one_out_text, worst_direction
+from jcr.calibration.words import leave_one_out_text, only_centre_meets, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
 from jcr.report.render import Content
 from jcr.rounding import significant
@@ -49,6 +49,8 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
         reason = sentence(short)
     else:
         reason = "no check contradicts it" if required is None else reached_in_words(required)
+        if only_centre_meets(calibration):
+            reason += "; the corners of the image do not reach this"
     evidence = _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
         reason, evidence = (
