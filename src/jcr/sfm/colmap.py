@@ -37,7 +37,7 @@ from jcr.features.pair_search import MatchedPairs, match_alone, match_with_robot
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
-from jcr.sfm.missing_images import model_near_cameras, nearer_to_robot, with_missing_images
+from jcr.sfm.missing_images import ROUGHLY, model_near_cameras, nearer_to_robot, with_missing_images
 from jcr.sfm.model import (
     ENOUGH,
     adjust_robustly,
@@ -64,8 +64,6 @@ _MADE_AGAIN = (
 """Note on a map that was replaced by one near the cameras that the gripper poses predict."""
 _MANY, _GROWN = 40, 1.3
 """Number of images above which COLMAP adjusts the whole map only after growth by a factor _GROWN (its default: 1.1)."""
-_ROUGHLY = 1e-3
-"""Relative change of the cost that ends the first of the two last adjustments."""
 _MOST_OBSERVATIONS = 60_000
 """Largest number of observations of a map; more would not help, because the robot's errors limit the accuracy."""
 _MOST_MATCHED = 120_000
@@ -227,7 +225,7 @@ def _adjusted(
         count = np.cumsum([model.point3D(int(point)).track.length() for point in order])
         for point in order[count > _MOST_OBSERVATIONS]:
             model.delete_point3D(int(point))
-    adjust_robustly(model, known, _ROUGHLY)
+    adjust_robustly(model, known, ROUGHLY)
     camera, rows, intrinsics = model.camera(1), rows_of(model), intrinsics_of(model.camera(1), like, known)
     size, image_ids = (camera.width, camera.height), [row + 1 for row in rows]
     greys = np.stack([grey_of(images[row], size) for row in rows])

@@ -76,11 +76,6 @@ class Config:
                 raise ValueError(f"{name} = {getattr(self, name)!r} is not covered; it must be {remedy}")
 
 
-def mixed_precision(like: Tensor) -> torch.autocast:
-    """Return a context in which networks compute in bfloat16 if the tensor `like` is on CUDA."""
-    return torch.autocast(like.device.type, torch.bfloat16, enabled=like.is_cuda)
-
-
 class Dust3r(nn.Module):
     """Network of DUSt3R or MASt3R, built from the fields of a published configuration (`Config`).
 
@@ -132,37 +127,34 @@ class Dust3r(nn.Module):
         """
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(f"images are {tuple(images.shape[-2:])}; both must be multiples of {PATCH}")
-        with mixed_precision(images):
-            grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
-            rotary = rotary_embedding(grid, self.head_dims[0], self.rope_base, images.device)
-            # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
-            x = self.patch_embed(images).float()
-            for block in self.enc_blocks:
-                x = block(x, rotary)
-            return EncodedImages(self.enc_norm(x), grid)
+        grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
+        rotary = rotary_embedding(grid, self.head_dims[0], self.rope_base, images.device)
+        x = self.patch_embed(images)
+        for block in self.enc_blocks:
+            x = block(x, rotary)
+        return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
         """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame.
 
         Swapped arguments give other predictions.
         """
-        with mixed_precision(features1.tokens):
-            rotary1, rotary2 = (
-                rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
-                for f in (features1, features2)
-            )
-            x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
-            # The heads read the encoder's tokens and those after each decoder block, the last ones normalised.
-            layers1, layers2 = [features1.tokens], [features2.tokens]
-            for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
-                x1, x2 = block1(x1, x2, rotary1, rotary2), block2(x2, x1, rotary2, rotary1)
-                layers1.append(x1)
-                layers2.append(x2)
-            layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
-            return (
-                self.downstream_head1(layers1, features1.grid),
-                self.downstream_head2(layers2, features2.grid),
-            )
+        rotary1, rotary2 = (
+            rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
+            for f in (features1, features2)
+        )
+        x1, x2 = (self.decoder_embed(f.tokens) for f in (features1, features2))
+        # The heads read the encoder's tokens and those after each decoder block, the last ones normalised.
+        layers1, layers2 = [features1.tokens], [features2.tokens]
+        for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
+            x1, x2 = block1(x1, x2, rotary1, rotary2), block2(x2, x1, rotary2, rotary1)
+            layers1.append(x1)
+            layers2.append(x2)
+        layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
+        return (
+            self.downstream_head1(layers1, features1.grid),
+            self.downstream_head2(layers2, features2.grid),
+        )
 
     @property
     def device(self) -> torch.device:
@@ -298,7 +290,7 @@ def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
 
     The vector (x, y, z) of length d is scaled to the length exp(d) − 1; the confidence is 1 + exp(c).
     """
-    xyz, c = raw.float().permute(0, 2, 3, 1).split([3, 1], -1)
+    xyz, c = raw.permute(0, 2, 3, 1).split([3, 1], -1)
     length = xyz.norm(dim=-1, keepdim=True)
     return Pointmap(xyz * (length.expm1() / length.clamp(min=1e-8)), 1 + c[..., 0].exp())
 
@@ -315,8 +307,7 @@ class LinearHead(nn.Module):
 
         `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
         """
-        with torch.autocast(layers[-1].device.type, enabled=False):
-            tokens = self.proj(layers[-1].float())
+        tokens = self.proj(layers[-1])
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
 
 
@@ -362,10 +353,7 @@ class Dpt(nn.Module):
 
         The grids have shape (b, channels, rows, columns), from the earliest layer to the last.
         """
-        x = self.head[:4](self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
-        # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
-        with torch.autocast(x.device.type, enabled=False):
-            return self.head[4](x.float())
+        return self.head(self.scratch([f(x) for f, x in zip(self.act_postprocess, maps, strict=True)]))
 
 
 class Scratch(nn.Module):
