@@ -107,6 +107,22 @@ class InputError(ValueError):
         super().__init__(printable(message))
 
 
+def other_size(
+    what: str,
+    size: Sequence[object],
+    expected: tuple[int, int],
+    whose: str = "images",
+    remedy: str = "take all with one camera at one resolution",
+) -> InputError:
+    """Return the error that `what` has another resolution than `whose`: `size` instead of `expected`.
+
+    Both are width and height (px). `remedy` is the end of the message. The error is not raised.
+    """
+    return InputError(
+        f"{what} of {shown(size[0])}x{shown(size[1])} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
+    )
+
+
 class RejectedError(RuntimeError):
     """Error for a rejected result of valid input (exit status 3).
 

@@ -10,10 +10,9 @@ from jcr.capture.folder import require_decided
 from jcr.capture.formats import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, shown
+from jcr.errors import InputError, other_size, shown
 from jcr.files import path_inside, write_bytes
 from jcr.records import Capture
-from jcr.records.capture_json import other_size
 from jcr.records.json_file import read_json
 
 FOLDER, OWNER = "added", "added_to"

@@ -10,13 +10,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import read_image
-from jcr.capture.notations import far_faults, tolerated
-from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
-from jcr.errors import InputError, first_few
+from jcr.capture.notations import METRES_LIMIT
+from jcr.capture.options import MAX_FRAMES, MIN_FRAMES, tolerated
+from jcr.errors import InputError, first_few, other_size
 from jcr.files import capture_file
 from jcr.geometry import step_between
 from jcr.records import Capture
-from jcr.records.capture_json import other_size
 
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """Position (m) and rotation (rad) within which two gripper poses count as equal."""
@@ -94,3 +93,26 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
             f"{where}: all {len(base_from_gripper)} gripper poses are the same ({within}); read the pose again for each "
             "image"
         )
+
+
+def far_faults(position: Float[ndarray, "n 3"], where: str, names: list[str]) -> dict[int, str]:
+    """Return a message for each position (m, base frame) that is more than 10 m from the base, by the index of its row.
+
+    Raises InputError, begun with `where`, if more rows are that far than `tolerated` permits, or the only row is. Wrong
+    units or a far base frame are then the cause. `names` are the names of the rows in the messages. NaN counts as 0.
+    """
+    distance = np.linalg.norm(np.nan_to_num(position), axis=1)
+    rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
+    if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
+        spread = float(np.ptp(position[np.isfinite(position).all(1)], axis=0).max())
+        if len(distance) > 1 and spread < METRES_LIMIT:
+            cause = (
+                "a map frame that is far away: subtract one offset from all, or use the arm's own base frame"
+            )
+        else:
+            cause = "millimetres: divide the translations by 1000"
+        raise InputError(
+            f"{where}: the gripper is up to {distance.max():.4g} m from the base; these look like {cause}"
+        )
+    text = "m from the base, the others are nearer; record it again"
+    return {k: f"{names[k]} is {distance[k]:.4g} {text}" for k in rows}

@@ -12,9 +12,8 @@ from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 
-from jcr.errors import InputError
+from jcr.errors import InputError, other_size
 from jcr.files import require_file
-from jcr.records.capture_json import other_size
 
 MAX_PIXELS = 64_000_000
 """Largest number of pixels of an image. No wrist camera has more; a larger file may be a decompression bomb, which is

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.capture.options import tolerated
 from jcr.errors import InputError, did_you_mean, shown
 from jcr.geometry import nearest_rotation, transform
 from jcr.rounding import HUGE
@@ -268,31 +269,3 @@ def poses_of_rows(
             f"{where}: pose {wrong[0] + 1} is no rigid transform; check the numbers and their notation"
         )
     return poses
-
-
-def tolerated(count: int) -> int:
-    """Return the number of faulty frames among `count` that may be left out: a quarter, rounded down, at least one."""
-    return max(1, count // 4)
-
-
-def far_faults(position: Float[ndarray, "n 3"], where: str, names: list[str]) -> dict[int, str]:
-    """Return a message for each position (m, base frame) that is more than 10 m from the base, by the index of its row.
-
-    Raises InputError, begun with `where`, if more rows are that far than `tolerated` permits, or the only row is. Wrong
-    units or a far base frame are then the cause. `names` are the names of the rows in the messages. NaN counts as 0.
-    """
-    distance = np.linalg.norm(np.nan_to_num(position), axis=1)
-    rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
-    if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
-        spread = float(np.ptp(position[np.isfinite(position).all(1)], axis=0).max())
-        if len(distance) > 1 and spread < METRES_LIMIT:
-            cause = (
-                "a map frame that is far away: subtract one offset from all, or use the arm's own base frame"
-            )
-        else:
-            cause = "millimetres: divide the translations by 1000"
-        raise InputError(
-            f"{where}: the gripper is up to {distance.max():.4g} m from the base; these look like {cause}"
-        )
-    text = "m from the base, the others are nearer; record it again"
-    return {k: f"{names[k]} is {distance[k]:.4g} {text}" for k in rows}

@@ -71,3 +71,8 @@ def chosen_name(names: Sequence[str], asked: str | None, usual: Sequence[str], w
         return usual[0]
     wrong = "" if asked is None else f"{asked} is not there; "
     raise InputError(f"{what}: {wrong}choose one with {option}: {', '.join(names) or 'there are none'}")
+
+
+def tolerated(count: int) -> int:
+    """Return the number of faulty frames among `count` that may be left out: a quarter, rounded down, at least one."""
+    return max(1, count // 4)

@@ -21,9 +21,8 @@ from jcr.capture.notations import (
     length_unit,
     notation_of,
     poses_of,
-    tolerated,
 )
-from jcr.capture.options import ReadOptions
+from jcr.capture.options import ReadOptions, tolerated
 from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.records import Reading

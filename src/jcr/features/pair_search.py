@@ -23,9 +23,7 @@ from jcr.features.gate import (
     Pair,
     RotationOfX,
     agreeing_motions,
-    by_quarters,
     classify_pairs,
-    rolls,
 )
 from jcr.features.matchers import Geometries, Matcher, matrices, still_cells
 from jcr.features.pairs import (
@@ -38,6 +36,7 @@ from jcr.features.pairs import (
     repeats,
 )
 from jcr.features.two_view import starting_motions
+from jcr.features.upright import by_quarters, rolls
 from jcr.geometry import Transform, rotation_angle
 from jcr.progress import Progress, silent
 from jcr.records import Intrinsics
@@ -139,7 +138,7 @@ class _Search:
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
         """Match pairs with each image rotated by its angle `upright` (rad); classify all pairs by the gripper's motion.
 
-        The angles are those of `gate.rolls`. `found` is the classification before, whose hand-eye rotation is used if
+        The angles are those of `rolls`. `found` is the classification before, whose hand-eye rotation is used if
         the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})

@@ -10,15 +10,15 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.checks.capture import STILL as MOVED
+from jcr.capture.checks import far_faults
 from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all
-from jcr.capture.notations import far_faults
-from jcr.errors import InputError
+from jcr.errors import InputError, other_size
 from jcr.files import IMAGES, capture_file, path_inside, remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture, FrameNames
-from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, other_size, read_rigid
+from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, read_rigid
 from jcr.records.json_file import validated_content
 
 Channels = Literal["rgb", "bgr"]

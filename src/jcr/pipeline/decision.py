@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.calibration.checks.convention import BETTER, FITTED, of_camera
 from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.folder import count_differs
-from jcr.capture.notations import tolerated
+from jcr.capture.options import tolerated
 from jcr.capture.pairing import FARTHEST, other_orders
 from jcr.capture.readings import text_of, undecided
 from jcr.errors import InputError, RejectedError, first_few

@@ -1,7 +1,6 @@
 """Models of the content of a capture.json: frames, intrinsics and further cameras."""
 
 import json
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from jcr.errors import InputError, shown
+from jcr.errors import InputError, other_size
 from jcr.geometry import require_rigid
 from jcr.records.capture import COEFFICIENTS, DistortionModel, FrameNames, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
@@ -31,22 +30,6 @@ Name = Annotated[str, StringConstraints(pattern=f"^{NAME}$")]
 MOST_ROTATION = 6 * np.pi + 0.01
 """Largest absolute joint angle (rad); a larger one is probably in degrees."""
 Std = Annotated[float, Field(ge=0, lt=HUGE)] | None
-
-
-def other_size(
-    what: str,
-    size: Sequence[object],
-    expected: tuple[int, int],
-    whose: str = "images",
-    remedy: str = "take all with one camera at one resolution",
-) -> InputError:
-    """Return the error that `what` has another resolution than `whose`: `size` instead of `expected`.
-
-    Both are width and height (px). `remedy` is the end of the message. The error is not raised.
-    """
-    return InputError(
-        f"{what} of {shown(size[0])}x{shown(size[1])} pixels, {whose} of {expected[0]}x{expected[1]}; {remedy}"
-    )
 
 
 def read_rigid(value: Any, where: str = "matrix") -> Float[ndarray, "4 4"]:
