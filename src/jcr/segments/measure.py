@@ -57,8 +57,8 @@ class Measurement:
     """Objects, sorted by footprint, largest first."""
 
 
-def measure_objects(cloud: PointCloud, scale_std: float = 0.0) -> Measurement:
-    """Measure all labelled objects above the support plane, which is fitted to the cloud.
+def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:
+    """Measure all labelled objects above the support plane, which is fitted to the cloud if `support` is None.
 
     Label 0 and the support plane's own label are not objects. `scale_std` is the relative standard deviation of the
     calibration's scale. Standard deviations come from a jackknife that leaves out one image at a time (Efron and Stein
@@ -67,7 +67,7 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0) -> Measurement:
     roughness²) of the support plane. The spread of heights at the top, divided by the root of the number of images, is
     added, too. Raises InputError if no plane carries the scene.
     """
-    support = fit_support(cloud)
+    support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
     plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
     # Mean height of the plane's points without those of one image, for each image.
