@@ -108,7 +108,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     if found.verdict not in ("accepted", "rejected") and command.require != "none":
         outcome = f"a calibration would miss {command.require[0]:g} mm and {command.require[1]:g}°"
     elif command.poses_only and not is_rejected and isinstance(capture, Capture):
-        outcome = "by the motion alone; whether the poses are those of the images was not checked"
+        outcome = (
+            "good to calibrate by the motion alone; whether the poses are those of the images was not checked"
+        )
     verdict = verdict_in_words(found.findings)
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"

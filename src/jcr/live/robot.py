@@ -105,11 +105,12 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
     far_m, largest = float(np.linalg.norm(numbers[:3])), max(map(abs, numbers[3:6]))
     if len(numbers) == 16:
         far_m = float(np.linalg.norm(numbers[3:12:4]))
-    if far_m > METRES_LIMIT or (len(numbers) == 6 and largest > RADIANS_LIMIT):
-        said = (
-            f"{far_m:.4g} m from the base" if far_m > METRES_LIMIT else f"turned by up to {largest:.4g} rad"
+    if far_m > METRES_LIMIT:
+        raise InputError(
+            f"{where}: the gripper is {far_m:.4g} m from the base; these look like millimetres: give metres"
         )
-        raise InputError(f"{where}: the gripper is {said}; give metres and radians, not mm or degrees")
+    if len(numbers) == 6 and largest > RADIANS_LIMIT:
+        raise InputError(f"{where}: an angle of {largest:.4g} rad; these look like degrees: give radians")
     return poses_of_rows(np.array([numbers], np.float64), named, "m-rad", where)[0]
 
 
