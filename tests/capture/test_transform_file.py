@@ -30,6 +30,8 @@ FILES = {
     + "  translation: {x: 0.05, y: -0.02, z: 0.04}\n"
     + f"  rotation: {json.dumps(QUATERNION)}\n",
     "matrix.txt": "\n".join(" ".join(map(str, row)) for row in TRUE),
+    "matrix in mm.txt": "\n".join(" ".join(map(str, [*row[:3], 1e3 * row[3]])) for row in TRUE[:3])
+    + "\n0 0 0 1\n",
     "matrix.json": json.dumps({"gripper2cam": TRUE.tolist()}),
     "list.json": json.dumps(TRUE.tolist()),
     "matrix.yaml": f"%YAML:1.0\n---\nX: !!opencv-matrix\n  rows: 4\n  cols: 4\n  data: {TRUE.ravel().tolist()}\n",

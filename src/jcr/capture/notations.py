@@ -170,7 +170,8 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
 
     Raises InputError, begun with `where`, if the size contradicts the stated unit, or if the base frame is far from
     all positions. Positions further from the origin than 10 are no metres, and positions that are all within 10 of each
-    other are no millimetres, because a calibration needs motions above 10 mm.
+    other are no millimetres, because a calibration needs motions above 10 mm. Raises InputError, too, for several
+    positions below NEAR_BASE that may be millimetres or centimetres.
     """
     position = position[np.isfinite(position).all(1)]
     if not len(position):
@@ -194,7 +195,8 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
             "metres the base frame is far away: subtract one offset from all, or give the poses in the arm's own base "
             "frame"
         )
-    if stated is None and METRES_LIMIT < far < NEAR_BASE:
+    # A single transform may be that of a camera, which is near its gripper.
+    if stated is None and METRES_LIMIT < far < NEAR_BASE and len(position) > 1:
         raise InputError(
             f"{where}: the positions are at most {far:.3g} from the origin, {far / 1e3:.2g} m as millimetres and "
             f"{far / 1e2:.2g} m as centimetres: say which with --pose-units mm-rad or cm-rad (or mm-deg, cm-deg)"

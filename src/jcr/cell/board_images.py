@@ -21,8 +21,6 @@ from jcr.geometry import fit_similarity
 from jcr.records import Boards, CellCamera, Intrinsics
 from jcr.sfm.register import Registration
 
-NONE = np.zeros(0, int)
-
 
 def located_by_board(
     shown: Boards, points: Float[ndarray, "p 3"], camera: CellCamera
@@ -53,7 +51,11 @@ def located_by_board(
 def _registration(
     shown: Boards, points: Float[ndarray, "p 3"], sightings: Sequence[Sighting], camera: Intrinsics
 ) -> Registration | None:
-    """Return the registration of an image by the board or tag with most corners in it; None without a clear pose."""
+    """Return the registration of an image by the board or tag with most corners in it; None without a clear pose.
+
+    `shown` is the board in the reconstruction and `points` are its points (m, recon frame); `sightings` are the image's
+    detections, and `camera` its intrinsics. All corners that the reconstruction knows are part of the registration.
+    """
     row_of = {
         (b.number, *np.round(x, 9)): row
         for b in shown.bodies
@@ -85,8 +87,8 @@ def _registration(
         ),
         points_in_recon=points[row[row >= 0]],
         x_px=x_px,
-        row=NONE,
+        row=np.zeros(0, int),
         row_x_px=np.zeros((0, 2)),
-        row_point=NONE,
+        row_point=np.zeros(0, int),
         point=row[row >= 0],
     )
