@@ -8,12 +8,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import jcr
+from jcr.calibration.checks.capture import view_findings
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
 from jcr.findings import FindingKind
+from jcr.geometry import inverse, step_between
+from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics
 from scenes import capture_of, reconstruction_of
 from simulation.problems import hand_eye_problem
@@ -71,3 +76,29 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     images = [replace(one, used=k != 4) for k, one in enumerate(of_right.images)]
     of_right = replace(of_right, images=tuple(images))
     assert not left_out_poses(replace(capture, base_from_gripper=right), made, of_right)
+
+
+@pytest.mark.slow
+def test_each_pose_of_a_usual_capture_is_compared(tabletop: Path):
+    """Eight of twelve images were looked at, so that a wrong pose of another one was not noticed."""
+    capture = jcr.read_capture(tabletop)
+    poses = capture.base_from_gripper.copy()
+    poses[4, :3, :3] = poses[4, :3, :3] @ Rotation.from_euler("z", 20, degrees=True).as_matrix()
+    found = check_capture(replace(capture, base_from_gripper=poses))
+    (wrong,) = [one for one in found.findings if one.kind is FindingKind.POSE_CONTRADICTS_IMAGE]
+    assert wrong.images == (capture.images[4],)
+    assert 4 not in found.counted and len(found.counted) == len(capture) - 1
+
+
+@pytest.mark.slow
+def test_a_fixed_camera_is_checked_by_what_moves_with_the_gripper(tabletop: Path):
+    """Its images were called all the same, or the check ended in an error. A table in the gripper moves as a whole."""
+    capture = jcr.read_capture(tabletop)
+    fixed = replace(capture, mount="base", base_from_gripper=inverse(capture.base_from_gripper))
+    found, of_wrist = check_capture(fixed), check_capture(capture)
+    assert found.verdict == "accepted" and found.hand_eye is not None and of_wrist.hand_eye is not None
+    apart = step_between(found.hand_eye.base_from_camera, of_wrist.hand_eye.gripper_from_camera)
+    assert np.abs(apart[:3]).max() < 1e-3 and found.expected is found.hand_eye.uncertainty
+    assert found.expected.seen is not None
+    still = replace(fixed, images=fixed.images[:1] * 3, base_from_gripper=fixed.base_from_gripper[:3])
+    assert not view_findings(still)

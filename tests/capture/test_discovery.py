@@ -339,7 +339,7 @@ CASES: tuple[Case, ...] = (
     *(("controller_notation", (".", "--poses", f"{name}.txt", *(("--pose-convention", way) if way else ())), 0, words)
       for name, way, words in (("list", "ur", "rotation vector in radians; by option"), ("kuka", "kuka", "angles ZYX"),
                                ("abb", "abb", "quaternion w, x, y, z"), ("fanuc", "fanuc", "angles xyz in degrees"),
-                               ("blocks", "matrix", "rotation matrix; by option"), ("fanuc", "", "by names"),
+                               ("blocks", "matrix", "rotation matrix; by option"), ("fanuc", "", "by names and"),
                                ("list", "", "NOT DECIDED"), ("kuka", "", "NOT DECIDED"), ("abb", "", "NOT DECIDED"))),
     ("far_base_frame", (".",), 2, "the base frame is far away: subtract one offset"),
     ("far_base_frame", (".", "--pose-units", "cm-rad"), 2, "the base frame is far away"),

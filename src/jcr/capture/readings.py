@@ -494,7 +494,7 @@ def undecided(where: str, readings: Sequence[Reading]) -> InputError:
 def decision_in_words(reading: Reading) -> str:
     """Return a sentence on how the poses were read and what decided it, for the terminal and the report."""
     by = {
-        "names": "by names",
+        "names": "by names and the size of the numbers",
         "numbers": "by the numbers",
         "option": "by option",
         "images": "decided by the images",

@@ -15,6 +15,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
+from jcr.findings.finding import joined
 from jcr.pipeline.options import TOLERANCE
 from jcr.progress import Progress, progress_bars
 from jcr.records import Capture, PosePairs
@@ -50,7 +51,7 @@ class CheckCommand:
     poses_only: bool = False
     """Check files, units and motion only, without features of the images."""
     thorough: bool = False
-    """Register all images at full size. By default 8 are registered, and all only if these show a fault."""
+    """Register all images at full size. By default 15 are, at reduced size, and all only if these show a fault."""
     require: RequiredAccuracy = GRASPING
     """Required accuracy of a point at the image centre, as for `jcr run`, for the comparison with the expected one."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
@@ -94,7 +95,6 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
     from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
     from jcr.capture.readings import decision_in_words
-    from jcr.pipeline.check import QUICK
 
     capture = found.capture
     about = f"{len(capture)} samples with the poses of gripper and camera, no images"
@@ -120,27 +120,11 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         lines += labelled("Poses", f"{readings} (jcr check without --poses-only, or jcr run)")
     elif isinstance(capture, Capture) and capture.reading is not None:
         lines += labelled("Poses", decision_in_words(capture.reading))
+    if isinstance(capture, Capture) and capture.others:
+        named = joined([one.name for one in capture.others])
+        lines += labelled("Cameras", f"{capture.camera_name} was checked; jcr run also uses {named}")
     if not is_rejected:
-        rotation = np.degrees(found.largest_rotation_rad)
-        motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
-        lines, fitted = [*lines, *labelled("Motion", motion)], found.hand_eye
-        if found.expected is not None and (seen := found.expected.seen) is not None:
-            std = found.expected.std
-            sizes = (1e3 * std[:3], np.degrees(std[3:6]))
-            offset, turn = (" ".join(significant(float(value)) for value in part) for part in sizes)
-            lines += labelled(
-                "Expected",
-                f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
-                f"{significant(seen.rotation_95_deg)}° (95 %), from {len(found.counted)} images; "
-                f"with {'usual errors' if fitted is None else 'the errors found in these images'}",
-                f"1σ: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
-            )
-        if fitted is not None:
-            noise, looked = fitted.robot_noise, f"{int(fitted.inliers.sum())} of {len(capture)} images"
-            if len(fitted.inliers) == QUICK < len(capture):
-                looked += "; --thorough compares all, and tests distortion and focus"
-            agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-            lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
+        lines += _motion_lines(found)
         run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
         closing = shlex.join([*run, *read_arguments(command.read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
@@ -151,6 +135,37 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         notes = notes[: MOST_LINES - len(lines) - len(acting) - 1]
     lines += [*acting, *notes]
     return [*lines, *labelled("Next", closing)]
+
+
+def _motion_lines(found: "Examination") -> list[str]:
+    """Return the lines on the motion, the expected accuracy, and the agreement of poses and images."""
+    rotation, images = np.degrees(found.largest_rotation_rad), len(found.capture)
+    motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
+    lines, fitted = labelled("Motion", motion), found.hand_eye
+    if found.expected is not None and (seen := found.expected.seen) is not None:
+        std = found.expected.std
+        offset, turn = (
+            " ".join(significant(float(value)) for value in part)
+            for part in (1e3 * std[:3], np.degrees(std[3:6]))
+        )
+        corner = "" if (worst := found.expected.corner) is None else significant(worst.within_95_mm)
+        lines += labelled(
+            "Expected",
+            f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
+            f"{significant(seen.rotation_95_deg)}° (95 %) at the image centre"
+            + (corner and f"; {corner} mm in the corner"),
+            f"from {len(found.counted)} images, with "
+            f"{'usual errors' if fitted is None else 'the errors found in these images'}",
+            f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
+        )
+    if fitted is not None:
+        noise, compared = fitted.robot_noise, images if found.compared is None else len(found.compared)
+        looked = f"{int(fitted.inliers.sum())} of {compared} images"
+        if compared < images:
+            looked += f"; --thorough compares all {images}, and tests distortion and focus"
+        agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
+        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
+    return lines
 
 
 def _check_facts(found: "Examination") -> dict[str, Any]:

@@ -15,7 +15,7 @@ from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration
 from jcr.calibration.requirement import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
-from jcr.calibration.stage import calibrate_pose_pairs, checked_case
+from jcr.calibration.stage import calibrate_pose_pairs, calibration_of, checked_case
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
@@ -45,8 +45,9 @@ from jcr.progress import Progress
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.sfm.colmap import reconstruct_colmap
 
-QUICK, QUICK_SIZE_PX = 8, 800
-"""Number of images of the quick reconstruction, and their longer side (px), so that it takes seconds."""
+QUICK, QUICK_SIZE_PX = 15, 800
+"""Number of images of the quick reconstruction, and their longer side (px), so that it takes 3 to 9 s. A usual capture
+has no more images, so that each of its poses is compared; eight take half of the time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +63,11 @@ class Examination:
     observability: Observability
     expected: Uncertainty | None
     """Predicted uncertainty of a calibration from the `counted` images, None for fewer than three of them; of PosePairs
-    the uncertainty of their calibration."""
+    and of a fixed camera the uncertainty of `hand_eye`."""
     counted: Int[ndarray, " c"]
     """Rows of the images that are expected to register: those that did or, if not all were tried, the clear ones."""
+    compared: Int[ndarray, " t"] | None
+    """Rows of the images whose poses were compared with the camera poses; None if none were."""
     hand_eye: Calibration | None
     """Calibration from sparse features, or from given camera poses; None if no images were registered."""
     findings: tuple[Finding, ...]
@@ -86,10 +89,12 @@ class _Comparison:
     """Calibration; None if no camera poses were found."""
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
+    tried: Int[ndarray, " t"] | None = None
+    """Rows of the images that were compared; None if none were."""
     registered: Int[ndarray, " c"] | None = None
-    """Rows of the images that the calibration uses; None if only some of the images were compared."""
+    """Rows of the images that the calibration uses; None if none were compared."""
     assumptions: Assumptions | None = None
-    """Camera and robot as the calibration estimates them; None if there is none, or it is rejected."""
+    """Camera and robot as the calibration estimates them; None if it is rejected, or of a fixed camera."""
 
 
 def check_capture(
@@ -125,17 +130,20 @@ def check_capture(
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         if look and verdict_of(views) != "rejected":
             shown = _compare(capture, robot, options, progress, thorough)
-    counted = clear if shown.registered is None else shown.registered
+    counted = clear
+    if shown.tried is not None and shown.registered is not None:
+        counted = np.union1d(np.setdiff1d(clear, shown.tried), shown.registered)
     rows = counted if len(counted) >= MIN_PREDICTED_IMAGES else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
     seen = observability(gripper, assumptions and assumptions.gripper_from_camera)
-    if hand_eye is not None and shown.registered is not None:
+    if hand_eye is not None and shown.tried is not None and len(shown.tried) == len(capture):
         seen = hand_eye.observability
     found = [*shown.findings, *(() if hand_eye is not None else seen.findings), *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
-    if isinstance(capture, PosePairs):
-        # This is the calibration itself, which needs no prediction.
-        expected = shown.hand_eye and shown.hand_eye.uncertainty
+    if isinstance(capture, PosePairs) or capture.mount == "base":
+        # Camera poses are given, or the camera is fixed, for which `predict` does not simulate images: the expected
+        # uncertainty is that of the calibration.
+        expected = hand_eye and hand_eye.uncertainty
     elif len(counted) >= MIN_PREDICTED_IMAGES:
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
@@ -149,6 +157,7 @@ def check_capture(
         observability=seen,
         expected=expected,
         counted=counted,
+        compared=shown.tried,
         hand_eye=hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
         notes=(*notes, *shown.notes),
@@ -200,35 +209,39 @@ def _compare(
 
     `robot` is the prior of the robot errors of all images. The camera poses of
     PosePairs are given, others are reconstructed from features: first those of QUICK images of reduced size; then those
-    of all images if `thorough` is set, or if the first comparison fails, is rejected, or does not use all QUICK images.
+    of all images if `thorough` is set, or if the first comparison fails or is rejected.
     """
+    rows = np.arange(len(capture))
     if isinstance(capture, PosePairs):
         hand_eye = calibrate_pose_pairs(capture, options)
-        rows = np.flatnonzero(hand_eye.inliers)
-        return _Comparison(hand_eye=hand_eye, findings=hand_eye.findings, registered=rows)
-    is_quick = not thorough and len(capture) > QUICK
+        used = np.flatnonzero(hand_eye.inliers)
+        return _Comparison(hand_eye=hand_eye, findings=hand_eye.findings, tried=rows, registered=used)
     tried, of_tried, size_px = capture, robot, WORKING_SIZE_PX
-    if is_quick:
+    if not thorough:
         rows, size_px = spread_rows(len(capture)), QUICK_SIZE_PX
         tried, of_tried = replace(capture.of_rows(rows), depths=None), robot.of(rows)
     try:
         made = reconstruct_colmap(tried, "sift", 0, progress, size_px)
     except RejectedError as error:
-        if is_quick:
+        if not thorough:
             return _compare(capture, robot, options, progress, thorough=True)
         return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
-    hand_eye, assumptions, registered = case.calibration, None, made.image_index[case.model.used]
+    hand_eye, assumptions = case.calibration, None
     if hand_eye.converged:
-        assumptions = assumptions_of(case)
+        if capture.mount == "gripper":
+            assumptions = assumptions_of(case)
+        else:
+            hand_eye = calibration_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
-    if is_quick and (verdict_of(hand_eye.findings) == "rejected" or len(registered) < QUICK):
+    if not thorough and verdict_of(hand_eye.findings) == "rejected":
         return _compare(capture, robot, options, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,
         notes=made.notes,
-        registered=None if is_quick else registered,
+        tried=rows,
+        registered=rows[made.image_index[case.model.used]],
         assumptions=assumptions,
     )
 
@@ -256,5 +269,5 @@ def assumptions_of(case: Case) -> Assumptions:
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
-    """Return the indices, from 0, of up to eight (QUICK) images, spread evenly over `count` images in their order."""
+    """Return the indices, from 0, of up to QUICK images, spread evenly over `count` images in their order."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)

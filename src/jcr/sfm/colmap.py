@@ -30,7 +30,7 @@ from jcr.camera import (
     without_distortion,
 )
 from jcr.capture.images import read_image
-from jcr.errors import RejectedError
+from jcr.errors import RejectedError, first_few
 from jcr.extras import extra
 from jcr.features.matchers import FeatureName, Geometries, Matcher
 from jcr.features.pair_search import MatchedPairs, match_alone, match_with_robot
@@ -132,7 +132,7 @@ def reconstruct_colmap(
     report("mapping", 1.0)
     notes = matched.notes + made.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
-        notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {', '.join(missing)}",)
+        notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {first_few(missing)}",)
     return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
 
 

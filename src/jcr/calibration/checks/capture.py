@@ -97,7 +97,8 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
     """Return findings on the images alone: static although the gripper moves, blurred, or with repetitive texture."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
-    is_still = metres > STILL[0] or radians > STILL[1]
+    # The image of a fixed camera shows mostly what does not move.
+    is_still = capture.mount == "gripper" and (metres > STILL[0] or radians > STILL[1])
     width, images = {}, capture.images
     for name in images:
         image = read_image(capture.folder / name)
