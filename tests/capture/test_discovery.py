@@ -451,3 +451,50 @@ def test_the_images_decide_once_and_the_run_keeps_the_reading(tmp_path: Path):
     assert kept.reading is not None and kept.reading.decided_by == "images" and len(kept) == 7
     np.testing.assert_allclose(kept.base_from_gripper, poses, atol=1e-8)
     assert "unchanged" in run_jcr("calibrate", tmp_path / "a", tmp_path / "out").stderr
+
+
+@pytest.mark.parametrize(("column", "cell", "said"), [
+    (1, "nan", "column y holds nan"), (1, "inf", "column y holds inf"), (1, "", "column y is empty"),
+    (6, "half", "column qw holds 'half'"), (slice(3, 7), ["0"] * 4, "0 0 0 0 is no rotation"),
+])  # fmt: skip
+def test_a_row_without_a_pose_is_left_out_with_the_cell_that_is_wrong(
+    tmp_path: Path, column: int | slice, cell: str | list[str], said: str
+):
+    cells = [row.split(",") for row in ROWS]
+    cells[2][column] = cell
+    rows = [f"{','.join(row)},{name}" for row, name in zip(cells, NAMES, strict=True)]
+    write(draw(tmp_path) / "poses.csv", [f"{HEADER},image", *rows])
+    kept = jcr.read_capture(tmp_path)
+    assert len(kept) == COUNT - 1 and any(said in note and NAMES[2] in note for note in kept.notes), (
+        kept.notes
+    )
+
+
+@pytest.mark.parametrize(("header", "cell", "said"), [
+    ("x,y,z,qx,qy,qz,other", None, "its columns x, y, z, qx, qy, qz, other, image are no position with a rotation"),
+    (HEADER, "nan", f"column y has no number in {COUNT} of {COUNT} rows"),
+])  # fmt: skip
+def test_a_file_without_poses_says_which_columns_it_has(
+    tmp_path: Path, header: str, cell: str | None, said: str
+):
+    cells = [row.split(",") for row in ROWS]
+    rows = [
+        ",".join([row[0], cell or row[1], *row[2:], name]) for row, name in zip(cells, NAMES, strict=True)
+    ]
+    write(draw(tmp_path) / "poses.csv", [f"{header},image", *rows])
+    with pytest.raises(jcr.InputError, match=said):
+        jcr.read_capture(tmp_path)
+
+
+def test_misspelt_keys_of_a_capture_are_named(small_capture: Path, tmp_path: Path):
+    folder = shutil.copytree(small_capture, tmp_path / "misspelt")
+    content = json.loads((folder / "capture.json").read_text())
+    content["intrinsic"] = content.pop("intrinsics") | {"distorsion": [0.0] * 5}
+    content["weather"] = "fair"  # a remark of the user's own
+    (folder / "capture.json").write_text(json.dumps(content))
+    (note,) = jcr.read_capture(folder).notes
+    assert note.endswith("'intrinsic' is not used; did you mean intrinsics?")
+    content["intrinsics"] = content.pop("intrinsic")
+    (folder / "capture.json").write_text(json.dumps(content))
+    (note,) = jcr.read_capture(folder).notes
+    assert note.endswith("'distorsion' is not used; did you mean distortion?")

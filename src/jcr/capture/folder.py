@@ -12,10 +12,17 @@ from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.discovery import Discovery, discover
 from jcr.capture.documents import Table
 from jcr.capture.intrinsics import intrinsics_of_capture
-from jcr.capture.options import ReadOptions
+from jcr.capture.options import ReadOptions, tolerated
 from jcr.capture.pairing import Pairing, poses_at_images
-from jcr.capture.readings import readings_of, source_of, undecided, untaken_readings
-from jcr.errors import InputError, first_few
+from jcr.capture.readings import (
+    numbers_of_table,
+    pose_columns,
+    readings_of,
+    source_of,
+    undecided,
+    untaken_readings,
+)
+from jcr.errors import LONGEST_NAME, InputError, first_few, printable, shown
 from jcr.records import Capture, Reading
 
 POSE_WORDS = re.compile(r"pos|tcp|robot|ee|arm|hand|flange|matri|end|gripper", re.IGNORECASE)
@@ -114,9 +121,7 @@ def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: Read
     faults = dict[int, str]()
     nameless = [k for k in np.flatnonzero(~has_pose).tolist() if _has_row(chosen, k)]
     for k in nameless:
-        faults[k] = (
-            f"{file}: the row of {found.images[k]} holds no pose (a number is missing or no rotation); correct it"
-        )
+        faults[k] = f"{file}: the row of {found.images[k]} holds no pose: {_row_fault(chosen, k)}; correct it"
     unlisted = [found.images[k] for k in np.flatnonzero(~has_pose).tolist() if k not in faults]
     rows = [k for k in range(len(found.images)) if found.images[k] not in set(unlisted)]
     images = [found.images[k] for k in rows]
@@ -162,6 +167,31 @@ def _untaken(source: _Source, images: list[int], where: str) -> tuple[tuple[Read
     )
 
 
+def _row_fault(chosen: list[_Source], image: int) -> str:
+    """Return why the row of an image in the first table that has one is no pose: the cell that is no number, or all."""
+    source = next(one for one in chosen if one.paired.row is not None and one.paired.row[image] >= 0)
+    table, paired = source.table, source.paired
+    assert paired.row is not None
+    columns = pose_columns(table, paired.skipped)[0]
+    row = int(paired.row[image])
+    numbers, cells = numbers_of_table(table)[row], table.rows[row]
+    for k in (*columns.position, *columns.rotation):
+        if np.isnan(numbers[k]):
+            holds = "is empty" if cells[k] is None else f"holds {shown(cells[k])}"
+            return f"column {table.columns[k] or k + 1} {holds}"
+    return f"{' '.join(f'{numbers[k]:.4g}' for k in columns.rotation)} is no rotation"
+
+
+def _why_no_pose(table: Table) -> str:
+    """Return why a table whose columns have names holds no pose; empty without such names."""
+    rows, missing = len(table.rows), np.isnan(numbers_of_table(table)).sum(0).tolist()
+    for name, cells, bad in zip(table.columns, zip(*table.rows, strict=True), missing, strict=True):
+        if name and bad > tolerated(rows) and any(isinstance(cell, float) for cell in cells):
+            return f" (column {printable(name)[:LONGEST_NAME]} has no number in {bad} of {rows} rows)"
+    names = [printable(name) for name in table.columns if name]
+    return f" (its columns {first_few(names)} are no position with a rotation)" if names else ""
+
+
 def _has_row(chosen: list[_Source], image: int) -> bool:
     """Test whether a table has a row for the image with an index."""
     return any(source.paired.row is not None and source.paired.row[image] >= 0 for source in chosen)
@@ -190,6 +220,10 @@ def _no_poses(folder: Path, found: Discovery, errors: list[tuple[Path, InputErro
     if named or errors:
         return (named or errors)[0][1]
     listed = first_few([one.name for one in found.documents])
+    tables = sorted(
+        (table for table, _ in found.tables), key=lambda one: not POSE_WORDS.search(one.file.name)
+    )
+    listed += _why_no_pose(tables[0]) if tables else ""
     images = found.images
     return InputError(
         f"{folder}: no gripper poses for its {len(images)} images ({images[0]} … {images[-1]})"

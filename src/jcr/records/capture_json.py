@@ -64,7 +64,7 @@ class Entry(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
 
-class IntrinsicsEntry(Entry):
+class IntrinsicsEntry(Entry, extra="allow"):
     """Intrinsics in a capture.json (px), which apply to images of the capture's size."""
 
     fx: Positive

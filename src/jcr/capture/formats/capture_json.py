@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.errors import InputError, shown
+from jcr.errors import InputError, did_you_mean, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import capture_file, path_inside, read_bytes, write_new
 from jcr.records import Capture, CellCamera
@@ -94,11 +94,25 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         if (depth := frames[row].depth) is not None:
             _inside(folder, depth, f"{file}: depth of frame {row}")
     stated = stated_fields(content, [frames[row] for row in rows], capture.image_size, file)
-    notes = (*capture.notes, *stated.pop("notes"))
+    notes = (*capture.notes, *stated.pop("notes"), *_unknown_keys(content, str(file)))
     capture = replace(capture, **stated, notes=notes)
     if content.cameras is None:
         return capture
     return with_cameras(capture, content.cameras, str(file), [row in rows for row in range(count)])
+
+
+def _unknown_keys(content: CaptureFile, where: str) -> list[str]:
+    """Return a note for each key that is similar to a known one, and so probably a misspelt one; others are remarks."""
+    frames = {key for frame in content.frames for key in frame}
+    camera = content.intrinsics
+    given = content.model_extra or {}, frames, (camera and camera.model_extra) or {}
+    known = CaptureFile.model_fields, FrameEntry.model_fields, IntrinsicsEntry.model_fields
+    return [
+        f"{where}: {shown(key)} is not used{meant}"
+        for keys, names in zip(given, known, strict=True)
+        for key in sorted(set(keys) - names.keys())
+        if (meant := did_you_mean(key, names))
+    ]
 
 
 def stated_fields(
