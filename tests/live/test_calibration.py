@@ -208,9 +208,10 @@ def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tm
         live.add(image[..., ::-1], poses[0].tolist(), color="bgr")
         live.add(grey, poses[1].tolist())
         kept = [read_image(live.live.folder / name) for name in live.live.names]
-        live.remove(1)
+        live.remove(live.live.names[1])
         assert live.remove(0).images == ()
-        with pytest.raises(jcr.InputError, match="no image at index 0; the capture has 0"):
-            live.remove(0)
+        for missing in (0, -1, "images/004.png"):
+            with pytest.raises(jcr.InputError, match=f"no image {missing}; the capture has 0"):
+                live.remove(missing)
         assert len(live.add(still(tabletop, 2), poses[2]).images) == 1
     assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))

@@ -165,7 +165,8 @@ def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], ta
         assert status(Origin="http://evil.example") == status(Origin="null") == 403
         assert status(Host="evil.example") == status("GET", f"/{page.key}/", "", Host="evil.example") == 403
         assert status(Content_Type="text/plain") == 403
-        assert status(path="/press") == status(path="/guess/press") == status("GET", "/", "") == 404
+        assert status(path="/press") == 403
+        assert status(path="/undo") == status(path="/guess/press") == status("GET", "/", "") == 404
         assert status("GET", f"/{page.key}/image/../capture.json", "") == 404
         for text in ("{", "[]", '{"action": "rm"}', '{"action": "remove", "number": "1"}', "x" * 2000):
             assert status(text=text) == 400
@@ -293,7 +294,8 @@ def posted(
     sent = {"Host": server.hosts[0], "Authorization": f"Bearer {server.key}"}
     sent |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
-    connection.request("POST", path, body, {name: value for name, value in sent.items() if value is not None})
+    method, sent = "GET" if path == "/state" else "POST", {key: text for key, text in sent.items() if text}
+    connection.request(method, path, body, sent)
     answer = connection.getresponse()
     text = answer.read()
     connection.close()
@@ -342,6 +344,35 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
         assert posted(server, POSE)[0] == 200
     assert np.allclose(taken[0].base_from_gripper, pose)
     assert np.allclose(taken[1].base_from_gripper[:3, :3], np.diag([-1, 1, -1]))
+
+
+def test_a_program_reads_the_state_and_removes_replaces_and_undoes(tmp_path: Path, tabletop: Path):
+    images, at = [read_image(tabletop / "images" / f"{k:02d}.jpg") for k in range(3)], [0]
+    session, _ = a_capture(tmp_path / "c", still_frames(lambda: images[at[0]]))
+    with LiveServer(session, takes_samples=True) as server:
+        for k in range(2):
+            at[0] = k
+            assert posted(server, {"base_from_gripper": poses(tabletop)[k].tolist()})[0] == 200
+        names = session.folder.names
+        status, state = posted(server, {"action": "remove", "number": 1}, "/press")
+        assert status == 200 and state["accepted"] and state["images"] == names[1:]
+        assert posted(server, {"action": "undo"}, "/press")[1]["images"] == names
+        assert posted(server, {"action": "retake", "number": 2}, "/press")[0] == 200
+        at[0] = 2
+        assert posted(server, {"base_from_gripper": poses(tabletop)[2].tolist()})[0] == 200
+        assert len(session.folder.names) == 2 and session.folder.names[1] != names[1]
+        refused, answer = posted(server, {"action": "remove", "number": 9}, "/press")
+        assert refused == 422 and "no image 9" in answer["reason"]
+        status, answer = posted(server, {"action": "jump"}, "/press")
+        assert status == 400 and "remove, undo, finish" in answer["reason"]
+        assert posted(server, {"action": "undo"}, "/press", Authorization=None)[0] == 403
+        status, answer = posted(server, {}, "/undo")
+        assert status == 404 and "GET /state" in answer["reason"]
+        assert posted(server, {"action": "finish"}, "/press")[1]["done"]
+        assert posted(server, {"action": "undo"}, "/press")[0] == 422
+        status, state = posted(server, "", "/state")
+        assert status == 200 and state["images"] == session.folder.names and state["done"]
+        assert posted(server, "", "/state", Authorization=None)[0] == 403
 
 
 def test_a_run_is_verified_when_a_program_asks(serving: Callable[..., Any]):

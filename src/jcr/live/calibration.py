@@ -101,17 +101,19 @@ class LiveCalibration:
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
-    def remove(self, index: int) -> LiveProgress:
-        """Remove the image at `index`, which counts from 0, from the capture, and calibrate without this image.
+    def remove(self, image: int | str) -> LiveProgress:
+        """Remove an image from the capture, and calibrate without it.
 
-        Returns the new state of the calibration. A negative `index` counts from the end. Raises InputError if there is
-        no such image.
+        `image` is its name, or its index, which counts from 0, and from the end if it is negative. Returns the new state
+        of the calibration. Raises InputError if there is no such image.
         """
         with self._lock:
             names = self.live.names
-            if not -len(names) <= index < len(names):
-                raise InputError(f"there is no image at index {index}; the capture has {len(names)}")
-            self.live.remove(names[index])
+            if isinstance(image, int) and -len(names) <= image < len(names):
+                image = names[image]
+            if image not in names:
+                raise InputError(f"there is no image {image}; the capture has {len(names)}")
+            self.live.remove(image)
             return self.update()
 
     def undo(self) -> LiveProgress:

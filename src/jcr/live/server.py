@@ -1,6 +1,6 @@
-"""HTTP server of a capture: the live page with its commands, and gripper poses from a program (`POST /sample`).
+"""HTTP server of a capture: the live page, and gripper poses and commands of a program (`POST /sample`, `/press`).
 
-Every request needs the session key, in the path of the page or in the header `Authorization` of a sample. The header
+Every request needs the session key, in the path of the page or in the header `Authorization` of a program. The header
 `Host` must name this server (protection against DNS rebinding), and the header `Origin` of a browser must be that of the
 page. Other web sites can therefore not read the capture, send commands or add a pose.
 """
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import unquote
 
 import numpy as np
@@ -53,7 +53,7 @@ HEADERS = {
 
 
 class _Command(BaseModel):
-    """Command that the page sends: an action, and the number of its image, counted from 1 (None: the last)."""
+    """Command of the page or of a program: an action, and the number of its image, counted from 1 (None: the last)."""
 
     model_config = ConfigDict(strict=True)
     action: Action
@@ -133,7 +133,11 @@ class _Handler(BaseHTTPRequestHandler):
     server: LiveServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
-        """Answer a GET request of the page: page, state, camera image, images of the list, or report."""
+        """Answer a GET request of a program for the state, or of the page: page, state, images, or report."""
+        if self.path == "/state":
+            refused = self._refused()
+            self._send_json(*((self._state(), 200) if refused is None else ({"reason": refused}, 403)))
+            return
         if (path := self._path()) is None:
             return
         path, _, query = path.partition("?")
@@ -161,23 +165,50 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(status=404)
 
     def do_POST(self) -> None:
-        """Execute a command of the page, or take an image at the gripper pose of a posted sample."""
-        if self.path in ("/sample", "/verify"):
+        """Execute a command of the page or of a program, or take an image at the gripper pose of a posted sample."""
+        programs = {"/sample": self._sampled, "/press": self._pressed, "/verify": self._verified}
+        if (answered := programs.get(self.path)) is not None:
             if (refused := self._refused()) is not None:
                 answer, status = {"accepted": False, "reason": refused}, 403
             else:
-                answer, status = self._sampled() if self.path == "/sample" else self._verified()
+                answer, status = answered()
             self._send_json(answer, status)
         elif (path := self._path()) is not None:
             is_json = self.headers.get("Content-Type", "") == "application/json"
-            is_own, command = is_json and self._is_own_origin(), None
-            with suppress(ValidationError):
-                command = _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
+            is_own, command = is_json and self._is_own_origin(), self._command()
             if is_own and path == "press" and command is not None:
                 self.server.session.press(command.action, command.number)
                 self._send(status=204)
             else:
                 self._send(status=400 if is_own else 403)
+
+    def _command(self) -> _Command | None:
+        """Return the command in the request's body; None if it is none."""
+        with suppress(ValidationError):
+            return _Command.model_validate_json(self._body(MAX_COMMAND) or b"")
+        return None
+
+    def _pressed(self) -> tuple[dict[str, Any], int]:
+        """Execute a program's command; return the state after it and the HTTP status, 422 if it is refused."""
+        if (command := self._command()) is None:
+            listed = ", ".join(get_args(Action))
+            return {"accepted": False, "reason": f'send {{"action": …, "number": …}}; actions: {listed}'}, 400
+        session = self.server.session
+        if session.state.is_over:
+            return self._state() | {"accepted": False, "reason": "the capture has ended"}, 422
+        session.press(command.action, command.number)
+        state = session.state
+        answer = self._state() | {"accepted": not state.is_refusal}
+        return (answer | {"reason": state.event}, 422) if state.is_refusal else (answer, 200)
+
+    def _state(self) -> dict[str, Any]:
+        """Return the state of the capture for programs: its images, last event, and last calibration."""
+        state = self.server.session.state
+        return state.progress.as_json() | {
+            "images": state.names,
+            "event": state.event,
+            "done": state.is_over,
+        }
 
     def _refused(self) -> str | None:
         """Return the reason why a request of a program is refused; None if its key, host and origin are right."""
@@ -230,7 +261,9 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("Host") not in self.server.hosts:
             self._send(status=403)
         elif not slash or not self._is_key(key):
-            self._send(status=404)
+            self._send_json(
+                {"reason": "not found; programs use GET /state and POST /sample, /press, /verify"}, 404
+            )
         else:
             return path
         return None
