@@ -60,8 +60,8 @@ def cli_page() -> str:
     """Every command with its arguments, as the parser itself has them."""
     parts = [
         "# Command line\n",
-        "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 done, but the result "
-        "is rejected, 1 a bug, 130 interrupted. [In the shell](../how-to/batch.md#in-the-shell).\n",
+        "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 the result is rejected "
+        "or not as exact as needed, 1 a bug, 130 interrupted. [In the shell](../how-to/batch.md#in-the-shell).\n",
         "| command | |\n|---|---|",
         *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
     ]

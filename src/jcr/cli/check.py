@@ -244,7 +244,9 @@ class CompareCommand:
         remedy = []
         if is_contradiction:
             explained = "; more than the reported errors explain"
-            remedy = ["find what moved between the two, or which error they do not report"]
+            remedy = [
+                "look for an error that one of the two does not state; if there is none, something moved"
+            ]
         if found.likely_cause is not None:
             remedy = [f"compare first {found.likely_cause}", *(f"otherwise {one}" for one in remedy)]
         verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"

@@ -16,6 +16,7 @@ from jcr.cli.output import Output, VerboseOutput
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.files import locked
+from jcr.findings.finding import joined
 from jcr.pipeline.options import BatchOptions
 from jcr.progress import Progress, progress_bars
 from jcr.reconstruct import ReconstructOptions
@@ -271,7 +272,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
         name = "" if is_named else " --parent-frame FRAME"
         # A driver often publishes the optical frame below a root link of the camera.
         about = (
-            "" if is_named else "FRAME is that of your poses: tool0, flange, …; "
+            "" if is_named else "FRAME is the frame of your gripper poses, such as tool0 or flange; "
         ) + "for a driver: --to-root LINK"
         following = f"jcr export {shlex.quote(str(out))} ros2{name}  # {about}"
     lines = list[str]()
@@ -282,6 +283,11 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
             about = f"{verdict_in_words(camera.findings)}, {camera.mount}_from_camera ±{mm} mm, {deg}°"
             about += " (1σ, worst axis; cameras.json)"
         lines += labelled("Camera", f"{camera.name}: {about}")
+    if content.converged and (bad := [camera.name for camera in placed if not camera.converged]):
+        lines += labelled(
+            "Exit",
+            f"status 3: {joined(bad)} is rejected; the calibration of {result.capture.camera_name} can be used",
+        )
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
         lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]

@@ -14,7 +14,8 @@ class DepthOptions:
         bool,
         tyro.conf.arg(
             help="Leave plain surfaces without depth. By default planes fill them where their colour and the matched "
-            "depth around them support it. The map uses these planes as surfaces, not as evidence of free space."
+            "depth around them support it. The map uses these planes as surfaces, not as evidence of free space.",
+            help_behavior_hint="(default: planes fill them)",
         ),
     ] = True
     """Fill plain surfaces with planes. Networks predict them anyway."""

@@ -262,8 +262,9 @@ class ExportedRun:
             off = views.base_from_camera - views.base_from_gripper @ found.gripper_from_camera
             mm = 1e3 * float(np.median(np.linalg.norm(off[:, :3, 3], axis=1)))
             return (
-                f"cameras and intrinsics ({intrinsics_in_words(views.intrinsics)}) are those of the images, as in the "
-                f"map; the centres are {significant(mm)} mm (median) from gripper pose times transform"
+                f"camera poses and intrinsics ({intrinsics_in_words(views.intrinsics)}) fit each other and the map to "
+                f"a fraction of a pixel; gripper poses times the hand-eye transform differ from them by "
+                f"{significant(mm)} mm (median), the errors of the robot's poses"
             )
         camera = self.camera_frame.intrinsics if {"mount", "camera_frame"} & {*contents.split()} else None
         if camera is None:
