@@ -156,6 +156,30 @@ def test_estimated_distortion_of_a_wide_lens_is_not_extrapolated_beyond_its_usua
         assert lengths.max() < 0.02 and (lengths < bounds).all() and bounds.max() < 0.2
 
 
+def test_a_point_beyond_the_reach_of_the_images_is_as_uncertain_as_the_given_distortion_is_wrong():
+    """The image corner is displaced by 15 % of its radius by the given distortion, and by 3 % by the lens."""
+    nominal = with_parameters(INTRINSICS, parameters(INTRINSICS) * np.r_[np.ones(4), np.zeros(5)])
+    middle = np.array([nominal.width - 1.0, nominal.height - 1.0]) / 2
+    scale = (np.linalg.norm(middle) / nominal.fx) ** -np.array([2, 4, 6])
+    truth, given = (
+        replace(nominal, distortion=(k[0], k[1], 0.0, 0.0, k[2]))
+        for k in (scale * (0.03, -0.02, 0.02), scale * (0.05, -0.1, 0.2))
+    )
+    problem = bent_problem(arm_named("ur5e"), "white", 12, 3)
+    tracks = observed(problem, np.random.default_rng(3), 400, 0.2, truth)
+    inner = np.linalg.norm(tracks.x_px - middle, axis=1) < np.linalg.norm(middle) / 2
+    found = solved(problem, tracks.only(inner), camera_with_prior(given))
+    x, camera = found.state.x[0], found.problem.intrinsics(found.state)[0]
+    x_px = middle * (1 + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1], [0, 0]]))
+    covariance = point_covariance(x, uncertainty_of(found), camera, x_px, DISTANCE_M)
+    bounds = np.array([within_95(one) for one in covariance])
+    ours, there = (
+        points_along(pose, lens, x_px, DISTANCE_M)
+        for pose, lens in ((x, camera), (problem.gripper_from_camera, truth))
+    )
+    assert (np.linalg.norm(ours - there, axis=1) < bounds).all() and bounds[4] < 3e-3
+
+
 @pytest.mark.slow
 def test_the_error_that_the_model_leaves_has_its_size_and_makes_the_intrinsics_uncertain():
     exact, some, much = (warped(warp_px) for warp_px in (0.0, 0.3, 1.0))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.boards.detection import FEWEST_POINTS, Board, Sighting, boards, most_seen
-from jcr.camera import WITHIN_FOLD, fold_distance_px, project
+from jcr.camera import project, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.errors import RejectedError
 from jcr.estimation.absolute_pose import absolute_pose
@@ -52,13 +52,9 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     report("board", 1.0)
     seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
     notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
-    intrinsics, intrinsics_notes = intrinsics_by_board(capture.intrinsics, capture.image_size, board, seen)
+    given, warnings = usable_intrinsics(capture.intrinsics)
+    intrinsics, intrinsics_notes = intrinsics_by_board(given, capture.image_size, board, seen)
     notes += intrinsics_notes
-    if (fold_px := fold_distance_px(intrinsics)) is not None:
-        centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
-        for sightings in seen:
-            sightings[:] = [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
-        notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
     poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
@@ -88,6 +84,7 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
         is_metric=board.size_std is not None,
         metric_std=board.size_std,
         notes=tuple(notes),
+        warnings=warnings,
     )
 
 

@@ -1,7 +1,7 @@
 """Prior distribution of a camera's intrinsics, and of the remaining distortion that its model does not describe."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,9 +17,9 @@ MEASURED = {
     "aspect": 1e-3,
     "cx": 5e-3,
     "cy": 5e-3,
-    "k1": 0.02,
-    "k2": 0.05,
-    "k3": 0.1,
+    "k1 in the corner": 0.03,
+    "k2 in the corner": 0.03,
+    "k3 in the corner": 0.03,
     "p1": 1e-3,
     "p2": 1e-3,
     "s1": 1e-3,
@@ -28,7 +28,10 @@ MEASURED = {
     "s4": 1e-3,
 }
 """Prior standard deviations of given intrinsics without stated ones: focal length and aspect relative, principal point
-in image widths, distortion absolute. Errors of factory values: 0.3 to 0.9 % and a few pixels."""
+in image widths; k1 to k3 as displacements of the image corner, as shares of its radius; other coefficients absolute.
+Errors of factory values: 0.3 to 0.9 % and a few pixels. The given k1, k2 and k3 of five real captures are 3 % (rms)
+from those that features out to the corners show; the largest sums of the three are 3 %. With 1.5 or 4.5 %, simulated
+errors in the corner stay within the stated 95 % as often, which is 0.8 or 1.2 to 1.8 times as large."""
 ESTIMATED = {
     "f": 0.5,
     "aspect": 3e-3,
@@ -171,6 +174,37 @@ def unmodelled(
     every = polynomials(x_px, camera)
     fit = np.linalg.lstsq(by_prior, every.reshape(len(by_prior), -1), rcond=None)[0]
     return every - (by_prior @ fit).reshape(every.shape), directions @ fit
+
+
+FARTHEST = 10
+"""Place, from the farthest, of the point whose radius counts as the last observed one: single points are wrong matches.
+With 5 or 15, no stated bound of 40 simulated captures changes by 1 %."""
+
+
+def reach_px(camera: Intrinsics, x_px: Float[ndarray, "k 2"]) -> float:
+    """Return the distance (px) from the principal point within which all pixels but the FARTHEST lie."""
+    radius = np.sort(np.linalg.norm(x_px - [camera.cx, camera.cy], axis=1))
+    return float(radius[-min(FARTHEST, len(radius))])
+
+
+def rays_by_reach(
+    camera: Intrinsics, x_px: Float[ndarray, "*k 2"], reach_px: float
+) -> Float[ndarray, "*k 3"]:
+    """Return the rays with z = 1 of pixels if the distortion did not change, as a share, beyond `reach_px`.
+
+    The share is that of the last observed pixel on the same radius. A lens need not follow its polynomial beyond: from
+    boards in the middle of the images, four of ten real captures fit one that folds over before the corner.
+    """
+    centre = np.array([camera.cx, camera.cy])
+    beyond = np.maximum(np.linalg.norm(x_px - centre, axis=-1, keepdims=True) / reach_px, 1.0)
+    near_px, without = (
+        centre + (x_px - centre) / beyond,
+        replace(camera, distortion=(0.0,) * len(camera.distortion)),
+    )
+    far, near = (np.linalg.norm(unproject(without, at)[..., :2], axis=-1) for at in (x_px, near_px))
+    out = unproject(camera, near_px)
+    out[..., :2] *= (far / np.maximum(near, 1e-12))[..., None]
+    return out
 
 
 def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: float) -> float:

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject, with_thin_prism
 from jcr.distributions import chi2
 from jcr.estimation.elimination import cholesky, over, point_blocks
-from jcr.estimation.intrinsics_prior import polynomials
+from jcr.estimation.intrinsics_prior import polynomials, rays_by_reach
 from jcr.estimation.pose_equations import pose_by_pose, reported_poses
 from jcr.estimation.problem import BASE_ROTATION, BASE_TRANSLATION, SCALE
 from jcr.estimation.projection import derivatives
@@ -237,7 +237,8 @@ def _derivatives(
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns, and their covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale, the intrinsics if
-    estimated, and the coefficients of the distortion that the model cannot express. `distance_m` is along the ray.
+    estimated, the coefficients of the distortion that the model cannot express, and the extrapolated part of the
+    distortion. `distance_m` is along the ray.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     ray = unproject(intrinsics, x_px)
@@ -258,5 +259,8 @@ def _derivatives(
         columns.append(by_pixel @ (by_coefficient - by_intrinsics @ left.expressed))
         # The squared mean is part of the error of a projection by the intrinsics alone.
         moment = left.covariance + np.outer(left.likeliest, left.likeliest)
-        covariance = block_diag(covariance, moment)
+        # Beyond the last observed pixel, the change of the distortion counts as one standard deviation of its error.
+        kept = rays_by_reach(intrinsics, x_px, left.reach_px)
+        columns.append((distance * (unit - kept / np.linalg.norm(kept, axis=-1, keepdims=True)))[..., None])
+        covariance = block_diag(covariance, moment, 1.0)
     return np.concatenate(columns, axis=-1), np.asarray(covariance)

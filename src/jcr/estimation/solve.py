@@ -28,7 +28,7 @@ from jcr.estimation.image_equations import (
     with_model_error_of,
     with_pixel_noise,
 )
-from jcr.estimation.intrinsics_prior import unmodelled
+from jcr.estimation.intrinsics_prior import reach_px, unmodelled
 from jcr.estimation.pose_equations import (
     PoseEquations,
     pose_by_pose,
@@ -259,6 +259,7 @@ def uncertainty_of(found: Solution) -> Uncertainty:
             likeliest=found.state.camera_steps[own],
             covariance=found.covariance[unknowns, unknowns],
             expressed=unmodelled(middle, directions, x_px)[1],
+            reach_px=reach_px(known, x_px),
         )
     by_unknown = np.eye(7 + len(directions), len(found.covariance))
     by_unknown[7:] = 0.0

@@ -335,6 +335,9 @@ class ModelError:
     """Covariance of the coefficients (e,e)."""
     expressed: Square
     """Matrix (q,e): parameters (camera.parameters) that best fit each polynomial at the points of the images."""
+    reach_px: Spread
+    """Distance (px) from the principal point within which the images show points; beyond it, distortion is
+    extrapolated."""
 
     __post_init__ = require_fields
 
