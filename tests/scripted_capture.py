@@ -99,7 +99,7 @@ class Scripted:
     def finish(self) -> Any:
         self.finished += 1
         made = a_hand_eye(True)
-        blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/000.png", value=5.0)
+        blurred = Finding.of(FindingKind.BLURRED, "warns", "images", "images/001.png", value=5.0)
         error = LeaveOneOut(
             translation_mm=0.0123, rotation_deg=0.00456, reprojection_px=0.0789, how="joint adjustment"
         )

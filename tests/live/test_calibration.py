@@ -188,8 +188,8 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
             (other, mirrored, "a reflection"),
             (other, not_finite, "NaN"),
             (other, in_mm, "look like millimetres: divide the translations by 1000"),
-            (image, poses[1], "image 2: is the same as images/000.png, though the gripper moved by"),
-            (image, poses[0], "image 2: repeats images/000.png, image and pose"),
+            (image, poses[1], "image 2: is the same as images/001.png, though the gripper moved by"),
+            (image, poses[0], "image 2: repeats images/001.png, image and pose"),
         ):
             with pytest.raises(jcr.InputError, match=words):
                 live.add(wrong, pose)
@@ -198,7 +198,7 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
         with pytest.raises(jcr.InputError, match="image 2: joints: up to 90 rad; these look like degrees"):
             live.add(other, poses[1], joints=[90.0] * 6)
         assert (live.live.folder / "capture.json").read_bytes() == before
-        assert [file.name for file in (live.live.folder / "images").iterdir()] == ["000.png"]
+        assert [file.name for file in (live.live.folder / "images").iterdir()] == ["001.png"]
 
 
 def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tmp_path: Path, tabletop: Path):
@@ -210,7 +210,7 @@ def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tm
         kept = [read_image(live.live.folder / name) for name in live.live.names]
         live.remove(live.live.names[1])
         assert live.remove(0).images == ()
-        for missing in (0, -1, "images/004.png"):
+        for missing in (0, -1, "images/005.png"):
             with pytest.raises(jcr.InputError, match=f"no image {missing}; the capture has 0"):
                 live.remove(missing)
         assert len(live.add(still(tabletop, 2), poses[2]).images) == 1

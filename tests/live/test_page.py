@@ -75,13 +75,13 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         assert "± 3.3 mm" in three["parts"]["head"] and "required 2 mm" in three["parts"]["head"]
         scene = json.loads(three["scene"])
         assert len(scene["views"]) == 3 and scene["views"][0]["camera"] is not None
-        with asked(page, "GET", f"/{page.key}/image/images/000.png") as answer:
+        with asked(page, "GET", f"/{page.key}/image/images/001.png") as answer:
             assert answer.status == 200 and answer.read()[:2] == b"\xff\xd8"
 
-        scripted.contradicted = "images/003.png"
+        scripted.contradicted = "images/004.png"
         add(live, scripted, tabletop, 4)
         wrong = parts(page)["parts"]
-        assert "verdict fair" in wrong["head"] and "The gripper pose of images/003.png" in wrong["head"]
+        assert "verdict fair" in wrong["head"] and "The gripper pose of images/004.png" in wrong["head"]
         assert wrong["images"].count('class="rejected"') == 1
         assert "(retake 4, or remove 4)" in wrong["head"]
         assert any("(retake 4, or remove 4)" in line for line in progress_lines(live.state.progress))
@@ -112,7 +112,7 @@ def test_the_page_advises_until_the_requirement_is_met(capture: tuple[LiveSessio
         assert 'data-press="take"' not in head and 'data-press="retake"' in head
         live.press("retake", 2)
         shown = parts(page)["parts"]
-        assert "next image replaces images/001.png" in shown["head"] and len(live.folder.names) == 5
+        assert "next image replaces images/002.png" in shown["head"] and len(live.folder.names) == 5
         assert shown["images"].count("the next image replaces this one") == 1
 
 
@@ -146,7 +146,7 @@ def test_the_server_serves_until_the_report_is_sent(capture: tuple[LiveSession, 
         live.finish()
     reading.join()
     assert got["report"] == "<p>the report</p>" and got["last"]
-    assert 'id="report"' in got["head"] and "images/000.png is blurred" in got["head"].lower()
+    assert 'id="report"' in got["head"] and "images/001.png is blurred" in got["head"].lower()
 
 
 def test_only_the_page_itself_commands(capture: tuple[LiveSession, Scripted], tabletop: Path):
@@ -228,20 +228,20 @@ def test_buttons_take_retake_remove_undo_end_on_a_phone(chromium: Chromium, tmp_
         press("[data-press=take]", 1)
         press("[data-press=take]", 1)
         shows("document.querySelector('.verdict.bad')")
-        assert "where images/000.png was taken" in chromium.js("document.querySelector('.verdict').innerText")
+        assert "where images/001.png was taken" in chromium.js("document.querySelector('.verdict').innerText")
         for at[0] in (1, 2):
             press("[data-press=take]", at[0] + 1)
         press(".commands [data-press=retake]", 3)
-        shows("document.querySelector('#images img[src$=\"003.png\"]')")
-        assert live.folder.names == [f"images/00{k}.png" for k in (0, 1, 3)]
+        shows("document.querySelector('#images img[src$=\"004.png\"]')")
+        assert live.folder.names == [f"images/00{k}.png" for k in (1, 2, 4)]
         press('#images [data-press=remove][data-number="1"]', 2)
-        assert live.folder.names == ["images/001.png", "images/003.png"]
+        assert live.folder.names == ["images/002.png", "images/004.png"]
         press("[data-press=undo]", 3)
         shows("document.querySelector('.verdict.good')")
         # Nothing is wider than the window.
         assert chromium.js("document.documentElement.scrollWidth <= innerWidth")
         press(".commands [data-press=remove]", 2)
-        assert live.folder.names == ["images/000.png", "images/001.png"]
+        assert live.folder.names == ["images/001.png", "images/002.png"]
         press("[data-press=finish]", 2)
         taking.join(60)
         assert live.state.is_over and chromium.js("asked") == "End the capture with 2 images?"
@@ -428,7 +428,7 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     sample = json.dumps({"base_from_gripper": poses(tabletop)[0].tolist()})
     connection.request("POST", "/sample", sample, {"Authorization": "Bearer sesame"})
     answer = json.loads(connection.getresponse().read())
-    assert answer["accepted"] and answer["image"] == "images/000.png", answer
+    assert answer["accepted"] and answer["image"] == "images/001.png", answer
     second = [sys.executable, "-m", "jcr", "capture", str(out), "--camera", str(tmp_path / "a.avi")]
     refused = subprocess.run(second, capture_output=True, text=True, timeout=60)
     assert refused.returncode == 2 and "another jcr is writing there" in refused.stderr.splitlines()[-1]
@@ -449,5 +449,5 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     assert result.splitlines()[-1] == f"Next        jcr check {out}"
     assert talked.returncode == 0 and talked.stdout.count("images/00") == 3, talked.stdout + talked.stderr
     # The client prints the accuracy that each image leads to.
-    assert "images/003.png 95 %, mm: " in talked.stdout.splitlines()[-1]
+    assert "images/004.png 95 %, mm: " in talked.stdout.splitlines()[-1]
     assert jcr.read_capture(out).images == tuple(f"images/00{k}.png" for k in range(4))

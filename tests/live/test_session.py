@@ -79,16 +79,16 @@ def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
     heard = taken.run([0, 1, 2, retake, undo, retake, 3, ("remove", 9), removed, undo, undo])
     said = [line for _, lines in heard for line in lines]
     # Nothing is removed before its replacement is there.
-    waits, kept = "the next image replaces images/001.png", "images/001.png is kept"
-    assert [line for line in said if "001" in line and line != "kept images/001.png"] == [
-        waits, kept, waits, "kept images/003.png in place of images/001.png",
+    waits, kept = "the next image replaces images/002.png", "images/002.png is kept"
+    assert [line for line in said if "002" in line and line != "kept images/002.png"] == [
+        waits, kept, waits, "kept images/004.png in place of images/002.png",
     ]  # fmt: skip
     assert any(answer.get("reason") == "there is no image 9" for answer, _ in heard)
-    assert ({"images": ["images/002.png", "images/003.png"]}, ["removed images/000.png"]) in heard
-    assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png", "images/002.png"]
+    assert ({"images": ["images/003.png", "images/004.png"]}, ["removed images/001.png"]) in heard
+    assert frames_in(tmp_path / "c") == ["images/001.png", "images/002.png", "images/003.png"]
     taken.scripted.close()
     left = sorted(file.name for file in (tmp_path / "c" / "images").iterdir())
-    assert left == ["000.png", "001.png", "002.png"]
+    assert left == ["001.png", "002.png", "003.png"]
 
 
 def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path: Path, tabletop: Path):
@@ -107,7 +107,7 @@ def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path
     heard = taken.run([0, ("retake",), ("take",), 1])
     reasons = [answer["reason"] for answer, _ in heard if "reason" in answer]
     assert len(reasons) == 2 and all("silent for 5 s" in reason for reason in reasons)
-    assert frames_in(tmp_path / "c") == ["images/001.png"]
+    assert frames_in(tmp_path / "c") == ["images/002.png"]
 
 
 def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_path: Path, tabletop: Path):
@@ -123,8 +123,8 @@ def test_requests_and_commands_of_several_threads_come_one_after_the_other(tmp_p
                 threads.submit(taken.session.press, "take")
 
     taken.session.run(source)
-    assert frames_in(tmp_path / "c") == ["images/000.png"]
-    assert all("where images/000.png" in one["reason"] for one in answers if not one["accepted"])
+    assert frames_in(tmp_path / "c") == ["images/001.png"]
+    assert all("where images/001.png" in one["reason"] for one in answers if not one["accepted"])
 
 
 def test_an_arm_that_moves_while_the_image_is_taken_is_named(tmp_path: Path, tabletop: Path):
@@ -152,7 +152,7 @@ def test_a_full_disk_refuses_the_image_alone(tmp_path: Path, tabletop: Path, mon
     assert [answer["reason"] for answer, _ in heard if "reason" in answer] == [
         "the image cannot be written (No space left on device); free the disk and take it again"
     ]
-    assert files == [["000.png", "001.png"]] and len(frames_in(tmp_path / "c")) == 3
+    assert files == [["001.png", "002.png"]] and len(frames_in(tmp_path / "c")) == 3
     # Neither does a calibration that cannot write its files end the capture.
     again = Stepped(tmp_path / "d", tabletop)
     again.scripted.fault = full
@@ -184,7 +184,7 @@ def test_a_camera_that_repeats_or_changes_its_size_is_named_and_nothing_is_kept(
     session, _ = a_capture(tmp_path / "c", frames(), patience=1.0)
     kept, refused = take_all(session, poses[:2])
     assert kept["accepted"] and not refused["accepted"] and why in refused["reason"]
-    assert frames_in(tmp_path / "c") == ["images/000.png"]
+    assert frames_in(tmp_path / "c") == ["images/001.png"]
 
 
 def test_poses_that_stop_end_the_capture_in_one_line_with_all_that_was_taken(tmp_path: Path, tabletop: Path):
@@ -198,10 +198,10 @@ def test_poses_that_stop_end_the_capture_in_one_line_with_all_that_was_taken(tmp
     with pytest.raises(jcr.InputError, match="silent"):
         session.run(source)
     scripted.close()
-    assert frames_in(tmp_path / "c") == ["images/000.png"]
+    assert frames_in(tmp_path / "c") == ["images/001.png"]
     resumed, _ = a_capture(tmp_path / "c", still_frames(lambda: still(tabletop, 1)))
     take_all(resumed, poses[1:2])
-    assert frames_in(tmp_path / "c") == ["images/000.png", "images/001.png"]
+    assert frames_in(tmp_path / "c") == ["images/001.png", "images/002.png"]
 
 
 def taken(folder: Path, camera: Path, poses: list[ndarray], **options) -> list[dict]:
@@ -218,7 +218,7 @@ def close_to(image: ndarray, other: ndarray) -> bool:
 def test_each_pose_gets_the_image_still_there_and_a_stopped_capture_resumes(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     first = taken(tmp_path / "c", video(tmp_path / "a.avi", tabletop, range(3)), pose[:3])
-    assert [answer["image"] for answer in first] == [f"images/00{k}.png" for k in range(3)]
+    assert [answer["image"] for answer in first] == [f"images/00{k}.png" for k in range(1, 4)]
     file = tmp_path / "c" / "capture.json"
     content = json.loads(file.read_text()) | {
         "remark": "mine",
@@ -240,7 +240,7 @@ def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_named(tmp_p
     file = video(tmp_path / "a.avi", tabletop, range(1), rest_s=2)
     answers = taken(tmp_path / "c", file, [pose[0], pose[0], pose[1], pose[2]], patience=0.8)
     assert [answer["accepted"] for answer in answers] == [True, False, False, False]
-    assert "where images/000.png was taken" in answers[1]["reason"]
+    assert "where images/001.png was taken" in answers[1]["reason"]
     assert "did not change" in answers[2]["reason"] and "ended" in answers[3]["reason"]
     assert len(LiveFolder(tmp_path / "c").names) == 1
 

@@ -100,11 +100,11 @@ def test_images_are_taken_by_service_each_with_its_state_and_a_change_is_undone(
     with pytest.raises(jcr.InputError, match="another jcr is writing"):
         session().start()
     for played.at in range(4):
-        assert first.take() == (True, f"kept images/{played.at:03d}.png")
+        assert first.take() == (True, f"kept images/{played.at + 1:03d}.png")
     until(lambda: states and states[-1]["translation_95_mm"] is not None)
     assert {"translation_95_mm", "rotation_95_deg", "findings", "verdict", "event"} <= states[-1].keys()
     assert states[-1]["translation_95_mm"] > 0 and states[0]["translation_95_mm"] is None
-    assert first.take() == (False, "the gripper is where images/003.png was taken; move to another pose")
+    assert first.take() == (False, "the gripper is where images/004.png was taken; move to another pose")
     assert first.undo()[0] is True
     until(lambda: len(states[-1]["images"]) == 3)
     first.stop()
@@ -113,7 +113,7 @@ def test_images_are_taken_by_service_each_with_its_state_and_a_change_is_undone(
     resumed = session()
     filmed(resumed, played)
     resumed.start()
-    assert resumed.take() == (True, "kept images/003.png")
+    assert resumed.take() == (True, "kept images/004.png")
     resumed.stop()
     capture = jcr.read_capture(tmp_path / "c")
     assert len(capture) == 4 and capture.intrinsics is not None and capture.intrinsics.fx == 600
@@ -283,7 +283,7 @@ def test_the_node_broadcasts_the_transform_that_is_accepted(
         assert node.services["~/start"](None, Message()).success
         for k in range(6):
             played.at = k
-            until(lambda k=k: (tmp_path / f"c/images/{k:03d}.png").exists())
+            until(lambda k=k: (tmp_path / f"c/images/{k + 1:03d}.png").exists())
     finally:
         over.set()
         film.join()

@@ -118,6 +118,10 @@ def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Ca
         return
     is_device = source.isdecimal()
     is_file = not is_device and "://" not in source
+    if Path(source).is_dir():
+        raise InputError(
+            f"--camera {source}: is a folder; jcr run calibrates images in a folder with their poses"
+        )
     if is_file and not Path(source).is_file():
         raise InputError(f"--camera {source}: no such video file; name a file, a device number or a stream")
     # OpenCV and FFmpeg would also write warnings to stderr, which add nothing to the InputError.

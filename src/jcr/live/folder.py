@@ -65,7 +65,7 @@ class LiveFolder:
         # The next number is above those of all image files, including files that capture.json does not name.
         files = [*self.names, *(f"{IMAGES}/{file.name}" for file in (folder / IMAGES).glob("*.png"))]
         numbers = [int(match[1]) for name in files if (match := re.match(r"images/([0-9]{1,9})\.", name))]
-        self._next_number = max(numbers, default=-1) + 1
+        self._next_number = max(numbers, default=0) + 1  # the first file is 001, as the page counts
 
     @property
     def names(self) -> list[str]:

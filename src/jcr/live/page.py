@@ -129,9 +129,11 @@ def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
         error = state.result.calibration.held_out
         reached = reached_accuracy(state.result.calibration) or ()
     names = ("Point uncertainty", " mm"), ("Direction", "°")
+    missing = [Path(name).name for name in state.names if name not in state.progress.registered]
+    without = [f"without {', '.join(missing[:3])}{' …' * (len(missing) > 3)}"] if missing else []
     for k, ((name, unit), value) in enumerate(zip(names, reached, strict=False)):
-        limit = "" if required == "none" else f"required {required[k]:g}{unit}"
-        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", limit, True))
+        limits = [] if required == "none" else [f"required {required[k]:g}{unit}"]
+        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", "; ".join(limits + without), True))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
     tiles.append(("Images registered", count, "", False))
     if error is not None:
