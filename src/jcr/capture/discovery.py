@@ -197,7 +197,7 @@ def _tables_of(
         for table in tables:
             paired = pair(table, images)
             off = abs(len(table.rows) - len(images))
-            if paired.row is not None or paired.stamp_ns is not None or off <= max(2, len(images) // 4):
+            if paired.is_paired or off <= max(2, len(images) // 4):
                 found.append((table, paired))
             elif pose_columns(table, paired.skipped):
                 what = f"{len(table.rows)} poses for {len(images)} images ({images[0]} … {images[-1]})"

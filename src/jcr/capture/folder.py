@@ -46,11 +46,7 @@ class _Source:
     @property
     def rank(self) -> tuple[int, bool, bool]:
         """Sort key, largest for the table that most probably holds the robot's poses."""
-        return (
-            self.relevance,
-            self.paired.row is not None or self.paired.stamp_ns is not None,
-            self.paired.is_by_name,
-        )
+        return self.relevance, self.paired.is_paired, self.paired.is_by_name
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
@@ -73,16 +69,14 @@ def read(path: Path, options: ReadOptions) -> Capture:
         raise _no_poses(folder, found, [*errors, *found.refused])
     best = max(source.rank for source in sources)
     chosen = _without_copies([source for source in sources if source.rank == best])
-    if chosen[0].paired.row is None and chosen[0].paired.stamp_ns is None:
-        return _unpaired(folder, found, chosen, options)
-    return _paired(folder, found, chosen, options)
+    return _capture(folder, found, chosen, options)
 
 
 def _source(table: Table, paired: Pairing, options: ReadOptions) -> _Source:
     """Return a table with its readings at the images; raise InputError if numbers contradict units or times."""
     where = f"{table.file}{f': {table.place}' if table.place else ''}"
     rank, readings = readings_of(table, options, where, paired.skipped)
-    if paired.row is None and paired.stamp_ns is None:
+    if not paired.is_paired:
         return _Source(table=table, paired=paired, relevance=rank, candidates=tuple(readings))
     made, notes = list[tuple[Reading, _Poses]](), set[str]()
     for reading, of_rows in readings:
@@ -113,50 +107,61 @@ def _without_copies(sources: list[_Source]) -> list[_Source]:
     return kept
 
 
-def _paired(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
-    """Return the capture of tables whose rows are paired with images; frames without a pose are left out with a note."""
-    candidates = [one for source in chosen for one in source.candidates]
-    file = str(chosen[0].table.file)
-    has_pose = np.any([np.isfinite(poses).all((1, 2)) for _, poses in candidates], axis=0)
-    faults = dict[int, str]()
-    nameless = [k for k in np.flatnonzero(~has_pose).tolist() if _has_row(chosen, k)]
-    for k in nameless:
-        faults[k] = f"{file}: the row of {found.images[k]} holds no pose: {_row_fault(chosen, k)}; correct it"
-    unlisted = [found.images[k] for k in np.flatnonzero(~has_pose).tolist() if k not in faults]
-    rows = [k for k in range(len(found.images)) if found.images[k] not in set(unlisted)]
-    images = [found.images[k] for k in rows]
-    require_frames(len(images), file, 0)
-    is_decided = len(candidates) == 1
+def _capture(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
+    """Return the capture of tables and images; paired frames without a pose are left out with a note.
+
+    Where rows and images differ in number and nothing pairs them, only the images can tell which fit.
+    """
+    candidates, first = [one for source in chosen for one in source.candidates], chosen[0]
+    file, is_paired, faults = str(first.table.file), first.paired.is_paired, dict[int, str]()
+    bare, unlisted = list[int](), list[int]()
+    if is_paired:
+        has_pose = np.any([np.isfinite(poses).all((1, 2)) for _, poses in candidates], axis=0)
+        bare = np.flatnonzero(~has_pose).tolist()
+    for k in bare:
+        if _has_row(chosen, k):
+            what = f"holds no pose: {_row_fault(chosen, k)}; correct it"
+            faults[k] = f"{file}: the row of {found.images[k]} {what}"
+        else:
+            unlisted.append(k)
+    rows = [k for k in range(len(found.images)) if k not in unlisted]
+    require_frames(len(rows), file, 0)
+    is_decided = is_paired and len(candidates) == 1
     poses = candidates[0][1][rows] if is_decided else np.tile(np.eye(4), (len(rows), 1, 1))
-    placed = {rows.index(k): text for k, text in faults.items()}
+    images, placed = [found.images[k] for k in rows], {rows.index(k): text for k, text in faults.items()}
     capture, kept = checked_capture(folder, images, poses, file, placed)
     taken = [rows[k] for k in kept]
-    notes = [*found.notes, *(note for source in chosen for note in source.notes)]
-    notes.append(f"poses of {source_of(chosen[0].table)}, paired with the images {chosen[0].paired.how}")
-    row = chosen[0].paired.row
-    if row is not None and (alone := np.setdiff1d(np.arange(len(chosen[0].table.rows)), row)).size:
+    intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
+    if not is_decided:
+        at_images = tuple((one, of_all[taken] if is_paired else of_all) for one, of_all in candidates)
+        nothing = np.full((len(kept), 4, 4), np.nan)
+        capture = replace(capture, base_from_gripper=nothing, candidates=at_images)
+    notes = _pairing_notes(folder, chosen, [found.images[k] for k in unlisted]) if is_paired else ()
+    return replace(
+        capture,
+        source=first.table.file,
+        intrinsics=intrinsics,
+        reading=candidates[0][0] if is_decided else None,
+        untaken=_untaken(first, taken, file) if is_decided else (),
+        notes=(*found.notes, *notes, *more, *capture.notes),
+    )
+
+
+def _pairing_notes(folder: Path, chosen: list[_Source], unlisted: list[str]) -> list[str]:
+    """Return notes on how rows and images were paired, and on those without a partner."""
+    table, paired = chosen[0].table, chosen[0].paired
+    notes = [note for source in chosen for note in source.notes]
+    notes.append(f"poses of {source_of(table)}, paired with the images {paired.how}")
+    if paired.row is not None and (alone := np.setdiff1d(np.arange(len(table.rows)), paired.row)).size:
         numbers = first_few([str(1 + r) for r in alone.tolist()])
         notes.append(
-            f"{len(alone)} poses of {Path(file).name} have no image in {folder} and are left out (poses {numbers})"
+            f"{len(alone)} poses of {table.file.name} have no image in {folder} and are left out (poses {numbers})"
         )
     if unlisted:
         notes.append(
-            f"{len(unlisted)} images have no pose in {Path(file).name} and are left out: {first_few(unlisted)}"
+            f"{len(unlisted)} images have no pose in {table.file.name} and are left out: {first_few(unlisted)}"
         )
-    intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
-    if not is_decided:
-        capture = replace(
-            capture, base_from_gripper=np.full((len(kept), 4, 4), np.nan), candidates=tuple(candidates)
-        )
-    return replace(
-        capture,
-        source=chosen[0].table.file,
-        intrinsics=intrinsics,
-        reading=candidates[0][0] if is_decided else None,
-        untaken=_untaken(chosen[0], taken, file) if is_decided else (),
-        candidates=() if is_decided else tuple((reading, of_all[taken]) for reading, of_all in candidates),
-        notes=(*notes, *more, *capture.notes),
-    )
+    return notes
 
 
 def _untaken(source: _Source, images: list[int], where: str) -> tuple[tuple[Reading, _Poses], ...]:
@@ -195,23 +200,6 @@ def _why_no_pose(table: Table) -> str:
 def _has_row(chosen: list[_Source], image: int) -> bool:
     """Test whether a table has a row for the image with an index."""
     return any(source.paired.row is not None and source.paired.row[image] >= 0 for source in chosen)
-
-
-def _unpaired(folder: Path, found: Discovery, chosen: list[_Source], options: ReadOptions) -> Capture:
-    """Return the capture of tables whose rows differ in number from the images; only the images can tell which fit."""
-    file, images = str(chosen[0].table.file), list(found.images)
-    capture, _ = checked_capture(folder, images, np.tile(np.eye(4), (len(images), 1, 1)), file)
-    none = np.full((len(capture), 4, 4), np.nan)
-    intrinsics, more = intrinsics_of_capture(folder, found.documents, options, capture.image_size)
-    candidates = tuple(one for source in chosen for one in source.candidates)
-    return replace(
-        capture,
-        source=chosen[0].table.file,
-        intrinsics=intrinsics,
-        base_from_gripper=none,
-        candidates=candidates,
-        notes=(*found.notes, *more, *capture.notes),
-    )
 
 
 def _no_poses(folder: Path, found: Discovery, errors: list[tuple[Path, InputError]]) -> InputError:

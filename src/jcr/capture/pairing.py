@@ -62,6 +62,11 @@ class Pairing:
     image_ns: Int[ndarray, " n"] | None = None
     """Time stamp of each image."""
 
+    @property
+    def is_paired(self) -> bool:
+        """Whether rows or times of the table belong to the images."""
+        return self.row is not None or self.stamp_ns is not None
+
 
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a sort key that orders names by the numbers in them: img2 before img10."""

@@ -3,6 +3,7 @@
 The frame of a fixed marker is the recon frame: recon_from_camera is the inverse of camera_from_marker.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from jcr.capture.checks import require_frames
-from jcr.capture.documents import Table, read_content, read_tables
+from jcr.capture.documents import read_content
+from jcr.capture.documents.nested import leaves
+from jcr.capture.documents.table import table_of
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import Candidate, readings_of
 from jcr.errors import InputError
@@ -48,7 +51,7 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
             f"{path}: calibration_type eye_on_base, a camera beside the robot; jcr calibrates cameras on the gripper"
         )
     notes = () if kind == "eye_in_hand" else ("calibration_type is not given; taken as eye_in_hand",)
-    (reading, gripper), (_, marker) = (_poses(path, key, len(entries), options) for key in keys)
+    (reading, gripper), (_, marker) = (_poses(path, entries, key, options) for key in keys)
     sound = np.flatnonzero(np.isfinite(gripper).all((1, 2)) & np.isfinite(marker).all((1, 2)))
     require_frames(len(sound), str(path))
     left_out = [
@@ -77,24 +80,18 @@ def _pairs(content: Any) -> tuple[list[Any], tuple[str, str]] | None:
     return None
 
 
-def _poses(path: Path, key: str, count: int, options: ReadOptions) -> Candidate:
+def _poses(path: Path, entries: Sequence[Any], key: str, options: ReadOptions) -> Candidate:
     """Return the reading and the poses (m) of one key of the samples; raise InputError if it holds no poses.
 
     A marker's pose is camera_from_marker; only the gripper's pose is inverted by `options`.
     """
     is_gripper = key in {gripper for gripper, _ in PAIRS}
-    own = options if is_gripper else ReadOptions(pose_units=options.pose_units)
-    for table in read_tables(path):
-        if len(table.rows) != count:
-            continue
-        places = [k for k, name in enumerate(table.columns) if (name or "").startswith(f"{key}.")]
-        columns = tuple((table.columns[k] or "").removeprefix(f"{key}.") for k in places)
-        rows = tuple(tuple(row[k] for k in places) for row in table.rows)
-        part = Table(file=path, place="", columns=columns, rows=rows, keys=None, words="")
-        readings = readings_of(part, replace(own, pose_columns=None), f"{path}: {key}")[1] if places else []
-        directed = [one for one in readings if one[0].inverted == own.pose_inverted]
-        if directed:
-            return directed[0]
+    own = replace(options, pose_columns=None) if is_gripper else ReadOptions(pose_units=options.pose_units)
+    rows = [leaves(path, one[key]) if isinstance(one, dict) and key in one else None for one in entries]
+    table = table_of(path, rows)
+    for candidate in readings_of(table, own, f"{path}: {key}")[1] if table else ():
+        if candidate[0].inverted == own.pose_inverted:
+            return candidate
     raise InputError(
         f"{path}: {key}: holds no poses; give position and quaternion, or 16 numbers of a matrix"
     )

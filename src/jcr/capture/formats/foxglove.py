@@ -5,7 +5,8 @@ https://docs.foxglove.dev/docs/sdk/schemas describes the messages.
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,83 +20,61 @@ INDEX_BYTES = 8_000_000
 """Part (bytes) of the end of a file in which names of messages are looked for; an hour of video has 1 MB of index."""
 
 
-def _stamp(message: Any) -> SimpleNamespace:
-    """Return the stamp of a message as that of ROS: protobuf names the parts seconds and nanos, JSON sec and nsec."""
-    time = _value(message, "timestamp")
-    sec, nanosec = ("sec", "nsec") if isinstance(time, dict) else ("seconds", "nanos")
-    return SimpleNamespace(sec=_value(time, sec), nanosec=_value(time, nanosec))
+ABSENT = {
+    **dict.fromkeys(("x", "y", "z", "w"), 0.0), **dict.fromkeys(("K", "D", "P", "transforms"), ()),
+    **dict.fromkeys(("frame_id", "parent_frame_id", "format", "distortion_model"), ""),
+}  # fmt: skip
+"""Values of fields that are not in a message of JSON, as protobuf has them."""
 
 
-def _value(message: Any, name: str, otherwise: Any = None) -> Any:
-    """Return a field of a message, which is a dictionary (JSON) or has attributes (protobuf)."""
-    return message.get(name, otherwise) if isinstance(message, dict) else getattr(message, name)
+def _of_json(content: dict[str, Any]) -> SimpleNamespace:
+    """Return an object of JSON with the fields of the message in protobuf, which names the parts of a time otherwise."""
+    time = {"seconds": content.get("sec"), "nanos": content.get("nsec")}
+    return SimpleNamespace(**ABSENT | time | content)
+
+
+def _as_ros(message: Any, frame: str = "frame_id", **fields: Any) -> SimpleNamespace:
+    """Return the message of ROS with fields and the header of a message; `frame` names the field with its frame."""
+    stamp = SimpleNamespace(sec=message.timestamp.seconds, nanosec=message.timestamp.nanos)
+    header = SimpleNamespace(stamp=stamp, frame_id=getattr(message, frame))
+    return SimpleNamespace(header=header, **fields)
 
 
 def _data(message: Any) -> bytes:
     """Return the bytes of an image, which JSON has in base64."""
-    data = _value(message, "data")
+    data = message.data
     return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
 
 
-def _header(message: Any, frame: str = "frame_id") -> SimpleNamespace:
-    """Return the header of ROS for a message; `frame` names the field with its frame."""
-    return SimpleNamespace(stamp=_stamp(message), frame_id=_value(message, frame, ""))
-
-
-def _compressed(message: Any) -> SimpleNamespace:
-    return SimpleNamespace(header=_header(message), format=_value(message, "format", ""), data=_data(message))
-
-
 def _raw(message: Any) -> SimpleNamespace:
-    names = ("width", "height", "encoding", "step")
-    fields = {name: _value(message, name) for name in names}
-    return SimpleNamespace(header=_header(message), is_bigendian=False, data=_data(message), **fields)
+    size: dict[str, Any] = {name: getattr(message, name) for name in ("width", "height", "encoding", "step")}
+    return _as_ros(message, is_bigendian=False, data=_data(message), **size)
 
 
 def _calibration(message: Any) -> SimpleNamespace:
-    fields = {name: list(_value(message, name.upper(), [])) for name in ("k", "d", "p")}
-    size = {name: _value(message, name) for name in ("width", "height")}
-    model = _value(message, "distortion_model", "")
-    return SimpleNamespace(header=_header(message), distortion_model=model, **fields, **size)
+    fields: dict[str, Any] = {name: list(getattr(message, name.upper())) for name in ("k", "d", "p")}
+    fields |= {name: getattr(message, name) for name in ("width", "height", "distortion_model")}
+    return _as_ros(message, **fields)
 
 
-def _transform(message: Any) -> SimpleNamespace:
-    moved, turned = _value(message, "translation"), _value(message, "rotation")
-    transform = SimpleNamespace(
-        translation=SimpleNamespace(**{axis: _value(moved, axis, 0.0) for axis in "xyz"}),
-        rotation=SimpleNamespace(**{axis: _value(turned, axis, 0.0) for axis in "xyzw"}),
-    )
-    child = _value(message, "child_frame_id")
-    return SimpleNamespace(
-        header=_header(message, "parent_frame_id"), child_frame_id=child, transform=transform
-    )
-
-
-def _transforms(message: Any) -> SimpleNamespace:
-    return SimpleNamespace(transforms=[_transform(one) for one in _value(message, "transforms", [])])
-
-
-def _pose(message: Any) -> SimpleNamespace:
-    pose = _value(message, "pose")
-    position, turned = _value(pose, "position"), _value(pose, "orientation")
-    pose = SimpleNamespace(
-        position=SimpleNamespace(**{axis: _value(position, axis, 0.0) for axis in "xyz"}),
-        orientation=SimpleNamespace(**{axis: _value(turned, axis, 0.0) for axis in "xyzw"}),
-    )
-    return SimpleNamespace(header=_header(message), pose=pose)
+def _transforms(messages: Iterable[Any]) -> SimpleNamespace:
+    made = [
+        _as_ros(one, "parent_frame_id", child_frame_id=one.child_frame_id, transform=one) for one in messages
+    ]
+    return SimpleNamespace(transforms=made)
 
 
 SCHEMAS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed),
+    "foxglove.CompressedImage": (
+        "sensor_msgs/msg/CompressedImage",
+        lambda one: _as_ros(one, format=one.format, data=_data(one)),
+    ),
     "foxglove.RawImage": ("sensor_msgs/msg/Image", _raw),
     "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _calibration),
-    "foxglove.FrameTransform": (
-        "tf2_msgs/msg/TFMessage",
-        lambda message: SimpleNamespace(transforms=[_transform(message)]),
-    ),
-    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
-    "foxglove.PoseInFrame": ("geometry_msgs/msg/PoseStamped", _pose),
-    "foxglove.CompressedVideo": ("foxglove_msgs/msg/CompressedVideo", lambda message: message),
+    "foxglove.FrameTransform": ("tf2_msgs/msg/TFMessage", lambda one: _transforms([one])),
+    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", lambda one: _transforms(one.transforms)),
+    "foxglove.PoseInFrame": ("geometry_msgs/msg/PoseStamped", lambda one: _as_ros(one, pose=one.pose)),
+    "foxglove.CompressedVideo": ("foxglove_msgs/msg/CompressedVideo", lambda one: one),
 }
 """Type of ROS of each message of Foxglove, and the conversion to it."""
 
@@ -131,7 +110,7 @@ class FoxgloveReader:
         records = self._reader.iter_messages(topics, starting_at=start, ending_before=stop)
         for schema, channel, record in records if topics else ():
             if channel.id in of_channel and schema is not None:
-                decode = json.loads
+                decode = partial(json.loads, object_hook=_of_json)
                 if channel.message_encoding == "protobuf":
                     decode = self._decoders.decoder_for("protobuf", schema)
                 message = SCHEMAS[schema.name][1](decode(record.data))
