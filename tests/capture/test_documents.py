@@ -204,15 +204,12 @@ def test_arrays(tmp_path: Path) -> None:
         "t.2",
         "id.0",
     )
-    cells = np.empty((1, 7), object)
-    cells[0] = [*poses]
-    savemat(
-        tmp_path / "c.mat",
-        {"T": cells, "s": {"A": np.moveaxis(poses, 0, -1)}, "big": np.zeros((7, 3))},
-        do_compression=True,
-    )
-    places = {one.place: one for one in read_tables(tmp_path / "c.mat")}
-    assert places["T"].rows == places["s.A"].rows == table.rows
+    arrays = {"T": np.moveaxis(poses, 0, -1), "big": np.zeros((7, 3)), "note": "mm", "s": {"A": poses}}
+    savemat(tmp_path / "c.mat", arrays, do_compression=True)
+    assert {one.place: one for one in read_tables(tmp_path / "c.mat")}["T"].rows == table.rows
+    savemat(tmp_path / "c.mat", {"s": {"A": poses}})
+    with pytest.raises(InputError, match=r"a MATLAB object, a cell array or a struct; save numbers, A = cat"):
+        read_tables(tmp_path / "c.mat")
     np.save(tmp_path / "a.npy", np.array([{}], object))
     with pytest.raises(InputError, match="pickle"):
         read_tables(tmp_path / "a.npy")

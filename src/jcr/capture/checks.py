@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import read_image
-from jcr.capture.notations import METRES_LIMIT
+from jcr.capture.notations import FAR_FRAME, METRES_LIMIT
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES, tolerated
 from jcr.errors import InputError, first_few, other_size
 from jcr.files import capture_file
@@ -105,14 +105,8 @@ def far_faults(position: Float[ndarray, "n 3"], where: str, names: list[str]) ->
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()
     if len(rows) > tolerated(len(distance)) or (rows and len(distance) == 1):
         spread = float(np.ptp(position[np.isfinite(position).all(1)], axis=0).max())
-        if len(distance) > 1 and spread < METRES_LIMIT:
-            cause = (
-                "a map frame that is far away: subtract one offset from all, or use the arm's own base frame"
-            )
-        else:
-            cause = "millimetres: divide the translations by 1000"
-        raise InputError(
-            f"{where}: the gripper is up to {distance.max():.4g} m from the base; these look like {cause}"
-        )
+        is_map = len(distance) > 1 and spread < METRES_LIMIT
+        cause = FAR_FRAME if is_map else "these look like millimetres: divide the translations by 1000"
+        raise InputError(f"{where}: the gripper is up to {distance.max():.4g} m from the base; {cause}")
     text = "m from the base, the others are nearer; record it again"
     return {k: f"{names[k]} is {distance[k]:.4g} {text}" for k in rows}

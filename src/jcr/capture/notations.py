@@ -24,6 +24,10 @@ NEAR_BASE = 200.0
 centimetres as well as millimetres: no arm has all its poses within 200 mm of its base, and few reach beyond 2 m. With
 300 the smallest arms (myCobot 280) would be asked; with 100, poses that are written in centimetres and go up to 1.5 m
 are read ten times too small."""
+FAR_FRAME = (
+    "the base frame is far away: subtract one offset from all, or give the poses in the arm's own base frame"
+)
+"""Cause and remedy of positions that are near each other and far from the origin."""
 UNIT_TOLERANCE = 1e-2
 """Largest accepted difference from 1 of a quaternion's length and of a matrix axis; three digits suffice."""
 SEQUENCES = (
@@ -189,24 +193,19 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
             f"{where}: the gripper is at most {far:.4g} {unit} from the base, too near for {unit}; these look like "
             "metres: give --pose-units m-rad (or m-deg), or correct the unit in the column's name"
         )
-    if spread < METRES_LIMIT < far and per < 1 and spread > 0 and len(position) > 1:
-        raise InputError(
-            f"{where}: the positions are {far:.4g} from the origin, and all within {spread:.3g} of each other; as "
-            "metres the base frame is far away: subtract one offset from all, or give the poses in the arm's own base "
-            "frame"
-        )
+    several = len(position) > 1
+    is_map = several and 0 < spread < METRES_LIMIT < far and per < 1
+    if is_map or (
+        far * per > METRES_LIMIT and (stated is None or (several and spread * per <= METRES_LIMIT))
+    ):
+        raise InputError(f"{where}: the positions are up to {far:.4g} from the origin: {FAR_FRAME}")
     # A single transform may be that of a camera, which is near its gripper.
-    if stated is None and METRES_LIMIT < far < NEAR_BASE and len(position) > 1:
+    if stated is None and METRES_LIMIT < far < NEAR_BASE and several:
         raise InputError(
             f"{where}: the positions are at most {far:.3g} from the origin, {far / 1e3:.2g} m as millimetres and "
             f"{far / 1e2:.2g} m as centimetres: say which with --pose-units mm-rad or cm-rad (or mm-deg, cm-deg)"
         )
     if far * per > METRES_LIMIT:
-        if stated is None or (len(position) > 1 and spread * per <= METRES_LIMIT):
-            raise InputError(
-                f"{where}: the positions are up to {far * per:.4g} m from the origin; a map frame is far away: "
-                "subtract one offset from all, or give the poses in the arm's own base frame"
-            )
         raise InputError(
             f"{where}: the gripper is up to {far:.4g} {unit} from the base; these look like millimetres: give "
             "--pose-units mm-rad (or mm-deg)"

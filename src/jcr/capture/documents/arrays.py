@@ -8,21 +8,23 @@ import warnings
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
 from jcr.capture.documents.nested import require_short
-from jcr.capture.documents.plain import MAX_DEPTH
 from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
 from jcr.errors import InputError, shown
 
 _PICKLE = (
     "a Python pickle, which may run programs; save numbers, np.save('poses.npy', np.array(poses, float))"
 )
-_MATLAB_OBJECT = "a MATLAB object such as a table; save it with writetable(T,'poses.csv')"
+_MATLAB_OBJECT = (
+    "a MATLAB object, a cell array or a struct; save numbers, A = cat(3,T{:}); save('poses.mat','A'), or a table with "
+    "writetable(T,'poses.csv')"
+)
 _SHEET = "a spreadsheet; save it as CSV"
 _REFUSED = {
     b"\x89HDF": "HDF5; save arrays, np.save('poses.npy', h5py.File(name)['poses'][:])",
@@ -36,6 +38,8 @@ _KINDS = {
     1: "i1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 17: "u2", 18: "u4",
 }  # fmt: skip
 """Kinds of elements of a .mat file, and types of their numbers; others are bytes (MathWorks, MAT-File Format)."""
+_NUMERIC = range(6, 16)
+"""Classes of arrays of numbers in a .mat file: double to uint64."""
 _NPY, _ZIP, _MATLAB = b"\x93NUMPY", b"PK\x03\x04", b"MATLAB 5.0"
 
 
@@ -113,13 +117,13 @@ def _read_npz(file: Path, data: bytes) -> dict[str, ndarray]:
 
 
 def _read_mat(file: Path, data: bytes) -> dict[str, ndarray]:
-    """Return the arrays in the bytes of a .mat file of version 5 by name, fields of a struct as "struct.field".
+    """Return the arrays of numbers in the bytes of a .mat file of version 5 by name; raise InputError without one.
 
     The format is read here, because scipy.io.loadmat ends the process on damaged files, also behind a whole header.
     """
     if len(data) <= 128:
         raise ValueError("the file is cut off")
-    order, found, left = "<" if data[126:128] == b"IM" else ">", dict[str, ndarray](), MAX_BYTES
+    order, found, left = "<" if data[126:128] == b"IM" else ">", dict[str, ndarray | None](), MAX_BYTES
     for kind, content in _elements(data[128:], order):
         if kind == _COMPRESSED:
             unpacked = zlib.decompressobj().decompress(content, left + 1)
@@ -128,11 +132,13 @@ def _read_mat(file: Path, data: bytes) -> dict[str, ndarray]:
                 raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
             kind, content = next(_elements(unpacked, order))
         if kind == _MATRIX:
-            found |= _variable(content, order, 0)
-    if found and not any(name for name in found):
+            name, array = _variable(content, order)
+            found[name] = array
+    # An object has its content in an array without a name.
+    numeric = {name: array for name, array in found.items() if name and array is not None}
+    if found and not numeric:
         raise InputError(f"{file}: {_MATLAB_OBJECT}")
-    found.pop("", None)
-    return found
+    return numeric
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -150,45 +156,17 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         at += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
 
 
-def _variable(content: bytes, order: str, depth: int) -> dict[str, ndarray]:
-    """Return the arrays of a variable by their names, such as "struct.field"; an object is an array without name.
-
-    Arrays of one shape in a cell array, or in a field of an array of structs, are one array.
-    """
+def _variable(content: bytes, order: str) -> tuple[str, ndarray | None]:
+    """Return the name of a variable and its array of numbers; None for a cell array, a struct, a text or an object."""
     parts = list(_elements(content, order))
-    if not parts or depth > MAX_DEPTH or len(parts) > MAX_ITEMS:
-        return {}
-    numbers = [np.frombuffer(part, order + _KINDS.get(kind, "u1")) for kind, part in parts]
+    if len(parts) < 3:
+        return "", None
     kind = content[8] if order == "<" else content[11]
-    if kind in (3, 16, 17):
-        return {"": np.zeros(0)}
     name = parts[2][1].decode("latin-1")
-    inner = [_variable(part, order, depth + 1) for at, part in parts[3:] if at == _MATRIX]
-    fields = [""]
-    if kind == 2:
-        width = int(numbers[3][0])
-        texts = (parts[4][1][k : k + width] for k in range(0, len(parts[4][1]), width))
-        fields = [text.split(b"\0")[0].decode("latin-1") for text in texts]
-    if kind in (1, 2):
-        return {
-            f"{name}.{field}{path}".rstrip("."): array
-            for k, field in enumerate(fields)
-            for path, array in _stacked(inner[k :: len(fields)]).items()
-        }
-    array = numbers[3].reshape([int(side) for side in numbers[1]], order="F")
-    if kind == 4:
-        array = np.array(["".join(map(chr, row)).strip() for row in array.reshape(len(array), -1)])
-    return {name: array}
-
-
-def _stacked(parts: Sequence[dict[str, ndarray]]) -> dict[str, ndarray]:
-    """Return the arrays of one name and shape as one, without their sides of length 1; others are left out."""
-    if len(parts) == 1:
-        return parts[0]
-    names = [
-        name for name in parts[0] if len({part[name].shape if name in part else None for part in parts}) == 1
-    ]
-    return {name: np.stack([part[name].squeeze() for part in parts]) for name in names} if parts else {}
+    if kind not in _NUMERIC or len(parts) < 4:
+        return name, None
+    shape, numbers = (np.frombuffer(parts[k][1], order + _KINDS.get(parts[k][0], "u1")) for k in (1, 3))
+    return name, numbers.reshape([int(side) for side in shape], order="F")
 
 
 def _tables_of(file: Path, arrays: dict[str, ndarray]) -> list[Table]:
