@@ -61,7 +61,7 @@ def cli_page() -> str:
     parts = [
         "# Command line\n",
         "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 the result is rejected "
-        "or not as exact as needed, 1 a bug, 130 interrupted. [In the shell](../how-to/batch.md#in-the-shell).\n",
+        "or not as exact as needed, 1 a bug, 130 interrupted, 141 if the reader of the output ended. [In the shell](../how-to/batch.md#in-the-shell).\n",
         "| command | |\n|---|---|",
         *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
     ]

@@ -281,3 +281,15 @@ def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path
     with pytest.raises(InputError, match=r"points\.csv: point 2 is not finite"):
         read_points(tmp_path / "points.csv")
     assert [file.name for file in tmp_path.iterdir()].count("out") == 0
+
+
+@pytest.mark.slow
+def test_a_reader_that_ends_early_is_no_success():
+    """`jcr run … | head` was stopped in the middle with exit status 0."""
+    asked = subprocess.Popen(
+        [sys.executable, "-m", "jcr", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert asked.stdout is not None and asked.stderr is not None
+    asked.stdout.close()
+    assert asked.wait() == 141 and not asked.stderr.read()
+    asked.stderr.close()

@@ -154,7 +154,8 @@ def command(name: str) -> Any:
 def dispatch(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit status; print an error as one line on stderr.
 
-    The status is 0 for success, 2 for invalid input or lack of disk or memory, 3 if rejected, 130 after Ctrl-C.
+    The status is 0 for success, 2 for invalid input or lack of disk or memory, 3 if rejected, 130 after Ctrl-C, 141
+    after the reader of the output closed it.
     """
     try:
         status = _dispatched(arguments)
@@ -163,8 +164,8 @@ def dispatch(arguments: Sequence[str]) -> int:
     except (InputError, RejectedError) as error:
         status, message = 2 if isinstance(error, InputError) else 3, str(error)
     except BrokenPipeError:
-        _write_no_more()  # the reader of the output closed it
-        return 0
+        _write_no_more()  # the reader of the output closed it: 128 + SIGPIPE, as of other programs
+        return 141
     except OSError as error:
         if error.errno not in _DISK:
             raise
