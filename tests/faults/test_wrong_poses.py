@@ -132,19 +132,23 @@ def test_a_reconstruction_in_pieces_leads(faultless: tuple[Capture, Reconstructi
 TOOL = transform(rotation_exp(np.array([0.0, 0.0, 0.4])), np.array([0.0, 0.0, 0.15]))
 
 
+@pytest.mark.parametrize("moved", [3, 5])
 @pytest.mark.parametrize("at_start", [False, True])
 @pytest.mark.parametrize("kind", [FindingKind.SLIP, FindingKind.BASE_MOVED])
 def test_poses_that_are_moved_alike_to_one_end_are_one_finding(
-    faultless: tuple[Capture, Reconstruction], kind: FindingKind, at_start: bool
+    faultless: tuple[Capture, Reconstruction], kind: FindingKind, at_start: bool, moved: int
 ):
-    """Another TCP moves the poses in gripper axes, another base frame in base axes."""
+    """Another TCP moves the poses in gripper axes, another base frame in base axes.
+
+    With five of twelve moved, the images that are used contradict each other, and only that was said.
+    """
     capture, made = faultless
-    poses, rows = capture.base_from_gripper.copy(), np.arange(3)
-    place = 3 if at_start else len(capture) - 3
+    poses, rows = capture.base_from_gripper.copy(), np.arange(moved)
+    place = moved if at_start else len(capture) - moved
     rows += 0 if at_start else place
     poses[rows] = poses[rows] @ TOOL if kind is FindingKind.SLIP else TOOL @ poses[rows]
     found = calibrate_reconstruction(with_poses(capture, poses), made)
-    (step,) = [one for one in found.findings if one.severity == "rejects"]
+    (step,) = [one for one in without_consequences(found.findings) if one.severity == "rejects"]
     assert step.kind is kind and step.images == capture.images[place - 1 : place + 1]
     assert step.value == pytest.approx(0.15, rel=0.05)
     assert step.details["rotation"] == pytest.approx(0.4, rel=0.05)

@@ -1,10 +1,13 @@
 """Check of the reported gripper poses of images that a calibration does not use: exchanged or contradicted poses."""
 
 import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
 
-from jcr.calibration.case import Case
+from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.checks.capture import SAME
 from jcr.calibration.checks.effects import POLICIES, of_step
+from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
@@ -17,35 +20,57 @@ from jcr.sfm.register import register
 NEARER = 0.1
 """Ratio of two distances from the pose that an image shows, to another image's reported pose and to its own, below
 which the other pose belongs to the image."""
+STEPS = FindingKind.SLIP, FindingKind.BASE_MOVED
+"""Findings of a motion of the camera or TCP, constant in gripper axes, and of the base, constant in base axes."""
 
 
 def check_pairing(case: Case) -> Case:
     """Return the case with findings on unused images whose gripper poses are exchanged or all differ by one motion.
 
     The robust fit rejects such poses one by one, so a calibration from the other images may be accepted. Images with a
-    merely wrong pose give no finding here, nor does a case whose used images do not agree.
+    merely wrong pose give no finding here. If the used images do not agree, a part of the capture may
+    (`_step_after_part`).
     """
     kinds = {one.kind for one in case.calibration.findings}
-    disagree = kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.UNOBSERVABLE}
-    if disagree or len(case.capture) - len(case.used) < 2:
+    if kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES}:
+        return case.found(*_step_after_part(case))
+    if FindingKind.UNOBSERVABLE in kinds or len(case.capture) - len(case.used) < 2:
         return case
     # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
     found = left_out_poses(case.capture, case.reconstruction, case.fit)
     return case.found(*(one for one in found if one.kind is not FindingKind.POSE_CONTRADICTS_IMAGE))
 
 
-def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration) -> tuple[Finding, ...]:
+def _step_after_part(case: Case) -> list[Finding]:
+    """Return the finding that all images but those at one end of the capture are moved alike; empty if they are not.
+
+    The end is the longest one, half of the images or more, whose poses alone give a calibration.
+    """
+    made, gripper = case.reconstruction, case.moving
+    count, every = len(gripper), np.arange(len(gripper))
+    for size in range(count - 2, max(MIN_IMAGES, count // 2) - 1, -1):
+        for part in (every[:size], every[-size:]):
+            fit = solve_hand_eye(gripper[part], case.recon_from_camera[part], camera_errors="none")
+            if fit.converged and fit.inliers.all():
+                found = left_out_poses(case.capture, made, fit, part)
+                return [one for one in found if one.kind in STEPS]
+    return []
+
+
+def left_out_poses(
+    capture: Capture, made: Reconstruction, hand_eye: Calibration, used: Int[ndarray, " u"] | None = None
+) -> tuple[Finding, ...]:
     """Return findings about unused images whose gripper poses are exchanged, all moved, or contradicted by the image.
 
     Unused images without a camera pose in `made` are registered by their features alone. Camera pose and hand-eye
     transform then give the true gripper pose. A reported pose is contradicted if it differs from the true one by more
-    than SAME. Poses are exchanged if two or more images show poses that are reported for other unused images. All other
-    contradicted poses give one finding if they are moved alike (`_one_step`). Images that cannot be registered give no
-    finding.
+    than SAME. `used` are the rows of the registered images that `hand_eye` uses; None: its inliers. Poses are exchanged
+    if two or more images show poses that are reported for other unused images. All other contradicted poses give one
+    finding if they are moved alike (`_one_step`). Images that cannot be registered give no finding.
     """
     metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
     shows = dict[int, Transform]()
-    used = set(made.image_index[hand_eye.inliers].tolist())
+    calibrated = set(made.image_index[hand_eye.inliers if used is None else used].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
     unseen = [row for row in range(len(capture)) if row not in camera]
     if unseen:
@@ -55,9 +80,14 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: Calibration
         )
         places = zip(unseen, register(made, older, new), strict=True)
         camera |= {row: place.a_from_camera for row, place in places if isinstance(place, CameraPose)}
-    x, scale, z, right = hand_eye.parent_from_camera, hand_eye.scale, hand_eye.body_from_recon.rigid, {*used}
+    x, scale, z, right = (
+        hand_eye.parent_from_camera,
+        hand_eye.scale,
+        hand_eye.body_from_recon.rigid,
+        {*calibrated},
+    )
     moving = inverse(capture.base_from_gripper) if capture.mount == "base" else capture.base_from_gripper
-    for row in (row for row in camera if row not in used):
+    for row in (row for row in camera if row not in calibrated):
         pose = predicted_gripper_poses(x, scale, z, camera[row][None])[0]
         by = np.linalg.norm(step_between(moving, pose).reshape(-1, 2, 3), axis=2)
         if (by[row] < SAME).all():
@@ -99,10 +129,7 @@ def _one_step(capture: Capture, shows: dict[int, Transform]) -> Finding | None:
     place = rows[-1] + 1 if rows[0] == 0 else rows[0]
     reported, shown = capture.base_from_gripper[rows], np.stack(list(shows.values()))
     spreads = []
-    for kind, motions in (
-        (FindingKind.SLIP, inverse(reported) @ shown),
-        (FindingKind.BASE_MOVED, shown @ inverse(reported)),
-    ):
+    for kind, motions in zip(STEPS, (inverse(reported) @ shown, shown @ inverse(reported)), strict=True):
         apart = float(motion_length(inverse(motions[0]) @ motions).max())
         metres, radians = np.linalg.norm(step_between(np.eye(4), motions[0]).reshape(2, 3), axis=1).tolist()
         spreads.append((apart / float(motion_length(motions[0])), kind, metres, radians))
