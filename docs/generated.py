@@ -25,7 +25,7 @@ from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind
-from jcr.findings.table import GROUPS, KindRow
+from jcr.findings.messages import GROUPS, KindRow
 from jcr.reconstruct import BACKENDS
 from jcr.result import RunState
 
@@ -61,7 +61,8 @@ def cli_page() -> str:
     parts = [
         "# Command line\n",
         "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 the result is rejected "
-        "or not as exact as needed, 1 a bug, 130 interrupted, 141 if the reader of the output ended. [In the shell](../how-to/batch.md#in-the-shell).\n",
+        "or not as exact as needed, 1 a bug, 130 interrupted, 141 if the reader of the output "
+        "ended. [In the shell](../how-to/batch.md#in-the-shell).\n",
         "| command | |\n|---|---|",
         *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
     ]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import jcr
-from jcr.calibration.words import summary
+from jcr.calibration.summary import summary
 from jcr.geometry import fit_similarity, rotation_between_deg
 from jcr.progress import progress_bars
 

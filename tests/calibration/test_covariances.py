@@ -10,7 +10,7 @@ import pytest
 
 from jcr.calibration.difference import StatedTransform, compare
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.words import mixed_pair_mm, summary
+from jcr.calibration.summary import mixed_pair_mm, summary
 from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
 from jcr.geometry import ROOT_FROM_OPTICAL, inverse, retract, rotation_exp, transform

@@ -13,12 +13,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.stage import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
+from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
-from jcr.calibration.words import summary
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, remedy, sentence, text
 from jcr.findings.finding import verdict_of
-from jcr.findings.table import GROUPS
+from jcr.findings.messages import GROUPS
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Intrinsics
 from scenes import capture_of, pairs_of, reconstruction_of

@@ -13,7 +13,7 @@ from jcr.calibration.checks.lengths import depth_check
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration, validated
 from jcr.calibration.stage import calibrate_reconstruction
-from jcr.calibration.words import details
+from jcr.calibration.summary import details
 from jcr.camera import rays
 from jcr.capture.images import encode_png, read_depth_images
 from jcr.capture.read import read_capture

@@ -133,7 +133,7 @@ def _conclude(
     `facts` is the content of --json, to which the result is added. `result` None: there is no calibration.
     `requirement_met`: the last live calibration met the requirement, and its leave-one-out error confirms this.
     """
-    from jcr.calibration.words import summary
+    from jcr.calibration.summary import summary
 
     out, images, lines = facts["capture"], len(facts["images"]), list[str]()
     verdict, is_sound = None, False

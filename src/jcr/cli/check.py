@@ -93,7 +93,7 @@ def read_arguments(read: ReadOptions) -> list[str]:
 
 def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
-    from jcr.calibration.words import MOST_LINES, actions, verdict_in_words
+    from jcr.calibration.summary import MOST_LINES, actions, verdict_in_words
     from jcr.capture.readings import decision_in_words
 
     capture = found.capture
@@ -306,7 +306,7 @@ class VerifyCommand:
 
         The status is 3 if a camera has moved, else 0.
         """
-        from jcr.calibration.words import summary
+        from jcr.calibration.summary import summary
         from jcr.pipeline.recalibrate import recalibrate
         from jcr.pipeline.verify import verify_run
         from jcr.pipeline.watch_page import write_page

@@ -235,7 +235,7 @@ def _run(
 
 def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: VerboseOutput) -> None:
     """Print the summary of a calibration and the capture's notes; nothing with --json, for which `show` prints all."""
-    from jcr.calibration.words import MOST_LINES, summary
+    from jcr.calibration.summary import MOST_LINES, summary
     from jcr.capture.readings import decision_in_words
 
     if not output.json:
@@ -259,7 +259,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     Printed are other cameras, the lines `more`, the path of the report, the next command, and with --verbose the
     details. With --json the whole result is printed as one object.
     """
-    from jcr.calibration.words import details, verdict_in_words
+    from jcr.calibration.summary import details, verdict_in_words
 
     content, cameras, out = result.calibration, result.cameras, result.out
     placed = [] if cameras is None else cameras.cameras

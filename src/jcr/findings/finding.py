@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import RejectedError
-from jcr.findings.requirement import Requirement
-from jcr.findings.table import MOTIONS, REACHED, FindingKind
+from jcr.findings.messages import MOTIONS, REACHED, FindingKind
+from jcr.findings.required import Requirement
 from jcr.rounding import significant
 
 Severity = Literal["rejects", "warns", "informs"]

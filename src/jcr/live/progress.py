@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration, Calibration
-from jcr.calibration.words import leave_one_out_text
+from jcr.calibration.summary import leave_one_out_text
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
 from jcr.records import LeaveOneOut
 from jcr.rounding import significant

@@ -13,7 +13,7 @@ from jcr.calibration.checks.capture import as_causes, view_findings
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration
-from jcr.calibration.requirement import requirement_of
+from jcr.calibration.required_accuracy import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.stage import calibrate_pose_pairs, calibration_of, checked_case
 from jcr.capture.images import exposure_fault, read_image

@@ -12,7 +12,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate_reconstruction
-from jcr.calibration.words import leave_one_out_text
+from jcr.calibration.summary import leave_one_out_text
 from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.findings import (

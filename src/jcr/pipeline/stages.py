@@ -18,7 +18,7 @@ from jcr import __version__
 from jcr.allocator import give_back
 from jcr.boards.proposal import proposed
 from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, write_calibration
-from jcr.calibration.words import log
+from jcr.calibration.summary import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import write_added
 from jcr.cell.carried import with_moving_parts

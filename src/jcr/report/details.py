@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration
-from jcr.calibration.words import facts
+from jcr.calibration.summary import facts
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
 from jcr.report.render import Content, label_colors

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jcr.calibration.words import given_in_words, seen_in_words
+from jcr.calibration.summary import given_in_words, seen_in_words
 from jcr.estimation.observability import WEAK, excitation
 from jcr.records import Excitation
 from jcr.report.render import Content

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jcr.calibration.words import leave_one_out_text
+from jcr.calibration.summary import leave_one_out_text
 from jcr.report.images import shown_names
 from jcr.report.render import Content
 from jcr.result import RunResult

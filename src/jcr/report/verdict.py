@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
-from jcr.calibration.words import leave_one_out_text, only_centre_meets, worst_direction
+from jcr.calibration.summary import leave_one_out_text, only_centre_meets, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
 from jcr.report.render import Content
 from jcr.rounding import significant

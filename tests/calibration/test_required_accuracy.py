@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration, validated
-from jcr.calibration.requirement import advised
+from jcr.calibration.required_accuracy import advised
 from jcr.calibration.stage import calibrate_pose_pairs
-from jcr.calibration.words import summary
+from jcr.calibration.summary import summary
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run import show, show_calibration
 from jcr.findings import Finding, FindingKind, sentence
