@@ -103,15 +103,23 @@ def _result(content: Calibration) -> list[str]:
         f"  1σ: {offset} mm, {rotation}°",
         *labelled("Accuracy", accuracy, "; ".join(tested)),
     ]
+    return [*lines, *(labelled("Intrinsics", *pair) if (pair := pair_in_words(content)) else ())]
+
+
+def pair_in_words(content: Calibration) -> list[str]:
+    """Return up to two lines: the intrinsics that belong to the transform, and the error of a point with the given ones.
+
+    The list is empty without intrinsics.
+    """
     if (camera := content.intrinsics) is None:
-        return lines
+        return []
     given = content.with_given_intrinsics
     how = "used" if camera.std is None else "estimated" if given is None else "given, refined"
     use = [f"{how}: {intrinsics_in_words(camera)}; use them together with the transform"]
     if given is not None and (mm := mixed_pair_mm(content)) is not None:
         pair = f"with the given ones (fx {given.intrinsics.fx:.1f}) and this transform"
         use.append(f"{pair} a point is up to {significant(mm)} mm off (jcr docs exports)")
-    return [*lines, *labelled("Intrinsics", *use)]
+    return use
 
 
 def intrinsics_in_words(camera: Intrinsics) -> str:

@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import Calibration, PublishedCalibration
+from jcr.calibration.summary import pair_in_words
 from jcr.camera import unproject, without_distortion
 from jcr.export.ros import (
     BASE,
@@ -40,9 +41,9 @@ def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
     The transform is gripper_from_camera or, for a fixed camera, base_from_camera. The published method has no
     covariance.
     """
-    x, mount, covariance = hand_eye.parent_from_camera, hand_eye.mount, None
+    x, mount, covariance, pair = hand_eye.parent_from_camera, hand_eye.mount, None, list[str]()
     if isinstance(hand_eye, Calibration):
-        covariance = hand_eye.covariance
+        covariance, pair = hand_eye.covariance, pair_in_words(hand_eye)
     names = hand_eye.frame_names
     base, child = names.base or BASE, names.camera or CHILD
     parent = names.gripper or PARENT if mount == "gripper" else base
@@ -67,6 +68,7 @@ def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
     return {
         "sketch": sketch(x, hand_eye.intrinsics, mount),
         "mount": mount,
+        "pair": pair,
         "parent": parent,
         "child": child,
         "rejected": not hand_eye.converged,
