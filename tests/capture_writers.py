@@ -21,26 +21,13 @@ HALF_PIXEL = 0.5
 def rows_as(convention: str, poses: np.ndarray) -> np.ndarray:
     """Poses (n,4,4) as the rows of numbers that a controller writes; written apart from the reader's table."""
     position, rotation = poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])
-    mm = 1e3 * position
-    x, y, z, w = rotation.as_quat().T
-    yaw, pitch, roll = rotation.as_euler("ZYX").T
-    rpy, vector = np.stack([roll, pitch, yaw], 1), rotation.as_rotvec()
-    quaternion = {"xyzw": np.stack([x, y, z, w], 1), "wxyz": np.stack([w, x, y, z], 1)}
-    written = {
-        ("matrix",): poses.reshape(-1, 16),
-        ("franka",): np.swapaxes(poses, 1, 2).reshape(-1, 16),
-        ("quat:xyzw",): np.hstack([position, quaternion["xyzw"]]),
-        ("quat:wxyz",): np.hstack([position, quaternion["wxyz"]]),
-        ("abb",): np.hstack([mm, quaternion["wxyz"]]),
-        ("rotvec", "ur"): np.hstack([position, vector]),
-        ("xarm-axis-angle",): np.hstack([mm, np.degrees(vector)]),
-        ("rpy", "unitree", "realman", "aubo"): np.hstack([position, rpy]),
-        ("xarm", "fanuc", "yaskawa", "techman", "jaka"): np.hstack([mm, np.degrees(rpy)]),
-        ("kuka", "epson"): np.hstack([mm, np.degrees(rpy[:, ::-1])]),
-        ("doosan", "kawasaki"): np.hstack([mm, rotation.as_euler("ZYZ", degrees=True)]),
-        ("staubli", "mecademic"): np.hstack([mm, rotation.as_euler("XYZ", degrees=True)]),
-    }
-    return next(rows for conventions, rows in written.items() if convention in conventions)
+    if convention == "abb":
+        return np.hstack([1e3 * position, rotation.as_quat()[:, [3, 0, 1, 2]]])
+    turned = {
+        "quat:xyzw": rotation.as_quat, "rotvec": rotation.as_rotvec, "ur": rotation.as_rotvec,
+        "rpy": lambda: rotation.as_euler("ZYX")[:, ::-1],
+    }  # fmt: skip
+    return np.hstack([position, turned[convention]()])
 
 
 def begin(folder: Path, capture: Capture) -> Path:
@@ -66,22 +53,14 @@ def write_camera_info(capture: Capture, folder: Path) -> None:
     (folder / "camera_info.yaml").write_text(yaml.safe_dump(content))
 
 
-def write_table(
-    folder: Path,
-    capture: Capture,
-    convention: str = "quat:xyzw",
-    header: str | None = "image,x,y,z,qx,qy,qz,qw",
-    separator: str = ",",
-) -> Path:
-    """poses.csv with the images' names in front, or, without a header, in the order of the images."""
+def write_table(folder: Path, capture: Capture) -> Path:
+    """poses.csv with the images' names in front."""
     begin(folder, capture)
-    rows = [[*map(repr, row)] for row in rows_as(convention, capture.base_from_gripper).tolist()]
-    if header is not None and header.startswith("image"):
-        rows = [[name, *row] for name, row in zip(capture.images, rows, strict=True)]
-    lines = [header.replace(",", separator)] if header else []
-    file = folder / {",": "poses.csv", "\t": "poses.tsv", " ": "poses.txt"}[separator]
-    file.write_text("\n".join([*lines, *(separator.join(row) for row in rows)]) + "\n")
-    return file
+    rows = rows_as("quat:xyzw", capture.base_from_gripper).tolist()
+    named = zip(capture.images, rows, strict=True)
+    lines = ["image,x,y,z,qx,qy,qz,qw", *(",".join([name, *map(repr, row)]) for name, row in named)]
+    (folder / "poses.csv").write_text("\n".join(lines) + "\n")
+    return folder / "poses.csv"
 
 
 def write_npy(folder: Path, capture: Capture) -> Path:
@@ -89,24 +68,19 @@ def write_npy(folder: Path, capture: Capture) -> Path:
     return folder
 
 
-def write_tum(
-    folder: Path, capture: Capture, header: str = "", start: int = 1_700_000_000_123_456_789
-) -> Path:
+def write_tum(folder: Path, capture: Capture, start: int = 1_700_000_000_123_456_789) -> Path:
     """Write a trajectory beside images that are named by their time stamps (ns), half-way between samples.
 
     The gripper stands at each image's pose from one sample to the next.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     write_camera_info(capture, folder)
-    lines = [header] if header else []
-    separator = ", " if "," in header else " "
-    rows = rows_as("quat:xyzw", capture.base_from_gripper).tolist()
+    lines, rows = list[str](), rows_as("quat:xyzw", capture.base_from_gripper).tolist()
     for k, (name, row) in enumerate(zip(capture.images, rows, strict=True)):
         stamp = start + k * 10**9
         shutil.copy(capture.folder / name, folder / "images" / f"{stamp}{Path(name).suffix}")
         for at in (stamp - 10**7, stamp + 10**7):
-            seconds = f"{at // 10**9}.{at % 10**9:09d}"
-            lines.append(separator.join([seconds, *map(repr, row)]))
+            lines.append(" ".join([f"{at // 10**9}.{at % 10**9:09d}", *map(repr, row)]))
     (folder / "poses.txt").write_text("\n".join(lines) + "\n")
     return folder
 
@@ -176,9 +150,6 @@ def write_list(folder: Path, capture: Capture) -> Path:
 
 CORPUS: dict[str, Callable[[Path, Capture], Path]] = {
     "poses.csv": write_table,
-    "poses.tsv": lambda folder, capture: write_table(
-        folder, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"
-    ),
     "poses.npy": write_npy,
     "poses.txt": write_tum,
     "poses.json": write_list,

@@ -21,7 +21,8 @@ from jcr.records import Capture, FrameNames
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
 
-pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
+typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed (extra ros)")
+STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)
 
 
@@ -96,42 +97,51 @@ def test_depth_messages_are_read_in_every_encoding():
     assert (read_ros_depth(packed, "d") == mm).all()
 
 
+JOINTS, POSES = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
+IMAGE = "sensor_msgs/msg/CompressedImage"
+Messages = Iterator[tuple[str, str, int, str, tuple[Any, ...]]]
+"""Topic, type, time (ns), frame and fields of each message."""
+
+
+def write_mcap(folder: Path, messages: Messages) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    topics = dict[str, Any]()
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind, at, frame, fields in messages:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            time = STORE.types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)
+            message = STORE.types[kind](STORE.types["std_msgs/msg/Header"](time, frame), *fields)
+            late = 6_000_000 if kind == IMAGE else 0  # an image is recorded after it was taken
+            writer.write(topics[topic], at + late, STORE.serialize_cdr(message, kind))
+    return folder
+
+
+def bytes_of(capture: Capture, k: int) -> np.ndarray:
+    return np.frombuffer((capture.folder / capture.images[k]).read_bytes(), np.uint8)
+
+
 @pytest.mark.slow
 def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Capture):
     """Two publishers on one topic, as with an arm and its gripper; the arm halts at eight places."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
     angles = np.random.default_rng(4).uniform(-1, 1, (8, 3))
     (tmp_path / "arm.urdf").write_text(writers.URDF)
 
-    kinds = {"/joint_states": "sensor_msgs/msg/JointState", "/image": "sensor_msgs/msg/CompressedImage"}
-    with Writer(tmp_path / "joints", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = {name: writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()}
-
-        def write(topic: str, at: int, *content, late: int = 0) -> None:
-            time = types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)
-            message = types[kinds[topic]](types["std_msgs/msg/Header"](time, ""), *content)
-            writer.write(topics[topic], at + late, store.serialize_cdr(message, message.__msgtype__))
-
+    def messages() -> Messages:
         for tick in range(8 * 50):  # 50 Hz, a second a place, the last half of it on the way
-            at = 10**18 + tick * 20_000_000
+            at, none = 10**18 + tick * 20_000_000, (np.zeros(0), np.zeros(0))
             share = max(tick % 50 - 25, 0) / 25
             pan, lift, roll = angles[tick // 50] + share * (angles[(tick // 50 + 1) % 8] - angles[tick // 50])
-            empty = np.zeros(0), np.zeros(0)
-            write("/joint_states", at, ["roll", "pan"], np.array([roll, pan]), *empty)
-            write("/joint_states", at + 7_000_000, ["grip", "lift"], np.array([0.01, lift]), *empty)
+            yield "/joint_states", JOINTS, at, "", (["roll", "pan"], np.array([roll, pan]), *none)
+            grip = ["grip", "lift"], np.array([0.01, lift]), *none
+            yield "/joint_states", JOINTS, at + 7_000_000, "", grip
             if tick % 5 == 3:
-                data = np.frombuffer((capture.folder / capture.images[tick // 50]).read_bytes(), np.uint8)
-                write("/image", at + 3_000_000, "jpeg", data, late=6_000_000)
+                yield "/image", IMAGE, at + 3_000_000, "", ("jpeg", bytes_of(capture, tick // 50))
+
     options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0", frames=8)
-    got = jcr.read_capture(tmp_path / "joints", options, into=tmp_path / "frames")
-    expected = {
-        (capture.folder / capture.images[k]).read_bytes(): pose
-        for k, pose in enumerate(writers.arm_poses(angles))
-    }
+    got = jcr.read_capture(write_mcap(tmp_path / "joints", messages()), options, into=tmp_path / "frames")
+    expected = {bytes_of(capture, k).tobytes(): pose for k, pose in enumerate(writers.arm_poses(angles))}
     assert len(got) == 8 and got.intrinsics is None
     assert got.frame_names == FrameNames(base="base_link", gripper="tool0")
     for name, pose in zip(got.images, got.base_from_gripper, strict=True):
@@ -141,29 +151,18 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
 
 @pytest.mark.slow
 def test_a_topic_of_poses_stands_in_for_tf(tmp_path: Path, capture: Capture):
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+    types = [STORE.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Pose")]
+    point, quaternion, pose_of = types
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    kinds = {"/ee_pose": "geometry_msgs/msg/PoseStamped", "/image": "sensor_msgs/msg/CompressedImage"}
-    with Writer(tmp_path / "poses", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = {name: writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()}
-
-        def write(topic: str, at: int, frame: str, *content: Any) -> None:
-            time = types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9)
-            message = types[kinds[topic]](types["std_msgs/msg/Header"](time, frame), *content)
-            writer.write(topics[topic], at, store.serialize_cdr(message, message.__msgtype__))
-
-        for k, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
-            quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
-            at = types["geometry_msgs/msg/Point"](*pose[:3, 3]), types["geometry_msgs/msg/Quaternion"](*quat)
+    def messages() -> Messages:
+        for k, pose in enumerate(capture.base_from_gripper):
+            turned, at = Rotation.from_matrix(pose[:3, :3]).as_quat(), 10**18 + k * 10**9
+            message = pose_of(point(*pose[:3, 3]), quaternion(*turned))
             for step in range(5):
-                stamp = 10**18 + k * 10**9 + step * 10**8
-                write("/ee_pose", stamp, "base_link", types["geometry_msgs/msg/Pose"](*at))
-            data = np.frombuffer((capture.folder / name).read_bytes(), np.uint8)
-            write("/image", 10**18 + k * 10**9 + 2 * 10**8, "lens", "jpeg", data)
-    got = jcr.read_capture(tmp_path / "poses", {"frames": 12}, into=tmp_path / "frames")
+                yield "/ee_pose", POSES, at + step * 10**8, "base_link", (message,)
+            yield "/image", IMAGE, at + 2 * 10**8, "lens", ("jpeg", bytes_of(capture, k))
+
+    got = jcr.read_capture(write_mcap(tmp_path / "in", messages()), {"frames": 12}, into=tmp_path / "frames")
     np.testing.assert_allclose(got.base_from_gripper, capture.base_from_gripper, atol=1e-9)
     assert got.frame_names == FrameNames(base="base_link", camera="lens")
 

@@ -75,6 +75,8 @@ NESTED = {
     "b.json": ('{"images":["a","b","c"],"poses":[[1,2],[3,4],[5,6]]}', ("images", "poses.0", "poses.1"),
                ("a", 1.0, 2.0), None),
     "c.json": ('{"a.png":{"x":1},"b.png":{"x":true},"c.png":{"x":null}}', ("x",), (1.0,), ("a.png", "b.png", "c.png")),
+    "i.json": ('{"T":[' + ",".join(['{"type_id":"opencv-matrix","rows":2,"cols":2,"data":[1,2,3,4]}'] * 3) + "]}",
+               ("0.0", "0.1", "1.0", "1.1"), (1.0, 2.0, 3.0, 4.0), None),
     "d.jsonl": ('{"t":1700000000123456789}\n' * 3, ("t",), ("1700000000123456789",), None),
     "e.yaml": ("- {p: {X: 1.5}}\n- {p: {X: .nan}}\n- {p: {X: 22:13:21}}\n", ("p.X",), (1.5,), None),
     "f.txt": ("header:\n  seq: 1\n---\nheader:\n  seq: 2\n---\nheader:\n  seq: 3\n---\n", ("header.seq",), (1.0,), None),

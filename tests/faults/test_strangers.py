@@ -358,17 +358,6 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
         read_image(file)
 
 
-@pytest.mark.parametrize("name", ["images/0.png\n", "images/" + 500 * "a/" + "0.png"])
-def test_names_that_no_line_holds_are_refused(tmp_path: Path, name: str):
-    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
-    content = json.loads((folder / "capture.json").read_text())
-    content["frames"][0]["image"] = name
-    (folder / "capture.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="no path inside the capture") as caught:
-        jcr.read_capture(folder)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_lock_that_is_a_pipe_blocks_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     capture = table_capture(tmp_path / "cap", str)
     (tmp_path / "out").mkdir()
@@ -447,34 +436,6 @@ def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_
 
 
 # Data sets
-
-TIMES = {"null": None, "NaN": math.nan, "1e300": 1e300, "text": "soon", "infinity": math.inf}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("what", TIMES)
-@pytest.mark.parametrize("place", ["timestamp", "from_timestamp"])
-def test_times_of_a_data_set_are_seconds(tmp_path: Path, what: str, place: str):
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    capture = noise_capture(tmp_path / "images", SIZE, 5)
-    pixels = [read_image(capture.folder / name) for name in capture.images for _ in range(3)]
-    states = np.repeat(writers.rows_as("rpy", capture.base_from_gripper), 3, axis=0)
-    names, codec = ["x", "y", "z", "roll", "pitch", "yaw"], None if place == "timestamp" else "mpeg4"
-    folder = writers.write_lerobot(
-        tmp_path / "set", [(pixels, states)], "v3.0", "observation.state", names, codec=codec
-    )
-    root = folder / ("data" if place == "timestamp" else "meta/episodes")
-    (file,) = root.rglob("*.parquet")
-    table = pq.read_table(file, partitioning=None)
-    (column,) = [name for name in table.column_names if name.endswith(place)]
-    values = table.column(column).to_pylist()
-    values[-1] = TIMES[what]
-    values = [str(value) for value in values] if what == "text" else values
-    pq.write_table(table.set_column(table.column_names.index(column), column, pa.array(values)), file)
-    with pytest.raises(InputError, match="no time in seconds"):
-        read_source(folder, ReadOptions(frames=3), into=tmp_path / "into")
 
 
 @pytest.mark.slow
