@@ -38,6 +38,32 @@ def test_intrinsics_survive_capture_json_camera_info_and_calibration(intrinsics:
     assert file.validate_json(file.dump_json(intrinsics), strict=True) == intrinsics
 
 
+MATRIX = "500 0 320\n0 501 240\n0 0 1\n"
+FILES = {
+    "ost.txt": f"# oST\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[wrist]\n\ncamera matrix\n{MATRIX}\ndistortion\n"
+    "0.1 -0.2 0.001 0.002 0\n\nrectification\n1 0 0\n0 1 0\n0 0 1\n",
+    "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [500.0, 501.0, 320.0, 240.0]\n"
+    "  resolution: [640, 480]\n  distortion_model: radtan\n  distortion_coeffs: [0.1, -0.2, 0.001, 0.002]\n",
+    "openicc.json": '{"image_width": 640, "image_height": 480, "intrinsics": {"focal_length": 500.0,'
+    '"aspect_ratio": 1.002, '
+    '"principal_pt_x": 320.0, "principal_pt_y": 240.0, "radial_distortion_1": 0.1, "radial_distortion_2": -0.2, '
+    '"tangential_distortion_1": 0.001, "tangential_distortion_2": 0.002}}',
+    "realsense.json": '{"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "ppx": 320.0, "ppy": 240.0, '
+    '"model": "brown_conrady", "coeffs": [0.1, -0.2, 0.001, 0.002, 0]}',
+    "cameras.txt": "# Camera list\n1 OPENCV 640 480 500 501 320.5 240.5 0.1 -0.2 0.001 0.002\n",
+    "matrix.txt": MATRIX,
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_intrinsics_of_other_tools_are_read(name: str, tmp_path: Path):
+    (tmp_path / name).write_text(FILES[name])
+    found = intrinsics_of_file(tmp_path / name, SIZE)
+    assert found is not None and (found.fx, found.fy, found.cx, found.cy) == (500, 501, 320, 240)
+    stated = (0.1, -0.2, 0.001, 0.002, 0.0) if name != "matrix.txt" else (0.0,) * 5
+    assert found.model == "pinhole" and found.distortion == stated
+
+
 @pytest.mark.parametrize("intrinsics", CAMERAS)
 def test_intrinsics_survive_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap

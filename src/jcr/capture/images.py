@@ -23,14 +23,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
 that start programs (PostScript)."""
 MAX_SCANS = 100
 """Largest number of scans of a JPEG with its previews; progressive ones have about ten."""
-ONE_CHANNEL = {
-    "1": np.uint8,
-    "L": np.uint8,
-    "I": np.uint16,
-    "I;16": np.uint16,
-    "I;16B": np.uint16,
-    "I;16L": np.uint16,
-}
+ONE_CHANNEL = {"1": np.uint8, "L": np.uint8} | dict.fromkeys(("I", "I;16", "I;16B", "I;16L"), np.uint16)
 """Type of the values of a grey image by Pillow's mode; older versions of Pillow read 16 bits as 32."""
 BLURRED = 0.25
 """Sharpness below which a frame is blurred, as a share of the median sharpness of the frames."""

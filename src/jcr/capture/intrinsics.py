@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
 from jcr.capture.documents import read_content, read_tables
@@ -189,14 +191,7 @@ def _numbers(keys: dict[str, Any]) -> dict[str, Any] | None:
     )
     if len(matrix) == 9:
         by_columns = abs(matrix[6]) > 1 and not matrix[2]
-        rows = np.array(matrix).reshape(3, 3).T if by_columns else np.array(matrix).reshape(3, 3)
-        return made | {
-            "fx": rows[0, 0],
-            "fy": rows[1, 1],
-            "cx": rows[0, 2],
-            "cy": rows[1, 2],
-            "skew": rows[0, 1],
-        }
+        return made | entry_of_matrix(np.array(matrix).reshape(3, 3).T.ravel() if by_columns else matrix)
     if len(matrix) == 4:  # Kalibr
         return made | dict(zip(("fx", "fy", "cx", "cy"), matrix, strict=True))
     fx, fy = _first(keys, "fx", "fl_x", "focal_length", "f"), _first(keys, "fy", "fl_y")
@@ -221,6 +216,12 @@ def _flat(value: Any) -> list[float]:
         return []
     flat = [cell for row in value for cell in (row if isinstance(row, list) else [row])]
     return flat if all(isinstance(cell, float) for cell in flat) else []
+
+
+def entry_of_matrix(numbers: Sequence[float] | Float[ndarray, "9"]) -> dict[str, Any]:
+    """Return the entry (`intrinsics_entry`) of a camera matrix of nine numbers by rows."""
+    fx, skew, cx, _, fy, cy, *_ = numbers
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
 
 
 def entry_of_colmap(model: str, numbers: Sequence[float]) -> dict[str, Any]:
@@ -253,8 +254,7 @@ def _of_ost(text: str) -> Iterator[dict[str, Any]]:
     matrix = sections.get("camera matrix", [])
     if len(matrix) == 9:
         sides = {side: sections[side][0] for side in ("width", "height") if sections.get(side)}
-        names = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5], "skew": matrix[1]}
-        yield names | sides | {"distortion": sections.get("distortion", [])}
+        yield entry_of_matrix(matrix) | sides | {"distortion": sections.get("distortion", [])}
 
 
 def _of_matrices(file: Path) -> Iterator[dict[str, Any]]:
@@ -270,7 +270,5 @@ def _of_matrices(file: Path) -> Iterator[dict[str, Any]]:
             for one in tables
             if set(words_of(one.place)) & {"dist", "d", "distortion", "distcoeffs"}
         ]
-        yield {
-            "fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2], "skew": matrix[0, 1],
-            "distortion": others[0].tolist() if others and others[0].size in (4, 5, 8) else [],
-        }  # fmt: skip
+        distortion = others[0].tolist() if others and others[0].size in (4, 5, 8) else []
+        yield entry_of_matrix(matrix.ravel()) | {"distortion": distortion}

@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field
 
 from jcr.capture.images import read_image, read_one_channel, require_pixels
-from jcr.capture.intrinsics import intrinsics_entry
+from jcr.capture.intrinsics import entry_of_matrix, intrinsics_entry
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.records import Intrinsics
 from jcr.records.json_file import validated_content
@@ -50,9 +50,8 @@ def intrinsics_of_ros(
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
         return None
-    fx, skew, cx, _, fy, cy, *_ = matrix
-    entry = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew, "width": info.width, "height": info.height}
-    return intrinsics_entry(entry | {"model": model, "distortion": coefficients}, where).record(size, where)
+    entry = {"width": info.width, "height": info.height, "model": model, "distortion": coefficients}
+    return intrinsics_entry(entry_of_matrix(matrix) | entry, where).record(size, where)
 
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {

@@ -40,13 +40,8 @@ def read_transform(file: Path) -> Float[ndarray, "4 4"]:
 def _of_arguments(text: str) -> list[Float[ndarray, "4 4"]]:
     """Return the transforms of static_transform_publisher's named arguments in a launch file or a command."""
     columns = [re.findall(rf'--{name}[\s",=]+([-+.\deE]+)', text) for name in ARGUMENTS]
-    rows = zip(*columns, strict=False)
-    return [_from_quaternion([float(number) for number in row]) for row in rows]
-
-
-def _from_quaternion(numbers: list[float]) -> Float[ndarray, "4 4"]:
-    """Return the transform of x, y, z (m) and a quaternion x, y, z, w."""
-    return transform(Rotation.from_quat(numbers[3:]).as_matrix(), np.array(numbers[:3]))
+    rows = [[float(number) for number in row] for row in zip(*columns, strict=False)]
+    return [transform(Rotation.from_quat(row[3:]).as_matrix(), np.array(row[:3])) for row in rows]
 
 
 def _of_urdf(file: Path, text: str) -> list[Float[ndarray, "4 4"]]:

@@ -315,23 +315,19 @@ def _poses(
     chain, are None without an arm, or if a sliding joint moves the gripper. `key` and `feature` are the name and
     description of the data set's column, `path` is that of the data set. Raises InputError if the numbers are neither.
     """
-    where, names = f"{path}: {key}", feature.numbers()
-    if arm is not None:
-        columns = arm.columns(names, where)
-        if max(columns) >= state.shape[1]:
-            raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
-        recorded = state[:, columns]
-        return arm.poses(recorded, where), arm.angles(recorded)
+    where, names, width = f"{path}: {key}", feature.numbers(), state.shape[1]
     if key == CARTESIAN and not names:
         names = ["x", "y", "z", "roll", "pitch", "yaw"]
-    names = [*names, *[None] * (state.shape[1] - len(names))] if names else [None] * state.shape[1]
-    if len(names) > state.shape[1]:
-        raise InputError(f"{where}: {len(names)} names for {state.shape[1]} numbers; correct {INFO}")
-    cells = tuple(map(tuple, state.tolist()))
-    table = Table(file=path, place=key, columns=tuple(names), rows=cells, keys=None, words="")
+    if len(names) > width:
+        raise InputError(f"{where}: {len(names)} names for {width} numbers; correct {INFO}")
+    if arm is not None:
+        recorded = state[:, arm.columns(names, where)]
+        return arm.poses(recorded, where), arm.angles(recorded)
+    columns, cells = (*names, *[None] * (width - len(names))), tuple(map(tuple, state.tolist()))
+    table = Table(file=path, place=key, columns=columns, rows=cells, keys=None, words="")
     _, readings = readings_of(table, options, where)
     if not readings:
-        listed = ", ".join(name for name in names if name) or "its numbers"
+        listed = ", ".join(names) or "its numbers"
         raise InputError(
             f"{where}: {listed} are no pose; give --urdf and --gripper-frame for joint angles (--pose-units m-deg for "
             "degrees), or --pose-convention"
