@@ -166,7 +166,7 @@ def undecided(
         np.degrees(1.0) if notation[:3] in ("rot", "eul") else 1.0
     )
     rows = tuple(map(tuple, np.hstack([1e3 * poses[:, :3, 3], turned]).tolist()))
-    table = Table(file=Path(name), place="", columns=(None,) * len(rows[0]), rows=rows, keys=None, words="")
+    table = Table(file=Path(name), columns=(None,) * len(rows[0]), rows=rows)
     candidates = tuple(readings_of(table, ReadOptions(), name)[1])
     nothing = np.full((images or len(poses), 4, 4), np.nan)
     return capture_of(nothing, source=Path(name), candidates=candidates)

@@ -36,9 +36,7 @@ def table_of(
     names = columns or [None] * len(cells[0])
     rows = tuple((*row, float(k), 0.5, 0.25) for k, row in enumerate(cells))
     of_rows = None if keys is None else tuple(keys)
-    return Table(
-        file=Path("p.csv"), place="", columns=(*names, "x", "y", "z"), rows=rows, keys=of_rows, words=""
-    )
+    return Table(file=Path("p.csv"), columns=(*names, "x", "y", "z"), rows=rows, keys=of_rows, words="")
 
 
 IMAGES = [f"images/{k}.png" for k in range(7, 13)]

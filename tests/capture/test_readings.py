@@ -355,9 +355,7 @@ def test_the_configuration_of_a_robtarget_is_no_quaternion():
         (300.0 + 20 * k, 100.0 - 20 * k, 500.0, -0.1008, -0.4892, 0.8584, -0.1165, 0.0, 0.0, -1.0, 0.0)
         for k in range(5)
     )
-    table = Table(
-        file=Path("a.mod"), place="", columns=(None,) * 11, rows=rows, keys=None, words="const robtarget"
-    )
+    table = Table(file=Path("a.mod"), columns=(None,) * 11, rows=rows, keys=None, words="const robtarget")
     ((reading, poses),) = readings_of(table, ReadOptions(), "a.mod")[1]
     assert reading.notation == "quat:wxyz" and not reading.inverted
     assert np.allclose(poses[:, :3, 3], [[0.3 + 0.02 * k, 0.1 - 0.02 * k, 0.5] for k in range(5)])

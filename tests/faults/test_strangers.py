@@ -156,7 +156,7 @@ def test_a_table_that_lists_no_files_is_read_itself(tmp_path: Path, name: str):
 def test_numbers_of_any_length_are_names(tmp_path: Path):
     capture = table_capture(tmp_path / "cap", str)
     table = Table(
-        file=capture, place="", columns=("x",), rows=((1.0,),) * 5, keys=tuple(f"{k}" * 5000 for k in range(5)),
+        file=capture, columns=("x",), rows=((1.0,),) * 5, keys=tuple(f"{k}" * 5000 for k in range(5)),
         words="",
     )  # fmt: skip
     assert not pair(table, [f"{k}.png" for k in range(5)]).is_by_name

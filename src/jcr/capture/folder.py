@@ -119,11 +119,10 @@ def _capture(folder: Path, found: Discovery, chosen: list[_Source], options: Rea
         has_pose = np.any([np.isfinite(poses).all((1, 2)) for _, poses in candidates], axis=0)
         bare = np.flatnonzero(~has_pose).tolist()
     for k in bare:
-        if _has_row(chosen, k):
-            what = f"holds no pose: {_row_fault(chosen, k)}; correct it"
-            faults[k] = f"{file}: the row of {found.images[k]} {what}"
-        else:
+        if (fault := _row_fault(chosen, k)) is None:
             unlisted.append(k)
+        else:
+            faults[k] = f"{file}: the row of {found.images[k]} holds no pose: {fault}; correct it"
     rows = [k for k in range(len(found.images)) if k not in unlisted]
     require_frames(len(rows), file, 0)
     is_decided = is_paired and len(candidates) == 1
@@ -172,10 +171,12 @@ def _untaken(source: _Source, images: list[int], where: str) -> tuple[tuple[Read
     )
 
 
-def _row_fault(chosen: list[_Source], image: int) -> str:
-    """Return why the row of an image in the first table that has one is no pose: the cell that is no number, or all."""
-    source = next(one for one in chosen if one.paired.row is not None and one.paired.row[image] >= 0)
-    table, paired = source.table, source.paired
+def _row_fault(chosen: list[_Source], image: int) -> str | None:
+    """Return why the row of an image is no pose, by the cell that is no number; None if no table has a row for it."""
+    with_row = [one for one in chosen if one.paired.row is not None and one.paired.row[image] >= 0]
+    if not with_row:
+        return None
+    table, paired = with_row[0].table, with_row[0].paired
     assert paired.row is not None
     columns = pose_columns(table, paired.skipped)[0]
     row = int(paired.row[image])
@@ -195,11 +196,6 @@ def _why_no_pose(table: Table) -> str:
             return f" (column {printable(name)[:LONGEST_NAME]} has no number in {bad} of {rows} rows)"
     names = [printable(name) for name in table.columns if name]
     return f" (its columns {first_few(names)} are no position with a rotation)" if names else ""
-
-
-def _has_row(chosen: list[_Source], image: int) -> bool:
-    """Test whether a table has a row for the image with an index."""
-    return any(source.paired.row is not None and source.paired.row[image] >= 0 for source in chosen)
 
 
 def _no_poses(folder: Path, found: Discovery, errors: list[tuple[Path, InputError]]) -> InputError:

@@ -22,8 +22,8 @@ _PICKLE = (
     "a Python pickle, which may run programs; save numbers, np.save('poses.npy', np.array(poses, float))"
 )
 _MATLAB_OBJECT = (
-    "a MATLAB object, a cell array or a struct; save numbers, A = cat(3,T{:}); save('poses.mat','A'), or a table with "
-    "writetable(T,'poses.csv')"
+    "a MATLAB object such as a table, a cell array or a struct; save a table with writetable(T,'poses.csv'), numbers "
+    "with A = cat(3,T{:}); save('poses.mat','A')"
 )
 _SHEET = "a spreadsheet; save it as CSV"
 _REFUSED = {

@@ -41,11 +41,11 @@ class Table:
     """
 
     file: Path
-    place: str
+    place: str = ""
     columns: tuple[str | None, ...]
     rows: tuple[tuple[Cell, ...], ...]
-    keys: tuple[str, ...] | None
-    words: str
+    keys: tuple[str, ...] | None = None
+    words: str = ""
 
 
 def table_of(

@@ -237,7 +237,7 @@ def _table_of_rows(file: Path, rows: Sequence[Row], texts: dict[int, str], separ
             names.append(name or None)
             columns.append(tuple(column))
     return Table(
-        file=file, place="", columns=tuple(names), rows=tuple(zip(*columns, strict=True)),
+        file=file, columns=tuple(names), rows=tuple(zip(*columns, strict=True)),
         keys=None if keys is None else tuple(keys), words=tidy_words(texts.values()),
     )  # fmt: skip
 

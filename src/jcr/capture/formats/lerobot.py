@@ -324,7 +324,7 @@ def _poses(
         recorded = state[:, arm.columns(names, where)]
         return arm.poses(recorded, where), arm.angles(recorded)
     columns, cells = (*names, *[None] * (width - len(names))), tuple(map(tuple, state.tolist()))
-    table = Table(file=path, place=key, columns=columns, rows=cells, keys=None, words="")
+    table = Table(file=path, place=key, columns=columns, rows=cells)
     _, readings = readings_of(table, options, where)
     if not readings:
         listed = ", ".join(names) or "its numbers"
