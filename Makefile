@@ -11,7 +11,6 @@ env: .venv/ready
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	$(BIN)/python -m jcr.depth  # compiles its loops, or the first run would
-	$(BIN)/python docs/generated.py  # pages of the manual that others link to
 	touch $@
 	@echo "prepared. To have the jcr command in this shell:  . .venv/bin/activate"
 

@@ -14,6 +14,7 @@ import sys
 import textwrap
 from collections.abc import Collection, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,8 @@ def api_page() -> str:
         "# Python\n",
         "Every public name of `jcr`. Transforms are `a_from_b` (4×4), points `x_in_a`; metres and radians, or the unit "
         "in the name. Cameras are OpenCV's: x right, y down, z forward. A path may be text, an array a list, options a "
-        "dict; what is wrong with them is an `InputError`.\n",
+        'dict with the names of the fields: `jcr.run(capture, out, {"calibrate": {"require": (2, 0.3)}})`. What is '
+        "wrong in files, poses and options is an `InputError`; an argument of a wrong type may be a `TypeError`.\n",
         f"A complete example, `examples/{EXAMPLE.name}`:\n\n```python\n{EXAMPLE.read_text('utf-8')}```\n",
     ]
     for name in jcr.__all__:
@@ -130,7 +132,7 @@ def _entry(name: str, value: Any) -> list[str]:
             for field in fields(value)
         ]
         lines += ["", "| field | type | default | |", "|---|---|---|---|", *rows]
-    for name, prop in inspect.getmembers(value, lambda member: isinstance(member, property)):
+    for name, prop in inspect.getmembers(value, lambda one: isinstance(one, property | cached_property)):
         if name in vars(value) and prop.__doc__:
             lines.append(f"\n`.{name}`: {_text(prop.__doc__)}")
     for method, function in inspect.getmembers(value, inspect.isfunction):

@@ -35,7 +35,6 @@ from jcr.files import read_bytes
 from jcr.reconstruct import ReconstructOptions
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.npz import read_reconstruction
-from jcr.rounding import significant
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map
@@ -128,10 +127,7 @@ class RunResult:
             found = self.calibration
         except InputError as error:
             return f"<RunResult {error}>"
-        used = f"{sum(one.used for one in found.images)} of {len(found.images)} images"
-        seen = None if found.uncertainty is None else found.uncertainty.seen
-        point = "" if seen is None else f", a point within {significant(seen.within_95_mm)} mm (95 %)"
-        return f"<RunResult {self.out}: {found.verdict}, {used}{point}>"
+        return f"<RunResult {self.out}: {found.in_short}>"
 
     @cached_property
     def calibration(self) -> AnyCalibration:

@@ -160,7 +160,7 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(
         last = capsys.readouterr().err.splitlines()[-1]
         assert last.startswith(f"belongs to fx {intrinsics['fx']:.1f}") and "--intrinsics given" in last
     export(done, "colmap", tmp_path / "colmap")
-    assert "mm (median), the errors of the robot's poses" in capsys.readouterr().err
+    assert "mm (median), by the robot's errors" in capsys.readouterr().err
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
     with pytest.raises(InputError, match="--intrinsics given"):

@@ -160,7 +160,7 @@ def test_rejected_images_are_reported_with_why(run: RunResult, page: str):
     assert [k for k, image in enumerate(images) if not image.used] == [WRONG, UNREGISTERED]
     text = Elements(page).text
     for k in (WRONG, UNREGISTERED):
-        assert f"Rejected: {images[k].reason}" in text
+        assert f"Left out: {images[k].reason}" in text
 
 
 def test_text_from_files_stays_text(page: str):

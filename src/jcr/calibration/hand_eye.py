@@ -138,10 +138,8 @@ def fit_poses(
     used = fit.problem.used[distinct]
     predicted = model.moving(predicted_gripper_poses(x, scale, z, camera))
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
-    noise_m, noise_rad = fit.noise.together
-    typical = f"(their noise: {1e3 * noise_m:.1f} mm, {np.degrees(noise_rad):.2f}°)"
     reasons = [
-        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it {typical}"
+        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it"
         for m, rad in zip(metres, radians, strict=True)
     ]
     left_out, moving = fit.leave_one_out[0][fit.problem.used], model.moving(gripper)

@@ -64,6 +64,7 @@ from jcr.records.checked import require_fields
 from jcr.records.json_fields import Matrix, Positive, rounded
 from jcr.records.json_file import read_json
 from jcr.records.npz import read_npz, write_npz
+from jcr.rounding import significant
 
 FORMAT = "jcr.calibration/2"
 UNCERTAINTY, ARRAYS = "uncertainty.npz", "jcr.uncertainty/1"
@@ -108,7 +109,7 @@ def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
 AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Outcome:
     """Base class of Calibration and FailedCalibration: findings, verdict, and the use of each image.
 
@@ -221,6 +222,18 @@ class Outcome:
         """Number of images that the calibration uses."""
         return sum(image.used for image in self.images)
 
+    def __repr__(self) -> str:
+        """Return the class, and the calibration in short."""
+        return f"<{type(self).__name__}: {self.in_short}>"
+
+    @property
+    def in_short(self) -> str:
+        """Verdict, number of used images, and the error that 95 % of the points stay below, on one line."""
+        uncertainty = getattr(self, "uncertainty", None)
+        seen = None if uncertainty is None else uncertainty.seen
+        point = "" if seen is None else f", a point within {significant(seen.within_95_mm)} mm (95 %)"
+        return f"{self.verdict}, {self.images_used} of {len(self.images)} images{point}"
+
     def with_findings(self: AnyOutcome, *findings: Finding) -> AnyOutcome:
         """Return the calibration with more findings, all of them sorted by `strongest_first`; its covariance stays."""
         return replace(self, findings=strongest_first((*self.findings, *findings)))
@@ -241,7 +254,7 @@ class Outcome:
     __hash__ = None  # type: ignore[assignment]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Calibration(Outcome):
     """Result of a hand-eye calibration: transform, scale, uncertainty, robot errors, and accuracy; see also Outcome."""
 
@@ -418,7 +431,7 @@ class _WithoutUncertainty(Outcome):
         return super().as_json() | empty
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FailedCalibration(_WithoutUncertainty):
     """Result for a capture that could not be reconstructed; its findings are the reasons.
 
@@ -435,7 +448,7 @@ class FailedCalibration(_WithoutUncertainty):
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class PublishedCalibration(_WithoutUncertainty):
     """Result of the published method: transform, scale and residuals, without covariance and without checks.
 

@@ -58,6 +58,8 @@ def discover(folder: Path, poses: Path | None = None) -> Discovery:
     `poses` is the only file of poses that is read, or a folder with one file for each image; None: all documents of the
     folder, or beside it if there are none. Raises InputError if the folder has no images.
     """
+    if poses is not None and not poses.exists():
+        raise InputError(f"{poses}: no such file or folder; correct --poses")
     images, notes = find_images(folder)
     listed, linked = _files_of(folder)
     files, large = _limited(listed)

@@ -36,7 +36,7 @@ GROUPS = {
         "use.map": "build or rebuild the map of a run",
     },
     "check": {
-        "check.check": "check a capture in seconds, before the calibration",
+        "check.check": "check a capture before the calibration, in seconds (a fixed camera: up to minutes)",
         "check.verify": "test with a few new images whether the camera has moved",
         "check.compare": "test whether the uncertainties of two calibrations explain their difference",
         "check.touch": "compare points that the robot's tip touches with the map",

@@ -17,7 +17,7 @@ class Output:
     json: bool = False
     """Print the result as one JSON object."""
     quiet: bool = False
-    """Print only errors and warnings on stderr, without progress and notes."""
+    """Print no progress and notes on stderr, only errors and warnings. The result is still printed on stdout."""
 
     def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
         """Print the result: with --json `facts` as one JSON object (arrays as lists), otherwise the `lines`."""

@@ -1,6 +1,5 @@
 """Commands that are not part of a calibration: board, docs and models."""
 
-import runpy
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, files
@@ -82,9 +81,6 @@ class DocsCommand:
 
 def pages() -> dict[str, Path]:
     """Return the file of each page of the manual by its name for `jcr docs`; empty if no page is installed."""
-    generator = CHECKOUT / "generated.py"
-    if generator.is_file() and not (CHECKOUT / "reference" / "cli.md").is_file():
-        runpy.run_path(str(generator), run_name="__main__")  # pages that are read from the source
     found = list(CHECKOUT.rglob("*.md"))
     if not (CHECKOUT / "conf.py").is_file():
         with suppress(PackageNotFoundError):  # when run from source files, without installation

@@ -126,7 +126,7 @@ class FindingKind(StrEnum):
         "{nearly:nearly unobservable|unobservable} from these motions: {direction}", "{concerns:motion={move}|}",
         means="the motions do not determine a direction of translation, rotation or scale",
         help="other motions; `details.motion` says what these are like")
-    FEW_IMAGES = "few images", KindRow("motion", "with {value:.0f} images a wrong one cannot be identified",
+    FEW_IMAGES = "few images", KindRow("motion", "with so few images ({value:.0f}) a wrong one cannot be identified",
         "take 8 or more")
     FEW_AGREE = "few images agree", KindRow("motion",
         "only {value:.0f} of {images:.0f} images agree on one calibration",

@@ -77,6 +77,7 @@ class LiveCalibration:
         self._map: LiveMap | None = None
         self._mapped: tuple[str, ...] = ()
         self._blurred: dict[str, Finding] = {}
+        self._is_closed = False
         self.progress = LiveProgress(images=tuple(self.live.names))
 
     def add(
@@ -98,6 +99,10 @@ class LiveCalibration:
         that repeats another. The capture is then unchanged. Several threads may call this at the same time.
         """
         with self._lock:
+            if self._is_closed:
+                raise InputError(
+                    f"{self.live.folder}: this calibration is closed; open it again to add images"
+                )
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
@@ -163,6 +168,7 @@ class LiveCalibration:
         with self._lock:
             self.live.close()
             self._opened.close()
+            self._is_closed = True
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> LiveProgress:
         """Return the state of the calibration; without a calibration if fewer than three images are registered.

@@ -18,7 +18,7 @@ REQUIREMENT_MET = "requirement met: finish, or go on"
 FIRST_ADVICE = "rotate the wrist by 20° or more, and move, between images"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class LiveProgress:
     """State of a live calibration: its images, findings and calibration."""
 
@@ -34,6 +34,11 @@ class LiveProgress:
     """Calibration, which may be rejected; None while fewer than three images are registered."""
     points_in_base: Float[ndarray, "p 3"] | None = None
     """Reconstructed points of the scene (m, base frame); None without a calibration."""
+
+    def __repr__(self) -> str:
+        """Return the number of registered images, and the calibration in short."""
+        found = "no calibration yet" if self.hand_eye is None else self.hand_eye.in_short
+        return f"<LiveProgress: {len(self.registered)} of {len(self.images)} images registered; {found}>"
 
     @property
     def reached(self) -> tuple[float, float] | None:

@@ -80,7 +80,7 @@ def run(
         with locked(out):
             capture = read_capture(capture, into=out / CAPTURE)
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
-    options, missing = _possible(replace(options, reconstruct=own), capture)
+    options, missing = _possible(replace(options, reconstruct=own), capture, out)
     with locked(out):
         capture, alone = _decided(capture, out, own.seed, report)
         result = begun(out, kept(capture, out / CAPTURE), options)
@@ -259,7 +259,7 @@ def _decided_before(capture: Capture, folder: Path) -> Capture | None:
     return None
 
 
-def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, tuple[str, ...]]:
+def _possible(options: RunOptions, capture: Capture, out: Path) -> tuple[RunOptions, tuple[str, ...]]:
     """Return the options, without a map if none can be made, and a note (in a tuple) if packages for it are missing.
 
     A fixed camera has no map.
@@ -269,7 +269,7 @@ def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, tuple[
         return replace(options, map=None), ()
     try:
         if not all(map(is_installed, PACKAGES)):
-            require_packages("the map", ", then `jcr map`")
+            require_packages("the map", f", then `jcr map {out}`")
     except InputError as error:
         return replace(options, map=None), (f"no map was made: {error}",)
     return options, ()

@@ -51,7 +51,8 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         (width, height), source = capture.image_size, origin(capture.folder)
         robot = options.get("calibrate", {}).get("robot") or capture.robot
         arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
-        given = "given" if capture.intrinsics is not None else "estimated"
+        refined = calibration.intrinsics != capture.intrinsics and calibration.intrinsics is not None
+        given = "estimated" if capture.intrinsics is None else "given and refined" if refined else "given"
         about = f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
     has_images, is_published = isinstance(capture, Capture), isinstance(calibration, PublishedCalibration)
     is_wrist, scene = has_images and capture.mount != "base", result.scene if has_images else None

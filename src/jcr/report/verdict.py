@@ -104,7 +104,7 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
         yield "Residual δt", f"{significant(1e3 * found.translation)} mm", "paper, eq. 16", True
         yield "Residual δR", significant(found.rotation), "paper, eq. 16; Frobenius norm", True
     used, count = calibration.images_used, len(calibration.images)
-    yield "Images used", f"{used} of {count}", f"{count - used} rejected" if used < count else "", True
+    yield "Images used", f"{used} of {count}", f"{count - used} left out" if used < count else "", True
     if isinstance(calibration, PublishedCalibration):
         yield "Scale", f"{calibration.scale:.4g}", "m per unit of the reconstruction", True
     elif uncertainty is not None and calibration.scale is not None:

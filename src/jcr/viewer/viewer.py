@@ -215,13 +215,13 @@ class Viewer:
     def _add_points(self) -> None:
         """Add the controls that select the drawn points and their colours, and the values at a clicked point."""
         gui, names = self.server.gui, [*self._layers, "none"]
-        with gui.add_folder("Points", expand_by_default=False):
+        with gui.add_folder("Points"):
             self.shown = gui.add_dropdown("show", names, initial_value=names[0])
             self._legend = gui.add_html("")
             self.show_tracks = gui.add_checkbox("features", len(names) == 1, hint="tracked, red")
         for control in (self.shown, self.show_tracks):
             control.on_update(lambda _: self.show_points())
-        with gui.add_folder("Click a point", expand_by_default=False):
+        with gui.add_folder("Click a point"):
             self.clicked = gui.add_html(_lines(("", "Click a point to see its values.")))
         self._mark = self.server.scene.add_icosphere("/clicked", 0.004, (255, 220, 0), visible=False)
 

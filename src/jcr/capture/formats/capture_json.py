@@ -61,8 +61,11 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return the validated frame `row` (from 0) of a capture.json; raise InputError that names its image if invalid."""
-    where = f"{file}: frame {row} ({content.frames[row]['image']})"
-    return validated_content(FrameEntry, content.frames[row], where)
+    frame = content.frames[row]
+    where, pose = f"{file}: frame {row} ({frame['image']})", "base_from_gripper"
+    if pose not in frame and (like := [key for key in frame if did_you_mean(key, [pose])]):
+        raise InputError(f"{where}: has {shown(like[0])} instead of {pose}; correct the key")
+    return validated_content(FrameEntry, frame, where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
