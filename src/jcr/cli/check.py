@@ -123,6 +123,11 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     if isinstance(capture, Capture) and capture.others:
         named = joined([one.name for one in capture.others])
         lines += labelled("Cameras", f"{capture.camera_name} was checked; jcr run also uses {named}")
+    if isinstance(capture, Capture) and capture.mount == "base":
+        lines += labelled(
+            "Board",
+            "none was looked for; if the gripper holds one: jcr calibrate … --board (jcr docs cameras)",
+        )
     if not is_rejected:
         lines += _motion_lines(found)
         run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
