@@ -85,6 +85,7 @@ def test_the_first_message_names_the_poses(real_captures: Path, name: str, what:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["inverses", "reversed"])
 def test_wrong_poses_of_few_images_without_intrinsics_lead(real_captures: Path, what: str):
     """Cameras of few images without intrinsics fit no poses well before the images are adjusted with them.
