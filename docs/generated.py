@@ -132,8 +132,17 @@ def _entry(name: str, value: Any) -> list[str]:
             for field in fields(value)
         ]
         lines += ["", "| field | type | default | |", "|---|---|---|---|", *rows]
+    elif inspect.isclass(value) and "__init__" in vars(value):
+        lines += ["", f"```python\n{_signature(name, vars(value)['__init__'])}\n```"]
+        lines += ["", _text(vars(value)["__init__"].__doc__ or "")]
+    hidden = [
+        one
+        for one in inspect.getmro(value)
+        if one.__module__.startswith("jcr") and not hasattr(jcr, one.__name__)
+    ]
+    own = {name for one in (value, *hidden) for name in vars(one)}
     for name, prop in inspect.getmembers(value, lambda one: isinstance(one, property | cached_property)):
-        if name in vars(value) and prop.__doc__:
+        if name in own and prop.__doc__:
             lines.append(f"\n`.{name}`: {_text(prop.__doc__)}")
     for method, function in inspect.getmembers(value, inspect.isfunction):
         if not method.startswith("_") and function.__doc__ and method in vars(value):
@@ -165,7 +174,8 @@ def _signature(name: str, function: Any) -> str:
             lines.append("    *,")
         kind = written[parameter.name].annotation if parameter.name in written else None
         text = parameter.name + (f": {ast.unparse(kind)}" if kind else "")
-        text += "" if parameter.default is parameter.empty else f" = {parameter.default!r}"
+        default = "…" if inspect.isfunction(parameter.default) else repr(parameter.default)
+        text += "" if parameter.default is parameter.empty else f" = {default}"
         lines.append(f"    {text},")
     returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
     return "\n".join([f"{name}(", *lines, f"){returns}"])

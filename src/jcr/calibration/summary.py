@@ -72,9 +72,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
-        if left_out := [f"{one.image}: {one.reason}" for one in content.images if not one.used]:
-            more = [f"and {len(left_out) - 2} more (log.txt)"] if len(left_out) > 2 else []
-            lines += labelled("Left out", "; ".join([*left_out[:2], *more]))
+        lines += left_out_lines(content)
     if isinstance(content, PublishedCalibration):
         lines += _published(content)
     return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines))]) + "\n"
@@ -104,6 +102,13 @@ def _result(content: Calibration) -> list[str]:
         *labelled("Accuracy", accuracy, "; ".join(tested)),
     ]
     return [*lines, *(labelled("Intrinsics", *pair) if (pair := pair_in_words(content)) else ())]
+
+
+def left_out_lines(content: Calibration) -> list[str]:
+    """Return a line with up to two images that the calibration does not use, and why; empty if it uses all."""
+    left_out = [f"{one.image}: {one.reason}" for one in content.images if not one.used]
+    more = [f"and {len(left_out) - 2} more (log.txt)"] if len(left_out) > 2 else []
+    return labelled("Left out", "; ".join([*left_out[:2], *more])) if left_out else []
 
 
 def pair_in_words(content: Calibration) -> list[str]:

@@ -130,7 +130,12 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         )
     if not is_rejected:
         lines += _motion_lines(found)
-        run = ["jcr", "run", str(command.capture), f"out/{command.capture.stem}"]
+        run = [
+            "jcr",
+            "run",
+            str(command.capture),
+            f"out/{command.capture.stem if command.capture.is_file() else command.capture.name}",
+        ]
         closing = shlex.join([*run, *read_arguments(command.read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
@@ -144,6 +149,8 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
 
 def _motion_lines(found: "Examination") -> list[str]:
     """Return the lines on the motion, the expected accuracy, and the agreement of poses and images."""
+    from jcr.calibration.summary import left_out_lines
+
     rotation, images = np.degrees(found.largest_rotation_rad), len(found.capture)
     motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
     lines, fitted = labelled("Motion", motion), found.hand_eye
@@ -153,12 +160,10 @@ def _motion_lines(found: "Examination") -> list[str]:
             " ".join(significant(float(value)) for value in part)
             for part in (1e3 * std[:3], np.degrees(std[3:6]))
         )
-        corner = "" if (worst := found.expected.corner) is None else significant(worst.within_95_mm)
         lines += labelled(
             "Expected",
             f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
-            f"{significant(seen.rotation_95_deg)}° (95 %) at the image centre"
-            + (corner and f"; {corner} mm in the corner"),
+            f"{significant(seen.rotation_95_deg)}° (95 %) at the image centre; jcr run states the corner, too",
             f"from {len(found.counted)} images, with "
             f"{'usual errors' if fitted is None else 'the errors found in these images'}",
             f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
@@ -169,7 +174,7 @@ def _motion_lines(found: "Examination") -> list[str]:
         if compared < images:
             looked += f"; --thorough compares all {images}, and tests distortion and focus"
         agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})")
+        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})") + left_out_lines(fitted)
     return lines
 
 

@@ -82,7 +82,7 @@ class LiveCalibration:
 
     def add(
         self,
-        image: ArrayLike | Path,
+        image: ArrayLike,
         base_from_gripper: ArrayLike,
         joints: ArrayLike | None = None,
         time_s: float | None = None,

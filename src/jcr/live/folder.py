@@ -85,7 +85,7 @@ class LiveFolder:
 
     def add(
         self,
-        image: ArrayLike | Path,
+        image: ArrayLike,
         base_from_gripper: ArrayLike,
         joints: ArrayLike | None = None,
         time_s: float | None = None,
@@ -207,7 +207,7 @@ class LiveFolder:
             path_inside(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
 
-def checked_image(image: ArrayLike | Path, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
+def checked_image(image: ArrayLike, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
     """Return an image in RGB, (h,w,3) uint8; grey images (h,w) or (h,w,1) are converted.
 
     `color` is the order of the channels, "rgb" or "bgr". Raises InputError for any other array or a path; its message

@@ -76,6 +76,11 @@ _FEW_FEATURES = 1000
 """Number of features per image below which texture is too scarce; textured tabletops give 1500 to 5000, a chessboard
 before a plain background 400."""
 
+POOR_PX = 1.0
+"""Mean reprojection error (px, at the working size) above which given intrinsics are compared with estimated ones. Eight
+real captures have 0.3 to 0.8 px; focal lengths that are wrong by 25 % or more give 1.0 to 1.3 px. With 0.5, five of the
+eight are mapped twice for nothing; with 1.5, none is noticed, because COLMAP leaves worse points out."""
+
 
 def reconstruct_colmap(
     capture: Capture,
@@ -88,7 +93,8 @@ def reconstruct_colmap(
 
     The gripper poses check the matches (features/pair_search.py). The images are reduced to a long side of
     `working_size_px`. Known intrinsics are held, unknown ones are estimated. Known ones with which fewer than half of
-    the images register are estimated too, if most images register then. Raises RejectedError when fewer than three
+    the images register, or points are more than POOR_PX off, are estimated too, if more images register then, or
+    points are half as far off. Raises RejectedError when fewer than three
     images register, with their number, the likely reason and a remedy.
     """
     report = progress or silent
@@ -113,19 +119,23 @@ def reconstruct_colmap(
 
         matched, model = mapped(all_intrinsics, matcher)
         like, registered = all_intrinsics[0], 0 if model is None else model.num_reg_images()
-        if known and 2 * registered < len(images):
+        error_px = 0.0 if model is None else model.compute_mean_reprojection_error()
+        if known and (2 * registered < len(images) or error_px > POOR_PX):
             # Wrong intrinsics spoil the matches' verification and the map; their focal length is nearly right mostly.
             start = [without_distortion(like), *starting_intrinsics(replace(capture, intrinsics=None))[0]]
             free = Matcher(matcher.features, working_cameras(start, False, working_size_px)[0], False, seed)
             others, other = mapped(start, free)
-            if other is not None and (count := other.num_reg_images()) > max(
-                2 * registered, len(images) // 2
-            ):
+            count = 0 if other is None else other.num_reg_images()
+            left_px = 0.0 if other is None else other.compute_mean_reprojection_error()
+            found = None
+            if count > max(2 * registered, len(images) // 2):
+                found = f"{registered} of {len(images)} images register, with estimated ones {count}"
+            elif count >= max(registered, _MIN_REGISTERED) and left_px < error_px / 2:
+                found = f"the points are {error_px:.1f} px off, with estimated ones {left_px:.1f} px"
+            if found is not None:
                 matched, model, matcher, like, known = others, other, free, start[0], False
-                warnings = (
-                    f"the given intrinsics are not used: with them {registered} of {len(images)} images register, with "
-                    f"estimated ones {count}; calibrate the camera again, or leave them out",
-                )
+                remedy = "calibrate the camera again at this resolution, or leave them out"
+                warnings = (f"the given intrinsics are not used: with them {found}; {remedy}",)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
         made = _adjusted(model, images, like, known, seed)
