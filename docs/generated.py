@@ -174,7 +174,7 @@ def _signature(name: str, function: Any) -> str:
             lines.append("    *,")
         kind = written[parameter.name].annotation if parameter.name in written else None
         text = parameter.name + (f": {ast.unparse(kind)}" if kind else "")
-        default = "…" if inspect.isfunction(parameter.default) else repr(parameter.default)
+        default = "..." if inspect.isfunction(parameter.default) else repr(parameter.default)
         text += "" if parameter.default is parameter.empty else f" = {default}"
         lines.append(f"    {text},")
     returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
