@@ -28,12 +28,12 @@ def check_pairing(case: Case) -> Case:
     """Return the case with findings on unused images whose gripper poses are exchanged or all differ by one motion.
 
     The robust fit rejects such poses one by one, so a calibration from the other images may be accepted. Images with a
-    merely wrong pose give no finding here. If the used images do not agree, a part of the capture may
-    (`_step_after_part`).
+    merely wrong pose give no finding here. If the used images do not agree, half of the capture may
+    (`_step_beyond_half`).
     """
     kinds = {one.kind for one in case.calibration.findings}
     if kinds & {FindingKind.FEW_AGREE, FindingKind.POSES_CONTRADICT_IMAGES}:
-        return case.found(*_step_after_part(case))
+        return case.found(*_step_beyond_half(case)) if case.carries == "camera" else case
     if FindingKind.UNOBSERVABLE in kinds or len(case.capture) - len(case.used) < 2:
         return case
     # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
@@ -41,19 +41,19 @@ def check_pairing(case: Case) -> Case:
     return case.found(*(one for one in found if one.kind is not FindingKind.POSE_CONTRADICTS_IMAGE))
 
 
-def _step_after_part(case: Case) -> list[Finding]:
-    """Return the finding that all images but those at one end of the capture are moved alike; empty if they are not.
+def _step_beyond_half(case: Case) -> list[Finding]:
+    """Return the finding that all images to one end of the capture are moved alike; empty if they are not.
 
-    The end is the longest one, half of the images or more, whose poses alone give a calibration.
+    A single step leaves the first or the second half of the images without it, which then gives a calibration alone.
     """
-    made, gripper = case.reconstruction, case.moving
-    count, every = len(gripper), np.arange(len(gripper))
-    for size in range(count - 2, max(MIN_IMAGES, count // 2) - 1, -1):
-        for part in (every[:size], every[-size:]):
-            fit = solve_hand_eye(gripper[part], case.recon_from_camera[part], camera_errors="none")
-            if fit.converged and fit.inliers.all():
-                found = left_out_poses(case.capture, made, fit, part)
-                return [one for one in found if one.kind in STEPS]
+    gripper, every = case.moving, np.arange(len(case.moving))
+    size = max(MIN_IMAGES, (len(every) + 1) // 2)
+    for half in (every[:size], every[-size:]):
+        fit = solve_hand_eye(gripper[half], case.recon_from_camera[half], camera_errors="none")
+        if fit.converged and fit.inliers.all():
+            found = left_out_poses(case.capture, case.reconstruction, fit, half)
+            if steps := [one for one in found if one.kind in STEPS]:
+                return steps
     return []
 
 
