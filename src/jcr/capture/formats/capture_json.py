@@ -61,11 +61,8 @@ def read_capture_json(file: Path) -> CaptureFile:
 
 def frame_of(content: CaptureFile, row: int, file: Path) -> FrameEntry:
     """Return the validated frame `row` (from 0) of a capture.json; raise InputError that names its image if invalid."""
-    frame = content.frames[row]
-    where, pose = f"{file}: frame {row} ({frame['image']})", "base_from_gripper"
-    if pose not in frame and (like := [key for key in frame if did_you_mean(key, [pose])]):
-        raise InputError(f"{where}: has {shown(like[0])} instead of {pose}; correct the key")
-    return validated_content(FrameEntry, frame, where)
+    where = f"{file}: frame {row} ({content.frames[row]['image']})"
+    return validated_content(FrameEntry, content.frames[row], where)
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
@@ -105,7 +102,10 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
 
 
 def _unknown_keys(content: CaptureFile, where: str) -> list[str]:
-    """Return a note for each key that is similar to a known one, and so probably a misspelt one; others are remarks."""
+    """Return a note for each key that is similar to a known one that is not there, so probably misspelt.
+
+    Other keys are remarks, such as a base_from_camera beside base_from_gripper.
+    """
     frames = {key for frame in content.frames for key in frame}
     camera = content.intrinsics
     given = content.model_extra or {}, frames, (camera and camera.model_extra) or {}
@@ -114,7 +114,7 @@ def _unknown_keys(content: CaptureFile, where: str) -> list[str]:
         f"{where}: {shown(key)} is not used{meant}"
         for keys, names in zip(given, known, strict=True)
         for key in sorted(set(keys) - names.keys())
-        if (meant := did_you_mean(key, names))
+        if (meant := did_you_mean(key, names.keys() - keys))
     ]
 
 
