@@ -214,6 +214,7 @@ def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tm
             with pytest.raises(jcr.InputError, match=f"no image {missing}; the capture has 0"):
                 live.remove(missing)
         assert len(live.add(still(tabletop, 2), poses[2]).images) == 1
-    with pytest.raises(jcr.InputError, match="is closed"):
-        live.add(still(tabletop, 3), poses[3])
+    for change in (lambda: live.add(still(tabletop, 3), poses[3]), lambda: live.remove(0), live.undo):
+        with pytest.raises(jcr.InputError, match="is closed"):
+            change()
     assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))

@@ -261,11 +261,8 @@ class ExportedRun:
             views = self.views
             off = views.base_from_camera - views.base_from_gripper @ found.gripper_from_camera
             mm = 1e3 * float(np.median(np.linalg.norm(off[:, :3, 3], axis=1)))
-            other = (
-                " and other intrinsics"
-                if views.intrinsics.fx != getattr(found.intrinsics, "fx", None)
-                else ""
-            )
+            camera = found.intrinsics
+            other = "" if camera is not None and camera.fx == views.intrinsics.fx else " and other intrinsics"
             return (
                 f"camera poses and intrinsics ({intrinsics_in_words(views.intrinsics)}) fit each other and the map to "
                 f"a fraction of a pixel; gripper poses times the hand-eye transform differ from them by "

@@ -1,8 +1,8 @@
 """Calibration that is updated after each image of a capture, with its accuracy and findings."""
 
 import threading
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -98,11 +98,7 @@ class LiveCalibration:
         image or no rigid pose, a pose that is not in metres, an image of another size than the others, and an image
         that repeats another. The capture is then unchanged. Several threads may call this at the same time.
         """
-        with self._lock:
-            if self._is_closed:
-                raise InputError(
-                    f"{self.live.folder}: this calibration is closed; open it again to add images"
-                )
+        with self._changing():
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
             return self.update()
 
@@ -112,7 +108,7 @@ class LiveCalibration:
         `image` is its name, or its index, which counts from 0, and from the end if it is negative. Returns the new state
         of the calibration. Raises InputError if there is no such image.
         """
-        with self._lock:
+        with self._changing():
             names = self.live.names
             if isinstance(image, int) and -len(names) <= image < len(names):
                 image = names[image]
@@ -126,7 +122,7 @@ class LiveCalibration:
 
         Returns the new state of the calibration, which is the same if there is nothing to undo.
         """
-        with self._lock:
+        with self._changing():
             self.live.undo()
             return self.update()
 
@@ -169,6 +165,16 @@ class LiveCalibration:
             self.live.close()
             self._opened.close()
             self._is_closed = True
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Hold the lock for a change of the images; raise InputError after `close`."""
+        with self._lock:
+            if self._is_closed:
+                raise InputError(
+                    f"{self.live.folder}: this calibration is closed; open it again to change it"
+                )
+            yield
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> LiveProgress:
         """Return the state of the calibration; without a calibration if fewer than three images are registered.

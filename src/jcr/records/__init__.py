@@ -4,7 +4,7 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
-from jcr.findings.required import *
+from jcr.findings.finding import Requirement as Requirement
 from jcr.records.calibration import *
 from jcr.records.capture import *
 from jcr.records.reconstruction import *
