@@ -254,8 +254,10 @@ def test_a_rejected_calibration_is_not_recommended(run: RunResult):
     still[:, :3, :3] = np.eye(3)
     cameras, of_sliding = still @ run.found.gripper_from_camera, replace(run.capture, base_from_gripper=still)
     sliding = replace(run.reconstruction, recon_from_camera=cameras[:UNREGISTERED], tracks=NO_TRACKS)
-    text = Elements(with_reconstruction(run.with_parts(capture=of_sliding), sliding)).text
+    found = Elements(with_reconstruction(run.with_parts(capture=of_sliding), sliding))
+    text = found.text
     assert "Rejected:" in text and "does not support the result" in text and "Accepted:" not in text
+    assert not any("data-copy" in attributes for _, attributes in found.found), "a rejected transform is not copied"
     bars = list(excitation_bars(excitation(still, run.found.gripper_from_camera)))
     assert [kind for kind, *_ in bars] == ["rejected"] * 3 + ["used"] * 4
 

@@ -104,7 +104,9 @@ class RunCommand(CalibrateCommand):
                 capture = read_capture(self.capture, self.read, into=self.out / CAPTURE, progress=progress)
             result = _run(self, capture, options, progress)
         lines = [note for note in result.calibration.notes if note.startswith("no map was made")]
-        if (self.out / "map.safetensors").is_file():
+        if not result.calibration.converged:
+            lines = []
+        elif (self.out / "map.safetensors").is_file():
             lines = [f"jcr view {shlex.quote(str(self.out))}"]
         elif self.no_map:
             lines = []

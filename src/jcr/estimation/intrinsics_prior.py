@@ -217,7 +217,8 @@ def size_of(likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], 
     right = posterior @ likeliest
     # The prior is subtracted; the images measure the coefficients independently along these directions.
     known, directions = np.linalg.eigh(posterior - np.eye(len(likeliest)) * std**-2.0)
-    known, right = np.maximum(known, 0.0), directions.T @ right
+    # Far from the solution the images' information may be negative along a direction, which then determines nothing.
+    known, right = np.maximum(known, 0.0), np.where(known > 0, directions.T @ right, 0.0)
     variance = std**2
     for _ in range(UPDATES):
         information = known + 1 / variance

@@ -147,9 +147,13 @@ def check_capture(
     elif len(counted) >= MIN_PREDICTED_IMAGES:
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
-        if assumptions is not None:
-            x = assumptions.gripper_from_camera
-            found += requirement_of(x, expected, found, len(counted), options)[1]
+        if assumptions is not None and hand_eye is not None:
+            # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
+            of_images = replace(expected, budget=hand_eye.uncertainty.budget)
+            x, arm_known = assumptions.gripper_from_camera, hand_eye.joint_offsets is not None
+            found += requirement_of(x, of_images, found, len(counted), options, arm_known)[1]
+    if look and isinstance(capture, Capture) and verdict_of(found) != "accepted":
+        found += proposed(capture, None)
     return Examination(
         capture=capture,
         largest_move_m=move_m,
@@ -225,7 +229,7 @@ def _compare(
     except RejectedError as error:
         if not thorough:
             return _compare(capture, robot, options, progress, thorough=True)
-        return _Comparison(findings=(*no_reconstruction(error), *proposed(capture, None)))
+        return _Comparison(findings=no_reconstruction(error))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
     hand_eye, assumptions = case.calibration, None
     if hand_eye.converged:
