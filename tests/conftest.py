@@ -155,6 +155,12 @@ def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> P
 
 
 @pytest.fixture(scope="session")
+def half_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
+    """Return the twelve images of the bundled capture, 320 pixels wide; no test changes them."""
+    return made_once(tmp_path_factory, "half", lambda folder: shrunk_capture(tabletop, folder, 12, 320))
+
+
+@pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
     """A browser, started once."""
     opened = Chromium(tmp_path_factory.mktemp("chromium"), "--disable-gpu")

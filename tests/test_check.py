@@ -79,9 +79,9 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
 
 
 @pytest.mark.slow
-def test_each_pose_of_a_usual_capture_is_compared(tabletop: Path):
+def test_each_pose_of_a_usual_capture_is_compared(half_capture: Path):
     """Eight of twelve images were looked at, so that a wrong pose of another one was not noticed."""
-    capture = jcr.read_capture(tabletop)
+    capture = jcr.read_capture(half_capture)
     poses = capture.base_from_gripper.copy()
     poses[4, :3, :3] = poses[4, :3, :3] @ Rotation.from_euler("z", 20, degrees=True).as_matrix()
     found = check_capture(replace(capture, base_from_gripper=poses))
@@ -91,9 +91,9 @@ def test_each_pose_of_a_usual_capture_is_compared(tabletop: Path):
 
 
 @pytest.mark.slow
-def test_a_fixed_camera_is_checked_by_what_moves_with_the_gripper(tabletop: Path):
+def test_a_fixed_camera_is_checked_by_what_moves_with_the_gripper(half_capture: Path):
     """Its images were called all the same, or the check ended in an error. A table in the gripper moves as a whole."""
-    capture = jcr.read_capture(tabletop)
+    capture = jcr.read_capture(half_capture)
     fixed = replace(capture, mount="base", base_from_gripper=inverse(capture.base_from_gripper))
     found, of_wrist = check_capture(fixed), check_capture(capture)
     assert found.verdict == "accepted" and found.hand_eye is not None and of_wrist.hand_eye is not None

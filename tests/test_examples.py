@@ -164,6 +164,7 @@ def test_a_result_places_a_point_compares_exports_and_answers(done: Path, tmp_pa
     assert (out / "export" / "camera_info.yaml").is_file() and "map at the point: occupancy" in text
 
 
+@pytest.mark.long
 def test_the_notebook_runs(done: Path, tmp_path: Path):
     notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text())
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]

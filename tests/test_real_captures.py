@@ -56,10 +56,8 @@ def test_a_plain_background_is_rejected(real_captures: Path):
         reconstruct_colmap(capture)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "least"), [("elephant_floor", 15), pytest.param("ur_black_cloth", 18, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "least"), [("elephant_floor", 15), ("ur_black_cloth", 18)])
 def test_another_pair_is_tried_where_the_first_bends_intrinsics(real_captures: Path, name: str, least: int):
     """Three images of the first register in one model alone, four of the second by the strict thresholds alone."""
     capture = jcr.read_capture(real_captures / name)

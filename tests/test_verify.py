@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 import jcr
-from conftest import shrunk_capture
 from jcr.calibration.drift import Located, Reference, check_series, step_of
 from jcr.calibration.record import write_calibration
 from jcr.calibration.stage import calibrate_reconstruction
@@ -62,9 +61,8 @@ NUDGE = transform(rotation_exp(np.array([0.0, 0.0, 0.02])), np.array([0.02, -0.0
 
 
 @pytest.fixture(scope="module")
-def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    folder = tmp_path_factory.mktemp("small") / "capture"
-    return jcr.read_capture(shrunk_capture(tabletop, folder, 12, 320))
+def capture(half_capture: Path) -> Capture:
+    return jcr.read_capture(half_capture)
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
 """The benches: their pages, the numbers that the README quotes, references of real captures and how these are built."""
 
-import json
 import re
-import subprocess
 from dataclasses import replace
 from importlib import import_module
 from inspect import signature
@@ -10,16 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.__main__ import BENCHES, claims, write_index
 from benchmarks.real import WristCamera, pixels_of
-from benchmarks.real_captures.fetch import Recipe, build, recipes
+from benchmarks.real_captures.fetch import recipes
 from benchmarks.references import Corners, reference
-from capture_writers import rows_as
 from jcr.camera import parameters
-from jcr.capture.read import read_capture
-from jcr.errors import InputError
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
 from places import ROOT
@@ -93,51 +87,6 @@ def test_references_state_their_own_error():
         assert found.noise[0] == pytest.approx(4e-4, rel=0.5) and found.rms_px < 2 * NOISE_PX
     # The mean square of 30 parameters is 1 ± 0.26.
     assert 0.22 < np.mean(squared) < 1.78
-
-
-@pytest.mark.slow
-def test_a_capture_is_built_from_a_commit_and_wrong_content_is_refused(tmp_path: Path):
-    folder, poses = tmp_path / "repository", hand_eye_problem(np.random.default_rng(0), 11).base_from_gripper
-    (folder / "data").mkdir(parents=True)
-    for k in range(11):
-        grey = np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8)
-        Image.fromarray(grey).save(folder / "data" / f"view_{k}.png")
-    rows = rows_as("rotvec", poses)
-    (folder / "data" / "poses.txt").write_text("\n".join(", ".join(map(repr, row)) for row in rows.tolist()))
-
-    def git(*words: str) -> str:
-        identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
-        done = subprocess.run(["git", "-C", str(folder), *identity, *words], check=True, capture_output=True)
-        return done.stdout.decode().strip()
-
-    git("init", "--quiet")
-    git("add", ".")
-    git("commit", "--quiet", "-m", "data")
-    recipe = Recipe(
-        repository=str(folder),
-        commit=git("rev-parse", "HEAD"),
-        licence="MIT",
-        images="data/view_*.png",
-        poses="data/poses.txt",
-        convention="rotvec",
-        use_images="1:",
-        use_poses=[1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
-        intrinsics=[60.0, 61.0, 31.5, 23.5],
-    )
-    capture = read_capture(build(recipe, tmp_path / "capture"))
-    # Names are in the order of their numbers, not of their letters.
-    assert capture.images[1] == "images/view_2.png" and capture.images[-1] == "images/view_10.png"
-    np.testing.assert_allclose(capture.base_from_gripper, poses[1:], atol=1e-12)
-    assert capture.intrinsics is not None and capture.intrinsics.fy == 61.0
-    assert (
-        json.loads((tmp_path / "capture" / "capture.json").read_text())["source"]["commit"] == recipe.commit
-    )
-    # A clone that is there already is used as it is; other content than the recipe's is refused.
-    with pytest.raises(InputError, match="not that of the recipe"):
-        build(replace(recipe, repository="nowhere", sha256="0"), tmp_path / "other", str(folder))
-    with pytest.raises(InputError, match="11 images and 10 poses"):
-        build(replace(recipe, use_images=":"), tmp_path / "other")
-    assert not (tmp_path / "other").exists()
 
 
 def test_every_recipe_names_a_commit_a_licence_and_what_it_makes():

@@ -126,15 +126,6 @@ def said(hand_eye: Calibration) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("images", "motion"),
-    [(3, {}), (5, {"pattern": "translation", "deviation": np.radians(6.0)})],
-)
-def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
-    assert said(calibrated(0, images, INTRINSICS, **motion)[1]) == ""
-
-
-@pytest.mark.slow
 def test_a_wrong_focal_length_is_named_with_the_right_one() -> None:
     factor = 1.05
     problem, hand_eye = calibrated(0, 10, scaled(factor))

@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -212,27 +212,9 @@ def write_foxglove_json(file: Path, capture: Capture, video: str | None = None) 
         writer.finish()
 
 
-def write_foxglove_protobuf(file: Path, capture: Capture) -> None:
-    foxglove: Any = pytest.importorskip("foxglove", reason="foxglove-sdk is for this test alone")
-    from foxglove import channels, messages  # pyright: ignore[reportMissingImports]
-
-    with foxglove.open_mcap(str(file)):
-        made = dict[str, Any]()
-        for topic, schema, at, content in foxglove_stream(capture):
-            made[topic] = made.get(topic) or getattr(channels, f"{schema}Channel")(topic)
-            kinds = {"translation": messages.Vector3, "rotation": messages.Quaternion}
-            message = {name: kinds[name](**dict(zip("xyzw", value, strict=False))) if name in kinds else value
-                       for name, value in content.items()}  # fmt: skip
-            message["timestamp"] = messages.Timestamp(at // 10**9, at % 10**9)
-            made[topic].log(getattr(messages, schema)(**message), log_time=at)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("write", [write_foxglove_json, write_foxglove_protobuf])
-def test_messages_of_foxglove_are_read(
-    write: Callable[[Path, Capture], None], tmp_path: Path, capture: Capture
-):
-    write(tmp_path / "scan.mcap", capture)
+def test_messages_of_foxglove_are_read(tmp_path: Path, capture: Capture):
+    write_foxglove_json(tmp_path / "scan.mcap", capture)
     options = {"frames": 12, "base_frame": "base", "gripper_frame": "tool0"}
     got = jcr.read_capture(tmp_path / "scan.mcap", options, into=tmp_path / "frames")
     np.testing.assert_allclose(got.base_from_gripper, capture.base_from_gripper, atol=1e-9)
@@ -255,10 +237,6 @@ def test_a_video_topic_is_named_with_the_command_that_converts_it(tmp_path: Path
         jcr.InputError, match="/wrist is a video; .*in_transport:=foxglove .*in/foxglove:=/wrist"
     ):
         jcr.read_capture(tmp_path / "scan.mcap", into=tmp_path / "frames")
-    cut = (tmp_path / "scan.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(cut[: len(cut) // 2])
-    with pytest.raises(jcr.InputError, match="not a readable bag"):
-        jcr.read_capture(tmp_path / "cut.mcap", into=tmp_path / "frames")
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,9 @@ FILES = {
     "realsense.json": '{"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "ppx": 320.0, "ppy": 240.0, '
     '"model": "brown_conrady", "coeffs": [0.1, -0.2, 0.001, 0.002, 0]}',
     "cameras.txt": "# Camera list\n1 OPENCV 640 480 500 501 320.5 240.5 0.1 -0.2 0.001 0.002\n",
+    "opencv.yml": "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: "
+    "[500., 0., 320., 0., 501., 240., 0., 0., 1.]\ndistortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n"
+    "  dt: d\n  data: [0.1, -0.2, 0.001, 0.002, 0.]\nimage_width: 640\nimage_height: 480\n",
     "matrix.txt": MATRIX,
 }
 

@@ -13,18 +13,16 @@ from PIL import Image
 import jcr
 from capture_writers import rows_as, write_easy_handeye2, write_moveit
 from in_process import run_jcr
-from jcr.calibration.checks.convention import better_reading
 from jcr.capture.discovery import find_images
 from jcr.capture.documents import Table
 from jcr.capture.notations import numbers_of
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import readings_of
 from jcr.estimation.pose_misfit import Misfit, pose_misfit
-from jcr.findings import sentence
 from jcr.geometry import inverse, transform
 from jcr.pipeline.decision import decide
 from jcr.records import Capture
-from places import ROOT, SHARED
+from places import ROOT
 from scenes import capture_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
@@ -302,63 +300,6 @@ def test_four_images_decide_nothing():
     assert_refused(undecided(problem.base_from_gripper, "euler:ZYX"), "say which", problem)
 
 
-Case = tuple[str, tuple[str, ...], int, str]
-CASES: tuple[Case, ...] = (
-    *(("controller_notation", (".", "--poses", f"{name}.txt", *(("--pose-convention", way) if way else ())), 0, words)
-      for name, way, words in (("list", "ur", "rotation vector in radians; by option"), ("kuka", "kuka", "angles ZYX"),
-                               ("abb", "abb", "quaternion w, x, y, z"), ("fanuc", "fanuc", "angles xyz in degrees"),
-                               ("blocks", "matrix", "rotation matrix; by option"), ("fanuc", "", "by names and"),
-                               ("list", "", "NOT DECIDED"), ("kuka", "", "NOT DECIDED"), ("abb", "", "NOT DECIDED"))),
-    ("far_base_frame", (".",), 2, "the base frame is far away: subtract one offset"),
-    ("far_base_frame", (".", "--pose-units", "cm-rad"), 2, "the base frame is far away"),
-    ("far_base_frame", (".", "--pose-units", "mm-rad"), 2, "the base frame is far away"),
-    ("image_column_other_name", (".",), 0, "paired with the images by the column img"),
-    ("lerobot_names_ignored", (".", "--pose-convention", "rpy"), 0, "up to 920 mm and 117°"),
-    ("lerobot_names_ignored", (".",), 0, "up to 920 mm and 117°"),
-    ("lerobot_video_path_null", (".",), 0, "up to 920 mm and 117°"),
-    ("opencv_yaml", (".",), 0, "intrinsics given"),
-    ("opencv_yaml", (".", "--poses", "named.csv", "--camera-info", "intrinsics.yml"), 0, "intrinsics given"),
-    ("pose_file_per_image", (".",), 0, "paired with the images by the names of rows"),
-    ("pose_file_per_image", (".", "--poses", "poses"), 0, "2 readings of poses are possible"),
-    ("stamps_not_matched", (".",), 0, "paired with the images by time stamps"),
-)  # fmt: skip
-STOPS: Case = (
-    "bag_images_only_at_stops",
-    ("bag", "--base-frame", "base_link", "--gripper-frame", "tool0"),
-    0,
-    "up to",
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "words", "status", "said"),
-    [*CASES, STOPS],
-    ids=lambda one: str(one)[:40],
-)
-def test_small_inputs_of_others_have_the_right_outcome(
-    case: str, words: tuple[str, ...], status: int, said: str
-):
-    folder = SHARED / "inputs" / "cases" / case
-    if not folder.is_dir():
-        pytest.skip(f"the inputs of others are not at {folder}")
-    done = run_jcr("check", "--poses-only", *words, cwd=folder)
-    text = " ".join((done.stdout + done.stderr).split())
-    assert done.returncode == status and said in text, text
-    assert ("good to calibrate" in text) == (status == 0 and "NOT DECIDED" not in text)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", [(), ("--pose-inverted",)])
-def test_an_inverted_marker_is_never_accepted(way: tuple[str, ...], tmp_path: Path):
-    file = SHARED / "inputs" / "cases" / "samples_marker_pose_inverted" / "marker_from_camera.samples"
-    if not file.is_file():
-        pytest.skip(f"the inputs of others are not at {file}")
-    done = run_jcr("calibrate", shutil.copy(file, tmp_path), tmp_path / "out", *way)
-    assert done.returncode == 3 and "either the gripper poses or the marker poses are inverted" in done.stdout
-    assert "0.452 m" in done.stdout and "0.0793 m" in done.stdout
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("inverted", "write", "way"),
@@ -371,35 +312,6 @@ def test_pairs_with_an_inverse_are_never_accepted(
     pairs = (inverse(gripper), marker) if inverted == "gripper" else (gripper, inverse(marker))
     done = run_jcr("calibrate", write(tmp_path / "in", *pairs), tmp_path / "out", *way)
     assert done.returncode == 3 and "either the gripper poses or the marker poses are inverted" in done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "convention", "option"),
-    [
-        ("zyz", "auto", "euler:ZYZ"),
-        ("euler_as_vector", "xarm-axis-angle", "euler:xyz"),
-        ("vector_as_euler", "yaskawa", "rotvec"),
-    ],
-)
-def test_the_convention_that_fits_is_found(case: str, convention: str, option: str, tmp_path: Path):
-    """Read as jcr check does, with the true cameras of the bundled images in place of a reconstruction."""
-    folder = SHARED / "inputs" / "cases" / "convention_not_found" / case
-    if not folder.is_dir():
-        pytest.skip(f"the inputs of others are not at {folder}")
-    shutil.copytree(folder, tmp_path / "a")
-    shutil.copytree(ROOT / "examples/tabletop/images", tmp_path / "a/images", dirs_exist_ok=True)
-    capture = jcr.read_capture(tmp_path / "a", {"pose_convention": convention})
-    true = jcr.read_capture(ROOT / "examples/tabletop").base_from_gripper
-    x = np.array(json.loads((ROOT / "examples/tabletop/reference.json").read_text())["gripper_from_camera"])
-    if convention == "auto":
-        reading = decide(capture, true @ x, np.arange(12)).reading
-        assert reading is not None and reading.notation == option
-    else:
-        (found,) = better_reading(
-            capture.base_from_gripper, true @ x, True, capture.images, np.arange(12), capture.untaken
-        )
-        assert f"give --pose-convention {option}" in sentence(found)
 
 
 @pytest.mark.slow

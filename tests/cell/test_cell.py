@@ -152,12 +152,18 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
 
 
 @pytest.fixture(scope="module")
-def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, Calibration]:
+def whole(half_capture: Path) -> Capture:
+    return jcr.read_capture(half_capture)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tabletop: Path, whole: Capture) -> tuple[Capture, Reconstruction, Calibration]:
     """The first images of the bundled capture, as a structure from motion without error would give them."""
-    capture, x = jcr.read_capture(tabletop), read_truth(tabletop).gripper_from_camera
+    capture, x = whole, read_truth(tabletop).gripper_from_camera
+    assert capture.intrinsics is not None
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
     poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
-    reconstruction = reconstruction_of(poses, intrinsics=read_truth(tabletop).intrinsics)
+    reconstruction = reconstruction_of(poses, intrinsics=capture.intrinsics)
     old = capture.of_rows(range(OLD))
     return old, reconstruction, calibrate_reconstruction(old, reconstruction)
 
@@ -178,10 +184,12 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
-def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool, tmp_path: Path):
+def test_an_image_of_the_scene_places_a_fixed_camera(
+    tabletop: Path, whole: Capture, calibrated, known: bool, tmp_path: Path
+):
     truth, own = read_truth(tabletop), calibrated[0].camera_name
-    added = added_camera("camera", [tabletop / truth.images[10]], None, (own,), tmp_path)
-    (camera,) = placed(calibrated, replace(added, intrinsics=truth.intrinsics if known else None)).cameras
+    added = added_camera("camera", [whole.folder / whole.images[10]], None, (own,), tmp_path)
+    (camera,) = placed(calibrated, replace(added, intrinsics=whole.intrinsics if known else None)).cameras
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
     error = step_between(camera.parent_from_camera, truth.base_from_camera[10])
     assert np.linalg.norm(error[:3]) < (0.004 if known else 0.01)
@@ -190,23 +198,21 @@ def test_an_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", [{"fx": 1.009, "fy": 1.009}, {"fx": 1.03, "fy": 1.03}])
+@pytest.mark.parametrize("factor", [1.009, 1.06])
 def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_used(
-    tabletop: Path, calibrated, wrong: dict[str, float]
+    tabletop: Path, calibrated, factor: float
 ):
-    """Used, 3 % too long are 10 mm off, 4.3 sigma; a centre 40 px off 2°, 6.8 sigma; another camera's do not fit."""
-    truth = read_truth(tabletop)
-    true = truth.intrinsics
-    given = replace(true, **{name: factor * getattr(true, name) for name, factor in wrong.items()})
+    """Used, 6 % too long would be 20 mm off."""
+    truth, true = read_truth(tabletop), calibrated[0].intrinsics
+    given = replace(true, fx=factor * true.fx, fy=factor * true.fy)
     overhead = replace(fixed(calibrated[0], truth.images[11]), intrinsics=given)
     (camera,) = placed(calibrated, overhead).cameras
-    is_far_off = wrong.get("fx") != 1.009
-    assert [one.kind for one in camera.findings] == [FindingKind.INTRINSICS] * is_far_off
+    assert [one.kind for one in camera.findings] == [FindingKind.INTRINSICS] * (factor > 1.05)
     assert camera.converged
     assert camera.parent_from_camera is not None and camera.covariance is not None
     error = step_between(camera.parent_from_camera, truth.base_from_camera[11])
     assert np.abs(error / np.sqrt(np.diag(camera.covariance))).max() < 3
-    assert np.linalg.norm(error[:3]) < 0.004
+    assert np.linalg.norm(error[:3]) < 0.008
     assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.01)
 
 
@@ -235,8 +241,8 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
 
 
 @pytest.mark.slow
-def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(tabletop: Path, calibrated):
-    capture = jcr.read_capture(tabletop)
+def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(whole: Capture, calibrated):
+    capture = whole
     base_from_other = transform(rotation_exp(np.array([0.1, -0.2, 2.8])), np.array([0.9, 0.3, 0.1]))
     rows = [2, 5, *range(OLD, len(capture))]
     camera = CellCamera(

@@ -1,7 +1,6 @@
 """The command line on the bundled capture and on faults: results, exit statuses, printed words."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -79,12 +78,6 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
     assert printed.err.startswith("warning: the calibration is rejected") and printed.err.count("\n") == 1
 
 
-def test_errors_are_named_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert dispatch(["measure", str(tmp_path), "--quiet", "--json"]) == 2
-    printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith("error: ") and printed.err.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -156,27 +149,6 @@ def test_a_rejected_result_exits_with_three_and_the_last_line_is_a_command_that_
     assert printed[-1] == f"Next        {last}" and len(printed) <= 14
     if found is not None:
         assert printed[0].startswith("ACCEPTED" if found.converged else "REJECTED")
-
-
-def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
-    names = {path.name for path in done.iterdir()}
-    assert {
-        "calibration.json",
-        "reconstruction.npz",
-        "depth.npz",
-        "cloud.ply",
-        "map.safetensors",
-        "report.html",
-        "log.txt",
-    } <= names
-    assert not [name for name in names if ".part" in name]
-    content = json.loads((done / "calibration.json").read_text())
-    assert content["format"] == "jcr.calibration/2"
-    assert content["converged"] is True
-    assert np.shape(content["uncertainty"]["covariance"]) == (7, 7)
-    assert len(content["images"]) == 12
-    # The requirement is met, and nobody asked for poses.
-    assert content["requirement"]["more_images"] == 0
 
 
 def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture: Path, small_done: Path, tmp_path: Path):
@@ -260,15 +232,6 @@ def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list
     assert words in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_wrong_arguments_are_named_in_full_on_an_ascii_terminal_too(tmp_path: Path):
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    command = [sys.executable, "-m", "jcr", "run", "a", "b", "--backend", "magic"]
-    finished = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert finished.returncode == 2 and finished.stdout == ""
-    assert "magic" in finished.stderr and "--backend" in finished.stderr and finished.stderr.count("\n") == 1
 
 
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):

@@ -58,17 +58,16 @@ def test_the_order_of_images_does_not_matter_to_the_last_bit():
 
 
 @pytest.mark.parametrize(
-    ("count", "wrong"),
+    ("count", "wrong", "kind"),
     [
-        (10, 3),
-        pytest.param(20, 6, marks=pytest.mark.slow),
+        *((10, 3, kind) for kind in ("shuffled", "stale", "mirrored")),
+        pytest.param(20, 6, "stale", marks=pytest.mark.slow),
         # More poses than robot_noise.MOST_FOR_SIZES: images only join those that agree.
-        pytest.param(60, 15, marks=pytest.mark.slow),
+        pytest.param(60, 15, "shuffled", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
 def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
-    for seed in range(2):
+    for seed in range(2 if count < 60 else 1):
         rng = np.random.default_rng([seed, count])
         problem = hand_eye_problem(rng, count, robot_noise=NOISE)
         clean = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
@@ -97,7 +96,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
     inside, larger = np.zeros(2), []
-    runs = 60
+    runs = 60 if given else 40
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
         solved = solve_hand_eye(
@@ -127,7 +126,7 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
 
 @pytest.mark.slow
 def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
-    given, inside, runs = (1e-4, np.radians(0.02)), 0, 30
+    given, inside, runs = (1e-4, np.radians(0.02)), 0, 20
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([8, seed]), 6, "varied", given, NOISE)
         solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
@@ -136,8 +135,8 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         # Whether at random or alike, six images hardly tell.
         assert min(np.divide(solved.robot_noise.together, given)) > 1.5
         assert any("more than the given robot noise" in warning for warning in solved.warnings)
-    # Binomial: 28.5 ± 1.2; none where the given noise is believed.
-    assert inside >= 25
+    # Binomial: 19 ± 1; none where the given noise is believed.
+    assert inside >= 16
 
 
 def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
@@ -216,7 +215,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
 
 @pytest.mark.slow
 def test_general_motion_is_never_called_degenerate():
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
         solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
@@ -244,7 +243,7 @@ def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
 def test_a_known_height_is_part_of_the_stated_uncertainty(is_metric: bool):
     """Heights that were given to 1 mm were stated to ±47 mm and more: none of these draws was accepted."""
     noise = {"robot_noise": (1e-4, np.radians(0.02)), "camera_noise": (2e-4, np.radians(0.03))}
-    for seed in range(8):
+    for seed in range(4):
         problem = hand_eye_problem(np.random.default_rng(seed), 12, "planar", **noise)
         up = problem.true_base_from_gripper[0, 2, :3]
         height = CalibrateOptions(known_height=1e3 * float(up @ problem.gripper_from_camera[:3, 3]))
@@ -259,7 +258,7 @@ def test_a_known_height_is_part_of_the_stated_uncertainty(is_metric: bool):
 
 def test_a_flange_that_turns_about_one_axis_gives_the_rotation_that_its_positions_show():
     """Of 30 such arms 9 were told that their poses contradict the images, and rotations were up to 27° off."""
-    for seed in range(30):
+    for seed in range(10):
         rng, x = np.random.default_rng(seed), random_hand_eye(np.random.default_rng(seed))
         yaw = transform(
             rotation_exp(rng.uniform(-2.8, 2.8, (12, 1)) * np.array([0.0, 0.0, 1.0])), np.zeros(3)
@@ -294,7 +293,7 @@ GROWTH = (3e-3, 3e-3)
 """m, rad per image."""
 
 
-def drifting(seed: int, count: int = 40) -> tuple[HandEyeProblem, np.ndarray]:
+def drifting(seed: int, count: int = 30) -> tuple[HandEyeProblem, np.ndarray]:
     """Camera poses whose motions from one to the next have errors, as visual odometry has them."""
     rng = np.random.default_rng([seed, 8])
     problem = hand_eye_problem(rng, count, robot_noise=(2e-4, 5e-4))
@@ -324,7 +323,7 @@ def test_growing_errors_are_weighed_and_in_the_uncertainty():
 def test_errors_of_camera_positions_do_not_bias_the_scale():
     """A fit that leaves the camera poses as given finds scales that are 6 % too small here, in the mean."""
     off, noise = list[float](), np.array([0.01] * 3 + [1e-4] * 3)
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng([seed, 10])
         problem = hand_eye_problem(rng, 30, robot_noise=(2e-4, 5e-4))
         camera = problem.recon_from_camera.copy()
@@ -336,7 +335,7 @@ def test_errors_of_camera_positions_do_not_bias_the_scale():
     assert abs(np.mean(off)) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rotations_about_the_board_and_errors_of_depth_are_weighed_and_in_the_uncertainty():
     squared, metres = list[float](), dict[bool, list[float]]()
     for seed in range(6):

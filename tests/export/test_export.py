@@ -321,24 +321,6 @@ def test_depth_images_lie_on_the_scene(
     assert color.shape == (*depth.shape, 3)
 
 
-def test_open3d_fuses_the_depth_images(done: Path, tabletop: Path, tmp_path: Path):
-    o3d: Any = pytest.importorskip("open3d", reason="a wheel of 400 MB, tested where it is installed")
-    folder = export(done, "depth", tmp_path / "depth")
-    content = json.loads((folder / "cameras.json").read_text())
-    kinds, device = 3 * (o3d.core.float32,), o3d.core.Device("CPU:0")
-    names = ("tsdf", "weight", "color")
-    grid = o3d.t.geometry.VoxelBlockGrid(names, kinds, ((1), (1), (3)), 0.005, 16, 20_000, device)
-    matrix, scale = o3d.core.Tensor(np.array(content["K"])), content["depth_scale"]
-    for frame in content["frames"]:
-        depth, color = (o3d.t.io.read_image(str(folder / frame[kind])) for kind in ("depth", "color"))
-        camera_from_base = o3d.core.Tensor(np.linalg.inv(frame["base_from_camera"]))
-        blocks = grid.compute_unique_block_coordinates(depth, matrix, camera_from_base, scale, 3.0)
-        grid.integrate(blocks, depth, color, matrix, matrix, camera_from_base, scale, 3.0)
-    z = np.asarray(grid.extract_triangle_mesh().to_legacy().vertices)[:, 2]
-    height = read_truth(tabletop).table_height
-    assert np.median(z[np.abs(z - height) < 0.01]) == pytest.approx(height, abs=1e-3)
-
-
 def test_the_cameras_of_a_data_set_are_a_table_by_episode(done: Path, tmp_path: Path):
     parquet: Any = pytest.importorskip("pyarrow.parquet")
     (tmp_path / "set/meta").mkdir(parents=True)

@@ -52,16 +52,16 @@ HUGE = (31_000, 31_000)
 """Size of an image of 961 million pixels; as grey PNG of zeros it has 0.9 MB."""
 
 
-def png_of_zeros(width: int, height: int, bits: int, colours: int = 0) -> bytes:
-    """Return a PNG that is whole, whose zeros pack 1000 to 1; `colours` is PNG's type, 0 for grey and 2 for RGB."""
+def png_of_zeros(width: int, height: int, bits: int) -> bytes:
+    """Return a grey PNG that is whole, whose zeros pack 1000 to 1."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    line = b"\0" * (1 + width * bits // 8 * (3 if colours == 2 else 1))
+    line = b"\0" * (1 + width * bits // 8)
     packer = zlib.compressobj(9)
     packed = b"".join(packer.compress(line) for _ in range(height)) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, bits, colours, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
 
 
@@ -92,7 +92,15 @@ def test_no_name_in_a_file_is_written_outside_of_the_run_folder(
     (tmp_path / "results/deep").mkdir(parents=True)
     before = state(tmp_path)
     # The images are found by their last names inside the capture, and noise is rejected.
-    assert dispatch(["calibrate", str(capture), str(tmp_path / "results/deep/out"), "--quiet"]) == 3
+    command = [
+        "calibrate",
+        str(capture),
+        str(tmp_path / "results/deep/out"),
+        "--backend",
+        "colmap",
+        "--quiet",
+    ]
+    assert dispatch(command) == 3
     capsys.readouterr()
     made = tmp_path / "results/deep/out"
     assert {
@@ -109,14 +117,6 @@ def test_a_link_of_the_user_to_the_folder_of_the_images_is_followed(tmp_path: Pa
     assert len(read) == 5 and not read.notes
     (tmp_path / "link").symlink_to(capture)
     assert len(jcr.read_capture(tmp_path / "link")) == 5
-
-
-def test_other_links_must_not_lead_out(tmp_path: Path):
-    capture = noise_capture(tmp_path / "capture", SIZE, 5, "views/").folder
-    (capture / "views").rename(tmp_path / "private")
-    (capture / "views").symlink_to(tmp_path / "private")
-    with pytest.raises(InputError, match="leads out of"):
-        jcr.read_capture(capture)
 
 
 def test_a_link_to_poses_elsewhere_is_refused_and_no_linked_folder_is_searched(tmp_path: Path):
@@ -172,18 +172,16 @@ def test_a_run_folder_with_links_is_not_written_through(tmp_path: Path, capsys: 
         (out / name).symlink_to(target)
         assert dispatch(["calibrate", str(capture), str(out), "--quiet"]) == 2
         assert capsys.readouterr().err.startswith("error: ")
-    assert [path.name for path in (tmp_path / "victim").iterdir()] == [".lock"]
-    assert (tmp_path / "victim/.lock").read_text() == "precious"
+    assert state(tmp_path / "victim") == {str(tmp_path / "victim/.lock"): b"precious"}
+    (tmp_path / "pipe").mkdir()
+    os.mkfifo(tmp_path / "pipe/.lock")
+    assert dispatch(["calibrate", str(capture), str(tmp_path / "pipe"), "--quiet"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["0²0", "½", "٣", "௧", "a" * 60 + "⑦"])
-def test_digits_of_other_scripts_are_names(tmp_path: Path, name: str):
+def test_digits_of_other_scripts_are_names(name: str):
     assert natural(f"{name}.png")
-    capture = noise_capture(tmp_path / "capture", SIZE, 5, "").folder
-    (capture / "capture.json").unlink()
-    (capture / "0.png").rename(capture / f"{name}.png")
-    with pytest.raises(InputError, match="no gripper poses for its 5 images"):
-        jcr.read_capture(capture)
 
 
 def test_devices_and_ports_are_decimal_numbers():
@@ -221,59 +219,41 @@ def test_messages_quote_80_characters_without_building_the_rest():
 MEASURED = """
 import resource, sys
 from pathlib import Path
+from types import SimpleNamespace
+sys.path[:0] = {paths}
 import jcr
-{imports}
+from jcr.capture.images import read_depth_images, read_image
+from jcr.capture.ros import image_of, read_ros_image
+from test_strangers import labelled
+folder = Path({folder!r})
+image = SimpleNamespace(format="png", data=(folder / "image.png").read_bytes())
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 before = peak()
-try:
-    {call}
-    print("read", end=" ")
-except jcr.InputError as error:
-    print("refused", end=" ")
+for read in (
+    lambda: read_depth_images(folder / "depth.png", (20000, 20000)), lambda: labelled(folder),
+    lambda: read_ros_image(image), lambda: read_image(image_of(image, "x")[0], "x"),
+):
+    try:
+        read()
+        print("read", end=" ")
+    except jcr.InputError as error:
+        print("refused", end=" ")
 print(round(peak() - before))
 """
-
-
-def peak_mb(imports: str, call: str) -> tuple[str, int]:
-    """Return whether a process read or refused, and how much its peak memory grew (MB)."""
-    program = MEASURED.format(imports=imports, call=call)
-    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    ended, grown = finished.stdout.split()
-    return ended, int(grown)
+"""Reads a depth, a label and two images, and prints how each ended and by how much the peak memory grew (MB)."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["depth", "label", "image in a bag", "image in bytes"])
-def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path, kind: str):
-    """Less than a megabyte as a file, 1.0 to 2.9 GB unpacked."""
-    file = tmp_path / "large.png"
-    if kind == "depth":
-        file.write_bytes(png_of_zeros(20_000, 20_000, 16))
-        call = (
-            "from jcr.capture.images import read_depth_images",
-            f"read_depth_images(Path({str(file)!r}), (20000, 20000))",
-        )
-    elif kind == "label":
-        capture = noise_capture(tmp_path, SIZE, 3)
-        (tmp_path / "labels").mkdir()
-        for k in range(3):
-            (tmp_path / f"labels/{k}.png").write_bytes(png_of_zeros(20_000, 20_000, 16))
-        paths = [*sys.path, str(Path(__file__).parent)]
-        imports = f"import sys; sys.path[:0] = {paths}\nfrom test_strangers import labelled"
-        call = imports, f"labelled(Path({str(capture.folder)!r}))"
-    else:
-        file.write_bytes(png_of_zeros(*HUGE, 8))
-        message = f"SimpleNamespace(format='png', data=Path({str(file)!r}).read_bytes())"
-        imports = "from types import SimpleNamespace\nfrom jcr.capture.ros import read_ros_image, image_of\n"
-        imports += "from jcr.capture.recording import sharpness"
-        call = imports, f"read_ros_image({message})"
-        if kind == "image in bytes":
-            call = (
-                imports + "\nfrom jcr.capture.images import read_image",
-                f"read_image(image_of({message}, 'x')[0], 'x')",
-            )
-    ended, grown = peak_mb(*call)
-    assert ended == "refused" and grown < 150
+def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path):
+    """Less than a megabyte each as a file, 1.0 to 2.9 GB unpacked."""
+    noise_capture(tmp_path, SIZE, 3, "labels/")
+    for name in ("depth", *(f"labels/{k}" for k in range(3))):
+        (tmp_path / f"{name}.png").write_bytes(png_of_zeros(20_000, 20_000, 16))
+    (tmp_path / "image.png").write_bytes(png_of_zeros(*HUGE, 8))
+    program = MEASURED.format(paths=[*sys.path, str(Path(__file__).parent)], folder=str(tmp_path))
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    *ended, grown = done.stdout.split()
+    assert ended == 4 * ["refused"] and int(grown) < 150
 
 
 def labelled(folder: Path) -> object:
@@ -297,26 +277,11 @@ def test_a_file_that_starts_a_program_is_no_image(tmp_path: Path):
 
 def tiff_of_tiles(image: tuple[int, int], tile: tuple[int, int], data: bytes) -> bytes:
     """Return a grey TIFF whose tiles, of any size, are packed by Deflate."""
-    tags = (
-        (256, image[0]),
-        (257, image[1]),
-        (258, 8),
-        (259, 8),
-        (262, 1),
-        (277, 1),
-        (322, tile[0]),
-        (323, tile[1]),
-    )
-    entries = [*tags, (324, 8), (325, len(data))]
+    shape = (256, image[0]), (257, image[1]), (258, 8), (259, 8), (262, 1), (277, 1)
+    entries = [*shape, (322, tile[0]), (323, tile[1]), (324, 8), (325, len(data))]
     listed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
-    return (
-        b"II*\0"
-        + struct.pack("<I", 8 + len(data))
-        + data
-        + struct.pack("<H", len(entries))
-        + listed
-        + bytes(4)
-    )
+    start = b"II*\0" + struct.pack("<I", 8 + len(data)) + data
+    return start + struct.pack("<H", len(entries)) + listed + bytes(4)
 
 
 def test_a_small_image_in_a_large_tile_is_refused(tmp_path: Path):
@@ -326,23 +291,6 @@ def test_a_small_image_in_a_large_tile_is_refused(tmp_path: Path):
     file.write_bytes(tiff_of_tiles(SIZE, HUGE, zlib.compress(bytes(1000))))
     with pytest.raises(InputError, match="over 64 million pixels"):
         read_image(file)
-
-
-def test_images_in_a_file_are_not_counted(tmp_path: Path):
-    Image.new("L", SIZE).save(file := tmp_path / "a.tif")
-    data = bytearray(file.read_bytes()) + bytes(file.stat().st_size % 2)
-    (begin,) = struct.unpack_from("<I", data, 4)
-    end = begin + 2 + 12 * struct.unpack_from("<H", data, begin)[0]
-    entry = bytes(data[begin:end])
-    struct.pack_into("<I", data, end, len(data))
-    places = len(data) + (len(entry) + 4) * np.arange(1, 30_001)
-    file.write_bytes(
-        bytes(data) + b"".join(entry + struct.pack("<I", at) for at in (*places[:-1].tolist(), 0))
-    )
-    started = time.process_time()
-    with pytest.raises(InputError, match="several images"):
-        read_image(file)
-    assert time.process_time() - started < 2
 
 
 def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
@@ -356,14 +304,6 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
     file.write_bytes(data[:-2] + 200 * last[:500] + b"\xff\xd9")
     with pytest.raises(InputError, match="a JPEG of 2[01][0-9] scans"):
         read_image(file)
-
-
-def test_a_lock_that_is_a_pipe_blocks_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    capture = table_capture(tmp_path / "cap", str)
-    (tmp_path / "out").mkdir()
-    os.mkfifo(tmp_path / "out/.lock")
-    assert dispatch(["calibrate", str(capture), str(tmp_path / "out"), "--quiet"]) == 2
-    assert "cannot be written" in capsys.readouterr().err
 
 
 def ros_image(height: int, width: int, encoding: str, data: bytes | None = None, /, **facts: Any) -> Any:
@@ -512,52 +452,27 @@ def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
 
 
 @pytest.mark.parametrize(
-    ("images", "names", "expected"),
+    ("images", "names", "words"),
     [
-        (
-            ("left/1.png", "left/2.png", "left/3.png", "right/1.png"),
-            ("1.png", "2.png", "3.png"),
-            "1.png could be",
-        ),
-        (("1.png", "2.png", "3.png"), ("a/1.png", "b/1.png", "2.png", "3.png"), "could both be 1.png"),
-        (
-            ("left/1.png", "left/2.png", "left/3.png", "right/1.png"),
-            ("left/1.png", "left/2.png", "left/3.png"),
-            None,
-        ),
+        ("left/1.png left/2.png left/3.png right/1.png", "1.png 2.png 3.png", "1.png could be"),
+        ("1.png 2.png 3.png", "a/1.png b/1.png 2.png 3.png", "could both be 1.png"),
     ],
 )
-def test_an_image_of_a_model_is_one_of_the_capture(
-    tmp_path: Path, images: tuple[str, ...], names: tuple[str, ...], expected: str | None
-):
+def test_an_image_of_a_model_is_one_of_the_capture(tmp_path: Path, images: str, names: str, words: str):
     import pycolmap
 
     from jcr.sfm.model import colmap_camera
 
-    model = pycolmap.Reconstruction()
-    camera = colmap_camera(CAMERA, known=True)
+    model, camera = pycolmap.Reconstruction(), colmap_camera(CAMERA, known=True)
     camera.camera_id = 1
     model.add_camera_with_trivial_rig(camera)
-    points = np.random.default_rng(0).uniform([-0.2, -0.2, 1], [0.2, 0.2, 1.5], (60, 3))
-    for k, name in enumerate(names):
-        at = [0.1 * k, 0.0, 0.0]
-        seen = points - at
-        x_px = [90, 90] * seen[:, :2] / seen[:, 2:] + [48, 36]
-        image = pycolmap.Image(name=name, keypoints=x_px, camera_id=1, image_id=k + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.c_[np.eye(3), np.negative(at)]))
-    for j, point in enumerate(points):
-        track = pycolmap.Track()
-        for k in range(len(names)):
-            track.add_element(k + 1, j)
-        model.add_point3D(point, track)
-    (tmp_path / "model").mkdir()
-    model.write_binary(str(tmp_path / "model"))
-    capture = capture_of(np.stack([np.eye(4)] * len(images)), folder=tmp_path, images=images, image_size=SIZE)
-    if expected is not None:
-        with pytest.raises(InputError, match=expected):
-            reconstruct_given(capture, tmp_path / "model")
-    else:
-        assert reconstruct_given(capture, tmp_path / "model").image_index.tolist() == [0, 1, 2]
+    for k, name in enumerate(names.split(), start=1):
+        pose = pycolmap.Rigid3d(np.c_[np.eye(3), [0.1 * k, 0.0, 0.0]])
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
+    model.write_binary(str(tmp_path))
+    poses, own = np.stack([np.eye(4)] * len(images.split())), tuple(images.split())
+    with pytest.raises(InputError, match=words):
+        reconstruct_given(capture_of(poses, folder=tmp_path, images=own, image_size=SIZE), tmp_path)
 
 
 # Dense depth
@@ -651,15 +566,16 @@ MAP_CHANGES: dict[str, Callable[[dict[str, Any], dict[str, Any]], object]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", MAP_CHANGES)
-@pytest.mark.parametrize("seals", [False, True])
-def test_a_map_that_was_changed_answers_nothing(tmp_path: Path, map_file: Path, what: str, seals: bool):
+def test_a_map_that_was_changed_answers_nothing(tmp_path: Path, map_file: Path):
     file = tmp_path / "map.safetensors"
-    changed_map(map_file, file, lambda *_: None, seals)
+    changed_map(map_file, file, lambda *_: None, seals=True)
     assert jcr.load_map(file).check_spheres(np.zeros((1, 3)), 0.01).shape == (1,)
-    changed_map(map_file, file, MAP_CHANGES[what], seals)
-    with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged"):
-        jcr.load_map(file)
+    cases = [(what, True) for what in MAP_CHANGES] + [("cells of NaN", False), ("no seen space", False)]
+    for what, seals in cases:
+        changed_map(map_file, file, MAP_CHANGES[what], seals)
+        with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged"):
+            jcr.load_map(file)
+            pytest.fail(what)
 
 
 def cloud_file(folder: Path, **facts: Any) -> Path:
@@ -758,16 +674,6 @@ def test_a_reading_is_one_that_jcr_writes(tmp_path: Path, reading: dict[str, str
                 jcr.read_capture(folder)
         else:
             assert jcr.read_capture(folder).reading == Reading(file="poses.csv")
-
-
-def test_a_message_quotes_no_number_of_thousands_of_digits(tmp_path: Path):
-    folder = noise_capture(tmp_path / "capture", SIZE, 5).folder
-    content = json.loads((folder / "capture.json").read_text())
-    given = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "width": 10**4000}
-    (folder / "capture.json").write_text(json.dumps(content | {"intrinsics": given}))
-    with pytest.raises(InputError) as caught:
-        jcr.read_capture(folder)
-    assert len(str(caught.value)) < 300 + len(str(folder))
 
 
 def test_a_bag_with_computed_columns_is_refused(tmp_path: Path):

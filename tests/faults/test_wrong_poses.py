@@ -63,11 +63,11 @@ def first_kinds(capture: Capture, reconstruction: Reconstruction) -> tuple[list[
 @pytest.mark.parametrize(
     ("name", "what"),
     [
-        ("cobotta_stage", "permuted"),
+        ("cobotta_stage", "inverses"),
+        pytest.param("cobotta_stage", "permuted", marks=pytest.mark.long),
         pytest.param("ur_snack_table", "of another capture", marks=pytest.mark.long),
         # Five of its poses are then permuted in one cycle, and the other ten images agree.
         pytest.param("elephant_floor", "second half permuted", marks=pytest.mark.long),
-        *(("cobotta_stage", mistake) for mistake in ("inverses", "Euler order")),
     ],
 )
 def test_the_first_message_names_the_poses(real_captures: Path, name: str, what: str):
@@ -109,10 +109,10 @@ def faultless() -> tuple[Capture, Reconstruction]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", CONTRADICT.values(), ids=CONTRADICT)
-def test_poses_that_contradict_drawn_images_lead(faultless: tuple[Capture, Reconstruction], change: Change):
+@pytest.mark.parametrize("what", ["permuted", "four permuted"])
+def test_poses_that_contradict_drawn_images_lead(faultless: tuple[Capture, Reconstruction], what: str):
     capture, made = faultless
-    said, _ = first_kinds(with_poses(capture, change(capture.base_from_gripper)), made)
+    said, _ = first_kinds(with_poses(capture, CONTRADICT[what](capture.base_from_gripper)), made)
     assert said[0] in OF_POSES
 
 
@@ -133,9 +133,13 @@ def test_a_reconstruction_in_pieces_leads(faultless: tuple[Capture, Reconstructi
 TOOL = transform(rotation_exp(np.array([0.0, 0.0, 0.4])), np.array([0.0, 0.0, 0.15]))
 
 
-@pytest.mark.parametrize("moved", [3, 5])
-@pytest.mark.parametrize("at_start", [False, True])
-@pytest.mark.parametrize("kind", [FindingKind.SLIP, FindingKind.BASE_MOVED])
+@pytest.mark.parametrize(
+    ("kind", "at_start", "moved"),
+    [
+        *((FindingKind.SLIP, at_start, moved) for at_start, moved in ((False, 5), (True, 3))),
+        *((FindingKind.BASE_MOVED, at_start, moved) for at_start, moved in ((False, 3), (True, 5))),
+    ],
+)
 def test_poses_that_are_moved_alike_to_one_end_are_one_finding(
     faultless: tuple[Capture, Reconstruction], kind: FindingKind, at_start: bool, moved: int
 ):

@@ -10,7 +10,7 @@ from jcr.camera import project
 from jcr.estimation.closed_form import motions
 from jcr.features.gate import Pair, classify_pairs, rotation_of_x
 from jcr.features.matchers import estimate_geometry, hidden, still_cells
-from jcr.features.pairs import hand_eye_of_pairs, near_pairs, viewpoints
+from jcr.features.pairs import hand_eye_of_pairs
 from jcr.features.two_view import CameraMotion, camera_motions
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.records import Intrinsics
@@ -141,25 +141,6 @@ def test_one_axis_fixes_nothing():
     x = rotation_exp(np.array([0.3, -0.2, 1.0]))
     gripper = rotation_exp(np.linspace(0.2, 1.5, 10)[:, None] * np.array([0.0, 0.0, 1.0]))
     assert rotation_of_x(gripper, x.T @ gripper @ x, np.full(10, 0.02)) is None
-
-
-def repeated(places: int, repeats: int) -> np.ndarray:
-    """Return gripper poses of viewpoints on a line of 5 cm steps, each taken again and again within 0.1 mm."""
-    rng = np.random.default_rng(0)
-    x = np.column_stack([0.05 * np.arange(places), np.zeros((places, 2))])
-    x = np.tile(x, (repeats, 1)) + rng.normal(scale=1e-4, size=(places * repeats, 3))
-    return transform(rotation_exp(rng.normal(scale=1e-3, size=(places * repeats, 3))), x)
-
-
-def test_images_of_one_viewpoint_are_no_partners():
-    viewpoint = viewpoints(motions(repeated(16, 12)))
-    assert np.array_equal(viewpoint, np.tile(np.arange(16), 12))
-    pairs = np.array(near_pairs(motions(repeated(16, 12)), 4))
-    assert (viewpoint[pairs[:, 0]] != viewpoint[pairs[:, 1]]).all()
-    for image in range(16 * 12):
-        partners = pairs[(pairs == image).any(1)]
-        others = viewpoint[np.where(partners[:, 0] == image, partners[:, 1], partners[:, 0])]
-        assert len(set(others.tolist())) >= 4
 
 
 INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)

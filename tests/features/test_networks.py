@@ -77,6 +77,7 @@ def test_a_rotated_image_is_matched_when_it_is_rotated_back(roll: float, tableto
     assert (error < 3).mean() > 0.9
 
 
+@pytest.mark.long
 def test_a_chessboard_before_a_plain_background(real_captures: Path):
     """SIFT registers none of its images; what says which way round the board is, is the robot."""
     from jcr.calibration.stage import calibrate_reconstruction

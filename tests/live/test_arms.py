@@ -1,4 +1,4 @@
-"""Cameras and arms through their makers' packages, against simulators of the makers or fakes of the protocols."""
+"""Cameras and arms through their makers' packages, against a simulator of the maker or a stand-in."""
 
 import json
 import os
@@ -6,6 +6,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cv2
@@ -13,19 +14,13 @@ import numpy as np
 import pytest
 
 import jcr
-from fake_arms import fake_xarm
-from jcr.geometry import rotation_exp, transform
+from jcr.geometry import rotation_exp, rotation_log, transform
 from jcr.live.cameras import set_up
+from jcr.live.robot import MOVED_ON, next_rest, states_of
 from places import ROOT
 
 POSE = transform(rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.42, -0.11, 0.36]))
 JOINTS = np.array([0.3, -1.2, 1.5, -1.8, -1.5, 0.4])
-
-
-def needs(*packages: str) -> None:
-    """Skip where one is missing, without importing it: one of them broke the process in which tests ran on."""
-    if missing := [name for name in packages if find_spec(name) is None]:
-        pytest.skip(f"not installed: {', '.join(missing)}")
 
 
 def named_by(script: str, *words: object) -> Any:
@@ -37,28 +32,34 @@ def named_by(script: str, *words: object) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-ASK = """
-    import json, sys
-    from jcr.errors import InputError
-    from jcr.live.robot import states_of
-    from jcr.live.robot import MOVED_ON, next_rest
-    ask = next_rest(states_of(f"{sys.argv[1]}:{sys.argv[2]}"), None, MOVED_ON)
-    try:
-        next(states_of(f"{sys.argv[1]}:{sys.argv[3]}")())
-    except InputError as error:
-        refused = str(error)
-    print(json.dumps([ask.base_from_gripper.tolist(), ask.joints.tolist(), refused]))
-"""
+def test_an_xarm_gives_pose_and_joints_from_its_makers_units(monkeypatch: pytest.MonkeyPatch):
+    """Its package gives millimetres, a rotation vector and one angle more than the arm has joints."""
 
+    class Arm:
+        axis = len(JOINTS)
 
-@pytest.mark.slow
-def test_an_arm_gives_pose_and_joints_through_its_makers_package():
-    needs("xarm")
-    with fake_xarm("127.0.0.7", POSE, JOINTS):
-        pose, joints, refused = named_by(ASK, "xarm", "127.0.0.7", "127.0.0.8")
-    # An xArm tells float32, and its package keeps six digits.
-    assert np.allclose(pose, POSE, atol=1e-6) and np.allclose(joints, JOINTS, atol=1e-6)
-    assert "xarm:127.0.0.8" in refused and "check the address" in refused
+        def __init__(self, host: str, is_radian: bool, **_: bool) -> None:
+            if host != "arm" or not is_radian:
+                raise OSError("no answer")
+
+        def get_position_aa(self, is_radian: bool) -> tuple[int, list[float]]:
+            return 0, [*(1e3 * POSE[:3, 3]), *rotation_log(POSE[:3, :3])]
+
+        def get_servo_angle(self, is_radian: bool) -> tuple[int, list[float]]:
+            return 0, [*JOINTS, 0.0]
+
+        def disconnect(self) -> None: ...
+
+    for name in ("xarm", "xarm.wrapper"):
+        monkeypatch.setitem(sys.modules, name, module := ModuleType(name))
+        vars(module).update(XArmAPI=Arm)
+    read, nobody = states_of("xarm:arm"), states_of("xarm:nobody")
+    assert read is not None and nobody is not None
+    found = next_rest(read, None, MOVED_ON)
+    assert found.joints is not None
+    assert np.allclose(found.base_from_gripper, POSE) and np.allclose(found.joints, JOINTS)
+    with pytest.raises(jcr.InputError, match="xarm:nobody: no answer; check the address"):
+        next(nobody())
 
 
 FILMED = """
@@ -75,7 +76,8 @@ FILMED = """
 
 @pytest.mark.slow
 def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its_maker(tmp_path: Path):
-    needs("pyrealsense2")
+    if find_spec("pyrealsense2") is None:  # imported here it would break the process in which tests run on
+        pytest.skip("not installed: pyrealsense2")
     file = tmp_path / "recording.db3"
     path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     with pytest.MonkeyPatch.context() as patch:

@@ -1,6 +1,5 @@
 """A calibration that grows with its capture: the same as the batch in the end, and faults named where they happen."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
@@ -12,22 +11,19 @@ import numpy as np
 import pytest
 
 import jcr
-from conftest import shrunk_capture
 from jcr.capture.images import read_image
-from jcr.findings import FindingKind, sentence
+from jcr.findings import FindingKind
 from jcr.geometry import rotation_exp, step_between, transform
 from jcr.live.calibration import LiveCalibration
-from jcr.live.page import verdict_lines
 from jcr.live.progress import LiveProgress
-from jcr.live.session import SessionState
 from jcr.records import Capture
 from scripted_capture import REQUIRED, still
 
 
 @pytest.fixture(scope="module")
-def capture(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def capture(half_capture: Path) -> Capture:
     """Nine images of the bundled capture, 320 pixels wide."""
-    return jcr.read_capture(shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 9, 320))
+    return jcr.read_capture(half_capture).of_rows(range(9))
 
 
 def image_of(capture: Capture, k: int) -> np.ndarray:
@@ -148,22 +144,6 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     )
     # What is wrong with single images has not harmed the others.
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
-
-
-@pytest.mark.slow
-def test_a_robot_whose_model_is_refused_is_named_once(grown, tmp_path: Path):
-    rng, folder = np.random.default_rng(0), shutil.copytree(grown[0], tmp_path / "capture")
-    content = json.loads((folder / "capture.json").read_text()) | {"robot": "ur5e"}
-    content["frames"] = [
-        frame | {"joints": rng.uniform(-1, 1, 6).tolist()} for frame in content["frames"][:6]
-    ]
-    (folder / "capture.json").write_text(json.dumps(content))
-    with closing(LiveCalibration(folder)) as live:
-        images, state = live.live.images, live.update()
-    assert [one.kind for one in state.findings].count(FindingKind.ROBOT_UNUSED) == 1
-    shown = verdict_lines(SessionState(images=images, progress=state))
-    (warning,) = [sentence(one) for one in state.findings if one.kind is FindingKind.ROBOT_UNUSED]
-    assert shown.count(warning) == 1
 
 
 def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tabletop: Path):

@@ -99,23 +99,6 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         )
 
 
-def test_the_page_advises_until_the_requirement_is_met(capture: tuple[LiveSession, Scripted], tabletop: Path):
-    live, scripted = capture
-    with LiveServer(live) as page:
-        for count, is_met in ((4, False), (5, True)):
-            add(live, scripted, tabletop, count)
-            head = parts(page)["parts"]["head"]
-            assert ("verdict good" in head) is is_met
-            assert ("Requirement met, press Finish" in head) is is_met
-            assert ("Rotate the wrist by 20° or more" in head) is not is_met
-        # Nobody reads the gripper's pose here, so no button takes an image, and the next posted pose replaces one.
-        assert 'data-press="take"' not in head and 'data-press="retake"' in head
-        live.press("retake", 2)
-        shown = parts(page)["parts"]
-        assert "next image replaces images/002.png" in shown["head"] and len(live.folder.names) == 5
-        assert shown["images"].count("the next image replaces this one") == 1
-
-
 def test_the_server_serves_until_the_report_is_sent(capture: tuple[LiveSession, Scripted], tabletop: Path):
     live, scripted = capture
     add(live, scripted, tabletop, 5)

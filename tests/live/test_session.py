@@ -235,16 +235,6 @@ def test_each_pose_gets_the_image_still_there_and_a_stopped_capture_resumes(tmp_
         assert np.allclose(capture.base_from_gripper[k], pose[k])
 
 
-def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_named(tmp_path: Path, tabletop: Path):
-    pose = poses(tabletop)
-    file = video(tmp_path / "a.avi", tabletop, range(1), rest_s=2)
-    answers = taken(tmp_path / "c", file, [pose[0], pose[0], pose[1], pose[2]], patience=0.8)
-    assert [answer["accepted"] for answer in answers] == [True, False, False, False]
-    assert "where images/001.png was taken" in answers[1]["reason"]
-    assert "did not change" in answers[2]["reason"] and "ended" in answers[3]["reason"]
-    assert len(LiveFolder(tmp_path / "c").names) == 1
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [

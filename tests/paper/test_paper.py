@@ -12,7 +12,7 @@ import pytest
 import jcr
 from jcr.calibration.record import PublishedCalibration, read_calibration
 from jcr.errors import InputError, RejectedError
-from jcr.geometry import nearest_rotation, rotation_exp, rotation_log, step_between, transform
+from jcr.geometry import rotation_exp, step_between, transform
 from jcr.records import Intrinsics
 from places import SHARED
 from scenes import pairs_of
@@ -53,18 +53,6 @@ def test_hand_made_motions_about_two_axes_give_the_exact_transform():
     assert abs(scale - 2.5) <= SCALES[1] - SCALES[0] and np.abs(translation - x[:3, 3]).max() < 1e-3
     camera[:, :3, 3] /= 10
     assert translation_and_scale(a, motions(camera), x[:3, :3], SCALES)[1] == pytest.approx(4.0)
-
-
-def test_the_printed_equations_are_not_exact_on_exact_data():
-    problem = hand_eye_problem(np.random.default_rng(0), 8)
-    a, b = motions(problem.base_from_gripper), motions(problem.recon_from_camera)
-    x, scale = problem.gripper_from_camera, problem.scale
-    printed = np.einsum("ni,nj->ij", rotation_log(a[:, :3, :3]), rotation_log(b[:, :3, :3]))
-    assert np.abs(nearest_rotation(printed.T) - x[:3, :3]).max() > 0.1
-    np.testing.assert_allclose(nearest_rotation(printed.T), x[:3, :3].T, atol=1e-9)
-    # Eq. 9 as printed, with λ t_c^e in place of λ t_B: the true transform and scale leave a residual.
-    left = (np.eye(3) - a[:, :3, :3]) @ x[:3, 3] - (a[:, :3, 3] - scale * x[:3, :3] @ x[:3, 3])
-    assert np.linalg.norm(left, axis=1).mean() > 0.05
 
 
 def test_too_few_poses_and_no_motion_are_rejected():
@@ -129,7 +117,7 @@ def test_one_switch_runs_the_published_method_from_images_to_the_map(
     options = {
         "method": "paper",
         "reconstruct": {"predictions": str(pairs)},
-        "map": {"steps": 60, "cell": 0.03},
+        "map": {"steps": 10, "cell": 0.04},
     }
     result = jcr.run(made, tmp_path / "out", options)
     reference = json.loads((made / "reference.json").read_text())["gripper_from_camera"]
@@ -143,7 +131,7 @@ def test_one_switch_runs_the_published_method_from_images_to_the_map(
     )
     assert "checks nothing" in (tmp_path / "out" / "report.html").read_text()
     scene = jcr.load_map(tmp_path / "out")
-    assert scene.is_published and scene.history["steps"] == "60"
+    assert scene.is_published and scene.history["steps"] == "10"
     with pytest.raises(InputError, match="no uncertainty"):
         scene.check_spheres(np.zeros((1, 3)), 0.1, confidence=0.95)
     assert jcr.run(made, tmp_path / "out", options).is_unchanged

@@ -175,15 +175,6 @@ def test_text_from_files_stays_text(page: str):
     assert "a & <b>" in elements.text and "a <note> & more" in elements.text
 
 
-def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(run: RunResult, page: str):
-    content = run.calibration
-    assert content.notes[0] == "a <note> & more" and content.warnings[-1] == "a <pose> is off"
-    page = page.partition('<section class="warnings" id="warnings">')[2]
-    warned, _, noted = page.partition('<details class="section" id="notes">')
-    assert "a &lt;pose&gt; is off" in warned and "a &lt;note&gt;" not in warned
-    assert "a &lt;note&gt; &amp; more" in noted.partition("</details>")[0]
-
-
 def test_page_is_one_small_file(page: str):
     assert len(page.encode()) < 4e6
     elements = Elements(page)

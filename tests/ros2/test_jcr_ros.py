@@ -31,10 +31,10 @@ PACKAGE = ROOT / "ros2" / "jcr_ros"
 class Played:
     """An arm that stands at one pose, and a camera that sees its image, until it is moved on."""
 
-    def __init__(self, tabletop: Path) -> None:
-        frames = json.loads((tabletop / "capture.json").read_text())["frames"]
-        self.poses = [np.array(frame["base_from_gripper"]) for frame in frames]
-        self.images = [read_image(tabletop / frame["image"]) for frame in frames]
+    def __init__(self, folder: Path) -> None:
+        capture = jcr.read_capture(folder)
+        self.poses = list(capture.base_from_gripper)
+        self.images = [read_image(folder / name) for name in capture.images]
         self.at = 0
         self.start = time.monotonic()
 
@@ -60,12 +60,12 @@ class Played:
 
 
 def camera_info(**more: Any) -> SimpleNamespace:
-    k = [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]
-    return SimpleNamespace(width=640, height=480, k=k, d=[0.0] * 5, distortion_model="plumb_bob", **more)
+    k = [300.0, 0.0, 159.75, 0.0, 300.0, 119.75, 0.0, 0.0, 1.0]
+    return SimpleNamespace(width=320, height=240, k=k, d=[0.0] * 5, distortion_model="plumb_bob", **more)
 
 
 @pytest.fixture
-def filmed(tabletop: Path) -> Iterator[Callable[[Calibrator, Played], None]]:
+def filmed() -> Iterator[Callable[[Calibrator, Played], None]]:
     over, threads = threading.Event(), []
 
     def film(calibrator: Calibrator, played: Played) -> None:
@@ -83,9 +83,9 @@ def filmed(tabletop: Path) -> Iterator[Callable[[Calibrator, Played], None]]:
 
 @pytest.mark.slow
 def test_images_are_taken_by_service_each_with_its_state_and_a_change_is_undone(
-    tmp_path: Path, tabletop: Path, filmed: Callable[[Calibrator, Played], None]
+    tmp_path: Path, half_capture: Path, filmed: Callable[[Calibrator, Played], None]
 ):
-    played, events, states = Played(tabletop), [], []
+    played, events, states = Played(half_capture), [], []
 
     def session() -> Calibrator:
         given = Settings(folder=tmp_path / "c", options=jcr.SessionOptions(images=6), at_rest=False)
@@ -116,7 +116,7 @@ def test_images_are_taken_by_service_each_with_its_state_and_a_change_is_undone(
     assert resumed.take() == (True, "kept images/004.png")
     resumed.stop()
     capture = jcr.read_capture(tmp_path / "c")
-    assert len(capture) == 4 and capture.intrinsics is not None and capture.intrinsics.fx == 600
+    assert len(capture) == 4 and capture.intrinsics is not None and capture.intrinsics.fx == 300
     assert np.allclose(capture.base_from_gripper, played.poses[:4])
 
 
@@ -258,22 +258,26 @@ def stamped(pose: ndarray, time_s: float) -> Any:
 
 @pytest.mark.slow
 def test_the_node_broadcasts_the_transform_that_is_accepted(
-    tmp_path: Path, tabletop: Path, node_module: ModuleType, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    tabletop: Path,
+    half_capture: Path,
+    node_module: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    played = Played(tabletop)
+    played = Played(half_capture)
     parameters = {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
     parameters |= {"require_mm": 5.0, "require_deg": 1.0}
     monkeypatch.setattr(FakeNode, "parameters", parameters)
     node = node_module.CalibratorNode()
     node.buffer.lookup_transform = lambda base, gripper, at: stamped(played.poses[played.at], played.time_s)
     node.subscriptions_made["/camera/color/camera_info"](camera_info())
-    depth = array("B", np.full((480, 640), 0.5, np.float32).tobytes())
+    depth = array("B", np.full((240, 320), 0.5, np.float32).tobytes())
     over = threading.Event()
 
     def push(message: Any, time_s: float) -> None:
         """Publish an image, and its depth after it."""
         node.subscriptions_made["/camera/color/image_raw"](message)
-        shape = {"height": 480, "width": 640, "step": 4 * 640, "is_bigendian": 0}
+        shape = {"height": 240, "width": 320, "step": 4 * 320, "is_bigendian": 0}
         measured = SimpleNamespace(header=message.header, encoding="32FC1", data=depth, **shape)
         node.subscriptions_made["/depth"](measured)
 

@@ -1,6 +1,5 @@
 """The map and a robot against a scene whose every distance is known: a table with a box and a ball."""
 
-import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -133,13 +132,18 @@ def test_colours_and_labels_are_learnt(scene: "SceneMap", cloud: PointCloud):
     assert scene.label_names == analytic_scene.LABELS
 
 
-def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud: PointCloud):
+@pytest.fixture(scope="module")
+def untrained(cloud: PointCloud) -> "SceneMap":
+    """The published representation without a step of training."""
+    from jcr.paper.fields import published_scene
+
+    return published_scene(cloud, replace(OPTIONS, preset="paper", max_seconds=0.0))
+
+
+def test_the_published_representation_is_plain_torch(untrained: "SceneMap"):
     import torch
 
-    from jcr.paper.fields import published_scene, train_fields
-
-    untrained = replace(OPTIONS, preset="paper", max_seconds=0.0)
-    scene = published_scene(cloud, untrained)
+    scene = untrained
     box, x = torch.tensor(scene.box, dtype=torch.float32), torch.rand(50, 3)
     field = next(one for one in scene.fields.of if "color" in one.heads)
     # The longest side spans [-1, 1].
@@ -150,6 +154,13 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
         field(x)["color"], plain(torch.cat([angle.sin(), angle.cos()]).T), rtol=1e-4, atol=1e-4
     )
     assert field.hidden.weight.shape == (256, 60)
+
+
+@pytest.mark.long
+def test_the_published_representation_learns_the_scene(cloud: PointCloud):
+    import torch
+
+    from jcr.paper.fields import train_fields
 
     fields, _ = train_fields(cloud, MapOptions(steps=250))
     surface = torch.tensor(cloud.points_in_base[:20_000], dtype=torch.float32)
@@ -162,12 +173,10 @@ def test_the_published_representation_is_plain_torch_and_learns_the_scene(cloud:
     assert (fields["label"](surface)["label"].argmax(1).numpy() == cloud.label[:20_000]).mean() > 0.95
 
 
-def test_published_networks_answer_everywhere_and_unknown_stands_beside(cloud: PointCloud):
+def test_published_networks_answer_everywhere_and_unknown_stands_beside(untrained: "SceneMap"):
     import torch
 
-    from jcr.paper.fields import published_scene
-
-    scene = published_scene(cloud, replace(OPTIONS, steps=100))
+    scene = untrained
     x = np.concatenate([uniform(5000), OUTSIDE[None], UNDER_TABLE[None]])
     raw = scene.fields(torch.tensor(x).float(), scene.properties)
     for unknown in ("occupied", "free", "report"):
@@ -183,12 +192,12 @@ def test_published_networks_answer_everywhere_and_unknown_stands_beside(cloud: P
 
 
 @pytest.fixture(scope="module")
-def uncertain(cloud: PointCloud) -> "SceneMap":
-    """A map whose calibration has errors of 2 mm, 0.2° and 0.3 % per axis."""
-    from jcr.scene.build import build_scene
+def uncertain(scene: "SceneMap", cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> "SceneMap":
+    """The map with a calibration that has errors of 2 mm, 0.2° and 0.3 % per axis."""
     from jcr.scene.uncertainty import MapUncertainty, _depth_std
 
-    made = build_scene(cloud, OPTIONS)
+    scene.save(file := tmp_path_factory.mktemp("uncertain") / "map.safetensors")
+    made = load_map(file)
     spread = np.diag(np.r_[[2e-3] * 3, [np.radians(0.2)] * 3, 0.003] ** 2)
     made.set_uncertainty(
         MapUncertainty(
@@ -368,17 +377,13 @@ def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Pa
         load_map(tmp_path)
     scene.save(path)
     whole = path.read_bytes()
-    for damage in (whole[: len(whole) // 2], b"", b"\x00" * 100, whole[:2000]):
-        path.write_bytes(damage)
-        with pytest.raises(InputError, match="damaged"):
-            load_map(tmp_path)
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="damaged"):
+        load_map(tmp_path)
     from safetensors.torch import save_file
 
     save_file({"a": torch.zeros(2)}, path)
     with pytest.raises(InputError, match="no map of jcr"):
-        load_map(tmp_path)
-    save_file({"a": torch.zeros(2)}, path, metadata={"format": "jcr.map/2", "about": json.dumps({})})
-    with pytest.raises(InputError, match="damaged"):
         load_map(tmp_path)
 
 

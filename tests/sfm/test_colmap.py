@@ -137,14 +137,14 @@ def test_given_distortion_with_which_no_image_registers_is_estimated_and_named(t
 
 
 @pytest.mark.slow
-def test_a_given_focal_length_of_another_resolution_is_named_and_not_used(tabletop: Path) -> None:
+def test_a_given_focal_length_of_another_resolution_is_named_and_not_used(half_capture: Path) -> None:
     """Half as long again, it was kept: the result was 32 mm off, and the remedy was to name the arm."""
-    capture = read_capture(tabletop)
+    capture = read_capture(half_capture)
     assert capture.intrinsics is not None
     wrong = replace(capture.intrinsics, fx=1.5 * capture.intrinsics.fx, fy=1.5 * capture.intrinsics.fy)
     made = reconstruct_colmap(replace(capture, intrinsics=wrong))
     assert "the given intrinsics are not used: with them the points are" in made.warnings[0]
-    assert made.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=2e-3)
+    assert made.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=4e-3)
 
 
 def test_unknown_intrinsics_is_found(capture: Capture) -> None:

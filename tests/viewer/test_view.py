@@ -7,7 +7,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
-from chromium import Chromium
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.records import Capture
@@ -185,57 +182,3 @@ def test_command_serves_this_machine_alone_until_interrupted(done: Path, monkeyp
     (host, answer), closed = answers
     assert status == 0 and host == "127.0.0.1" and b"200" in answer and closed
     assert printed.getvalue().count("\n") == 1
-
-
-@pytest.mark.long
-def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
-    gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-    chromium = Chromium(tmp_path, *gpu)
-    try:
-        chromium.open(f"http://127.0.0.1:{viewer.server.get_port()}", 800, 400)
-        deadline = time.monotonic() + 120
-        image, rows, columns = chromium.image("canvas"), np.zeros(0, int), np.zeros(0, int)
-        while len(rows) < 100:
-            image = chromium.image("canvas").astype(int)
-            assert time.monotonic() < deadline, "the scene does not appear"
-            drawn = np.ptp(image, axis=-1) > 15  # the background is grey or white
-            rows, columns = np.nonzero(
-                minimum_filter(drawn, 3)[200:, 320:450]
-            )  # of the table, left of the panel
-        assert "Sphere to drag" in chromium.js("document.body.innerText")
-
-        viewer.clicked.content = "not yet"
-        middle = len(rows) // 2
-        x, y = int(columns[middle]) + 320, int(rows[middle]) + 200
-        chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        for kind in ("mousePressed", "mouseReleased"):
-            chromium.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        until(lambda: viewer.clicked.content != "not yet")
-        assert "occupancy" in viewer.clicked.content
-
-        def red(image: np.ndarray) -> int:
-            r, g, b = np.moveaxis(image.astype(int), -1, 0)
-            return int(((r > 150) & (r - g > 80) & (r - b > 80)).sum())  # the ball is translucent
-
-        viewer.shown.value = "none"
-        viewer.show_points()
-        viewer.radius.value = 150.0
-        viewer.move_sphere()
-        before = red(image)
-        while red(chromium.image("canvas")) < before + 500:
-            assert time.monotonic() < deadline, "the sphere does not become red"
-        bad = [
-            event["params"]
-            for event in chromium.events
-            if event["method"] == "Runtime.exceptionThrown"
-            or event["params"].get("type") == "error"
-            or event["params"].get("entry", {}).get("level") == "error"
-        ]
-        assert not bad
-        asked = [e["params"]["request"]["url"] for e in chromium.events if e["method"].endswith("WillBeSent")]
-        assert asked and all(
-            url.startswith((f"http://127.0.0.1:{viewer.server.get_port()}", "data:", "blob:"))
-            for url in asked
-        )
-    finally:
-        chromium.close()

@@ -1,20 +1,17 @@
 """Global alignment against the truth of synthetic pairs: accuracy, gauge, wrong pairs, graphs, bad input."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import align as align_command
 from jcr.camera import rays
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import Similarity, fit_similarity, rotation_between_deg
 from jcr.paper.alignment import align
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
 from jcr.pointmaps.pairs import complete_pairs, window_pairs
-from simulation.pairs import PairErrors, PairTruth, synthetic_pairs, write_pairs
+from simulation.pairs import PairErrors, PairTruth, synthetic_pairs
 
 SMALL = (48, 36)
 NO_ERRORS = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)
@@ -54,17 +51,6 @@ def test_fast_beats_adam_and_both_are_near_the_truth():
     fast, published = (errors(method(predictions), truth) for method in (global_align, align))
     assert published[0] < 4 and published[1] < 0.4
     assert fast[0] < published[0] / 2 and fast[1] < published[1]
-
-
-def test_the_command_reads_aligns_and_writes(tmp_path: Path, capsys):
-    predictions, truth = synthetic_pairs(complete_pairs(3), SMALL)
-    write_pairs(tmp_path / "pairs.npz", predictions)
-    result = tmp_path / "new" / "aligned.npz"
-    assert align_command.main((str(tmp_path / "pairs.npz"), str(result))) == 0
-    assert json.loads(capsys.readouterr().out)["seconds"] > 0
-    with np.load(result) as file:
-        assert file["poses"].shape == (3, 4, 4) and file["depth"].shape == (3, 36, 48)
-        np.testing.assert_allclose(file["focals"], truth.intrinsics.fx, rtol=2e-3)
 
 
 @pytest.mark.parametrize("spoil", [{"wrong_pairs": 5}, {"noise_pairs": 5}])
