@@ -213,7 +213,7 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
     error = step_between(camera.parent_from_camera, truth.base_from_camera[11])
     assert np.abs(error / np.sqrt(np.diag(camera.covariance))).max() < 3
     assert np.linalg.norm(error[:3]) < 0.008
-    assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.01)
+    assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.02)
 
 
 @pytest.mark.slow

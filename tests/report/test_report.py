@@ -132,6 +132,9 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     np.testing.assert_allclose([float(values[axis]) for axis in "xyz"], x[:3, 3], atol=1e-9)
     is_rotation(Rotation.from_quat([float(values[f"q{axis}"]) for axis in "xyzw"]))
 
+    camera, given = run.calibration.intrinsics, run.capture.intrinsics
+    assert camera is not None and given is not None and abs(camera.fx - given.fx) > 0.01
+    assert f"fx {camera.fx:.2f}, fy {camera.fy:.2f}" in elements.text
     offered = json.loads(elements.copied("the covariance"))
     assert offered["order"] == list(COVARIANCE_ORDER)
     assert np.array_equal(offered["covariance"], run.found.covariance)
