@@ -14,7 +14,7 @@ import tyro
 from jcr.files import written_whole
 from jcr.paper.alignment import align
 from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.pairs import read_pairs
+from jcr.pointmaps.pair_predictions import read_pairs
 
 
 @dataclass(frozen=True)

@@ -23,16 +23,16 @@ from benchmarks.page import (
     squared_distance,
     table,
 )
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.backends import ReconstructOptions, reconstruct
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
-from jcr.cell.stage import place_cameras
+from jcr.cell.place_cameras import place_cameras
 from jcr.errors import RejectedError
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.problem import Problem, State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import inverse, scale_translation, step_between
-from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import CellCamera
 from jcr.records.json_file import read_json
 from jcr.result import RunOptions

@@ -16,13 +16,13 @@ from numpy import ndarray
 from benchmarks.page import number, squared_distance, table
 from benchmarks.peers import opencv
 from benchmarks.references import nine_pixels, placed
-from jcr.calibration.adjust import adjusted
+from jcr.calibration.bundle_adjustment import adjusted
+from jcr.calibration.calibrate import calibrate_reconstruction, fitted_case
 from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate_reconstruction, fitted_case
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior

@@ -19,9 +19,9 @@ from scipy.special import chdtrc
 
 import jcr
 from benchmarks.page import farthest, mm_deg, squared_distance, table
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.errors import InputError, RejectedError
 from jcr.findings import FindingKind, kinds_of
 from simulation import image_faults as make

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import folders_with_captures, largest_std, number, table
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.features.matchers import FeatureName, Matcher

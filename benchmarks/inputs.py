@@ -26,7 +26,7 @@ from jcr.capture.pairing import natural
 from jcr.capture.read import read_capture, read_source
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import rotation_exp, step_between, transform
-from jcr.pipeline.decision import decide
+from jcr.pipeline.reading_decision import decide
 from jcr.records import Capture
 from jcr.sfm.colmap import reconstruct_alone
 from simulation.layouts import LAYOUTS, Layout, write_layout

@@ -18,24 +18,24 @@ from scipy.spatial import KDTree
 
 from benchmarks.page import of_rows, table
 from benchmarks.peers import WEBCAM
+from jcr.backends import ReconstructOptions, reconstruct
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify
 from jcr.errors import InputError
 from jcr.export.options import ExportOptions, provenance
-from jcr.export.volume import write_octomap
+from jcr.export.planner_maps import write_octomap
 from jcr.geometry import apply, inverse
 from jcr.paper.fields import published_scene
-from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import PointCloud, Reconstruction
 from jcr.scene.build import build_scene
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.scene.scene_map import SceneMap
 from jcr.segments.measure import ObjectSize, measure_objects
-from jcr.segments.segments import read_labels
+from jcr.segments.segmentation import read_labels
 from jcr.segments.tabletop import label_tabletop
 from simulation.capture import SimulateOptions, simulate
 from simulation.scenes import make_scene, solid_labels

@@ -27,7 +27,7 @@ from jcr.geometry import apply, inverse, retract, scale_translation, step_betwee
 from jcr.pipeline.options import TOLERANCE
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.verify import Verification, exceeds, verify_run
-from jcr.pipeline.watch import WINDOW
+from jcr.pipeline.verify_history import WINDOW
 from jcr.records import Capture
 from simulation.arms import PRESETS, PresetName, bend, table_center, views
 from simulation.capture import encode_jpeg, pinhole

@@ -13,9 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.page import apart, mm_deg, table
+from jcr.backends import ReconstructOptions, reconstruct
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.estimation.intrinsics_prior import FIXED, camera_with_prior
@@ -33,8 +34,7 @@ from jcr.geometry import (
 from jcr.paper.hand_eye import SCALES
 from jcr.paper.hand_eye import solve as solve_published
 from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.pairs import complete_pairs
-from jcr.reconstruct import ReconstructOptions, reconstruct
+from jcr.pointmaps.pair_predictions import complete_pairs
 from simulation.capture import SimulateOptions, simulate
 from simulation.pairs import PairErrors, pairs_of_capture, synthetic_pairs, write_pairs
 from simulation.problems import INTRINSICS, HandEyeProblem, error, hand_eye_problem, observed

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 import jcr
 from benchmarks.page import farthest, mm_deg, squared_distance, table
+from jcr.backends import ReconstructOptions
 from jcr.camera import unproject
 from jcr.capture.formats import capture_json
 from jcr.capture.read import read_capture
@@ -18,8 +19,7 @@ from jcr.estimation.point_uncertainty import point_covariance
 from jcr.geometry import apply, fit_similarity, inverse, step_between
 from jcr.pipeline.run import RunOptions
 from jcr.pipeline.run import run as run_all
-from jcr.pointmaps.pairs import complete_pairs
-from jcr.reconstruct import ReconstructOptions
+from jcr.pointmaps.pair_predictions import complete_pairs
 from jcr.records import Capture
 from simulation.capture import SimulateOptions, simulate
 from simulation.faults import Faults, moved_parts, reported_poses

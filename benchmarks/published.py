@@ -9,12 +9,12 @@ import numpy as np
 
 from benchmarks.page import apart, of_rows, table
 from benchmarks.peers import PUBLISHED, WEBCAM
+from jcr.backends import ReconstructOptions, reconstruct
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.record import Calibration, PublishedCalibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, RejectedError
 from jcr.paper.run import calibrate_published, reconstruct_published
-from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Capture, Reconstruction
 from jcr.scene.cloud import point_cloud
 from jcr.segments.measure import measure_objects

@@ -29,6 +29,7 @@ from benchmarks.references import (
     placed_covariance,
     reference,
 )
+from jcr.backends import ReconstructOptions
 from jcr.calibration.record import Calibration
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.read import read_capture
@@ -36,7 +37,6 @@ from jcr.errors import InputError, RejectedError
 from jcr.estimation.point_uncertainty import point_covariance, within_95
 from jcr.geometry import inverse, nearest_to_lines, retract, rotation_exp, rotation_log, transform
 from jcr.pipeline.run import RunOptions, calibrate
-from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Intrinsics
 from jcr.result import RunResult
 

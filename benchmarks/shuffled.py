@@ -13,12 +13,12 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from benchmarks.page import folders_with_captures, of_rows, table
+from jcr.backends import ReconstructOptions, reconstruct
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.checks.effects import EXAMINED_FROM
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.errors import RejectedError
 from jcr.findings import FindingKind, kinds_of
-from jcr.reconstruct import ReconstructOptions, reconstruct
 from jcr.records import Capture, Reconstruction
 
 SHUFFLES = 3

@@ -158,13 +158,13 @@ def colmap_alone(place: str) -> None:
 def run_by_stage(place: str) -> None:
     """Run all stages in a process of its own, and write the processor seconds of each into stages.json."""
     import jcr
-    from jcr.pipeline import selection
+    from jcr.pipeline import backend_selection
     from jcr.pipeline.stages import STAGES as FUNCTIONS
 
     spent: dict[str, float] = dict.fromkeys(STAGES, 0.0)
     # The stage that reconstructs also calibrates, to select the back end.
     for function, name in (("reconstruct", "reconstruct"), ("calibrate_reconstruction", "calibrate")):
-        setattr(selection, function, _timed(getattr(selection, function), spent, name))
+        setattr(backend_selection, function, _timed(getattr(backend_selection, function), spent, name))
     for name in STAGES[2:]:
         files, function = FUNCTIONS[name]
         FUNCTIONS[name] = files, _timed(function, spent, name)
@@ -200,8 +200,8 @@ def _growth() -> list[tuple[int, tuple[int, float], Spent]]:
 
 def reconstruct_first(folder: str, count: int, facts: str) -> None:
     """Reconstruct and calibrate the first images of a capture; write images registered and error in mm to `facts`."""
+    from jcr.calibration.calibrate import calibrate_reconstruction
     from jcr.calibration.difference import read_hand_eye
-    from jcr.calibration.stage import calibrate_reconstruction
     from jcr.capture.read import read_capture
     from jcr.sfm.colmap import reconstruct_colmap
 
@@ -214,7 +214,7 @@ def reconstruct_first(folder: str, count: int, facts: str) -> None:
 
 def _calibration(images: int) -> tuple[int, int, str]:
     """Return images, observations, and the median processor seconds of their calibration."""
-    from jcr.calibration.stage import calibrate_reconstruction
+    from jcr.calibration.calibrate import calibrate_reconstruction
     from simulation.faults import faulty_capture, reconstructed
 
     seconds, count = [], 0

@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.special import ndtri
 
 from benchmarks.page import table
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.camera import rays, resized, without_distortion
 from jcr.errors import RejectedError
 from jcr.estimation.arms import ROBOT_NAMES, arm_named

@@ -19,13 +19,13 @@ import numpy as np
 
 from benchmarks.cameras import COUNT, answered, wanted
 from benchmarks.faults import IMAGES, OBSERVED, calibrated
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.read import read_capture
 from jcr.estimation.arms import arm_named
 from jcr.geometry import step_between
-from jcr.records.npz import read_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction
 from simulation.boards import Sheet, with_sheet
 from simulation.cells import Kind, cell_problem
 from simulation.faults import Faults, faulty_capture, reconstructed

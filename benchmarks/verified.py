@@ -22,7 +22,7 @@ from jcr.files import write_bytes
 from jcr.geometry import transform
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.verify import Verification, verify_run
-from jcr.pipeline.watch import FILE, telling_poses
+from jcr.pipeline.verify_history import FILE, telling_poses
 from jcr.records import Capture
 from jcr.result import RunResult
 from simulation.capture import SimulateOptions, simulate

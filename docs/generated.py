@@ -21,13 +21,13 @@ from typing import Any
 from pydantic import TypeAdapter
 
 import jcr
+from jcr.backends import BACKENDS
 from jcr.calibration.record import Calibration
 from jcr.cell.placement import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind
 from jcr.findings.messages import GROUPS, KindRow
-from jcr.reconstruct import BACKENDS
 from jcr.result import RunState
 
 REFERENCE = Path(__file__).parent / "reference"

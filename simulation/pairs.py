@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
-from jcr.pointmaps.pairs import ARRAYS, PairPredictions, complete_pairs
+from jcr.pointmaps.pair_predictions import ARRAYS, PairPredictions, complete_pairs
 from jcr.records import Intrinsics
 from simulation.truth import read_truth, true_depth
 

@@ -18,8 +18,8 @@ from PIL import Image
 import shape_checks
 from chromium import Chromium
 from in_process import run_jcr
+from jcr.backends import Backend
 from jcr.geometry import apply, transform
-from jcr.reconstruct import Backend
 from places import ROOT, SHARED
 from sift_once import find_sift_once
 from simulation.scenes import make_scene
@@ -121,7 +121,7 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     names: set[str] = set()
     monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
-    monkeypatch.setattr("jcr.reconstruct.xfeat_is_installed", lambda: "xfeat" in names)
+    monkeypatch.setattr("jcr.backends.xfeat_is_installed", lambda: "xfeat" in names)
     return names
 
 

@@ -14,11 +14,12 @@ import yaml
 from PIL import Image
 
 import capture_writers as writers
+from jcr.backends import ReconstructOptions
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.difference import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import read_calibration, write_calibration
-from jcr.calibration.stage import calibrate_pose_pairs
-from jcr.capture.added import read_added
+from jcr.capture.added_capture import read_added
 from jcr.capture.formats import capture_json
 from jcr.capture.formats.lerobot import Info, read_episode
 from jcr.capture.images import read_image
@@ -26,21 +27,20 @@ from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
-from jcr.cli.use import read_points
+from jcr.cli.map_query_export_view import read_points
 from jcr.depth.densify import pointmaps_of
 from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse
 from jcr.live.folder import LiveFolder
 from jcr.live.server import sample_pose
-from jcr.pointmaps.pairs import pairs_from_arrays, read_arrays
-from jcr.reconstruct import ReconstructOptions
+from jcr.pointmaps.pair_predictions import pairs_from_arrays, read_arrays
 from jcr.records import Attempt, Capture, Intrinsics
-from jcr.records.npz import read_reconstruction, write_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.scene.map_file import load_map
 from jcr.scene.options import MapOptions
-from jcr.segments.segments import _read_names
+from jcr.segments.segmentation import _read_names
 from jcr.sfm.given import read_model
 from scenes import NO_TRACKS, capture_of, cloud_of, maps_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem

@@ -21,8 +21,8 @@ from jcr.errors import InputError
 from jcr.geometry import transform
 from jcr.pipeline import batch as module
 from jcr.pipeline.batch import BatchRow, batch, run_one
+from jcr.pipeline.episode_agreement import agreement
 from jcr.pipeline.options import BatchOptions
-from jcr.pipeline.placements import agreement
 from jcr.result import RunOptions
 
 pytestmark = pytest.mark.slow

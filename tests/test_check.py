@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.calibration.checks.capture import view_findings
-from jcr.calibration.checks.left_out import left_out_poses
+from jcr.calibration.checks.images import view_findings
+from jcr.calibration.checks.unused_images import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch

@@ -19,9 +19,9 @@ import yaml
 import jcr
 from benchmarks.__main__ import Arguments as BenchArguments
 from jcr.cli import COMMANDS, command, dispatch
-from jcr.cli.prepare import page as page_named
-from jcr.cli.prepare import pages
-from jcr.cli.usage import parsed
+from jcr.cli.arguments import parsed
+from jcr.cli.board_docs_models import page as page_named
+from jcr.cli.board_docs_models import pages
 from jcr.errors import InputError
 from jcr.extras import DISTRIBUTION, extra
 from jcr.findings import FindingKind

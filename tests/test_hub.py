@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from jcr.reconstruct import BACKENDS
+from jcr.backends import BACKENDS
 
 pytestmark = pytest.mark.slow  # processes
 COMMIT = BACKENDS["da3-small"].revision

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind
 from jcr.geometry import rotation_between_deg, step_between

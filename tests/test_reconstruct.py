@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr import reconstruct as backends
-from jcr.calibration import stage as calibration_stage
+from jcr import backends
+from jcr.backends import BACKENDS, Backend, ReconstructOptions, candidates, tries
+from jcr.calibration import calibrate as calibration_stage
 from jcr.calibration.checks import convention
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
@@ -18,9 +19,8 @@ from jcr.calibration.record import Calibration
 from jcr.cli import dispatch
 from jcr.errors import InputError, RejectedError
 from jcr.findings import Finding, FindingKind
-from jcr.pipeline import selection
+from jcr.pipeline import backend_selection
 from jcr.pipeline.stages import begun
-from jcr.reconstruct import BACKENDS, Backend, ReconstructOptions, candidates, tries
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
 from scenes import capture_of, reconstruction_of
@@ -121,8 +121,8 @@ def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
     monkeypatch.setattr(convention, "better_reading", lambda *_: ())
-    monkeypatch.setattr(selection, "view_findings", lambda _: ())
-    monkeypatch.setattr(selection, "calibrate_reconstruction", calibrated_once)
+    monkeypatch.setattr(backend_selection, "view_findings", lambda _: ())
+    monkeypatch.setattr(backend_selection, "calibrate_reconstruction", calibrated_once)
 
 
 KNOWN: dict[object, Calibration] = {}
@@ -161,8 +161,8 @@ def auto_result(
             raise answer
         return reconstruction(options.backend, answer, observations)
 
-    monkeypatch.setattr(selection, "reconstruct", answered)
-    made, found = selection.select_reconstruction(capture_of(problem.base_from_gripper), RunOptions())
+    monkeypatch.setattr(backend_selection, "reconstruct", answered)
+    made, found = backend_selection.select_reconstruction(capture_of(problem.base_from_gripper), RunOptions())
     assert [attempt.backend for attempt in found.attempts] == tried
     kept = [attempt for attempt in found.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [made.backend]
@@ -218,7 +218,9 @@ def test_of_two_rejected_the_one_that_shows_a_cause_stays(present: set[str], mon
             uncertain, sheared
         ),
     }
-    monkeypatch.setattr(selection, "calibrate_reconstruction", lambda _, made, __: of_backend[made.backend])
+    monkeypatch.setattr(
+        backend_selection, "calibrate_reconstruction", lambda _, made, __: of_backend[made.backend]
+    )
     poses = problem.recon_from_camera
     kept, tried = auto_result(problem, {"mast3r": poses, "colmap": poses}, monkeypatch)
     assert tried == ["colmap", "mast3r"] and kept.backend == "mast3r"
@@ -250,7 +252,7 @@ def test_of_two_rejected_the_least_leave_one_out_error_stays(
 def test_what_many_features_reject_colours_do_not_accept(present: set[str], monkeypatch: pytest.MonkeyPatch):
     """Direct alignment tests no camera: a stronger fault, which features reject, would get the less honest answer."""
     present |= {"xfeat", "da3"}
-    monkeypatch.setattr(selection, "TEXTURED", 10)
+    monkeypatch.setattr(backend_selection, "TEXTURED", 10)
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good = problem.recon_from_camera
     shuffled = good[np.random.default_rng(4).permutation(8)]
@@ -295,8 +297,8 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
         now_s[0] += 3.0
         return calibration_stage.calibrate_reconstruction(*arguments)
 
-    monkeypatch.setattr(selection, "reconstruct", door)
-    monkeypatch.setattr(selection, "calibrate_reconstruction", slow)
+    monkeypatch.setattr(backend_selection, "reconstruct", door)
+    monkeypatch.setattr(backend_selection, "calibrate_reconstruction", slow)
     calibrate(capture, tmp_path)
     content = json.loads((tmp_path / "calibration.json").read_text())
     colmap, direct = content["attempts"]
@@ -323,7 +325,7 @@ def test_where_nothing_is_found_each_attempt_reports_why(
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         raise RejectedError(f"{options.backend} saw nothing")
 
-    monkeypatch.setattr(selection, "reconstruct", door)
+    monkeypatch.setattr(backend_selection, "reconstruct", door)
     with pytest.raises(RejectedError, match="direct saw nothing; back end colmap failed"):
         calibrate(read_capture(tabletop), tmp_path)
     tried = RunResult(tmp_path).calibration.attempts

@@ -17,7 +17,7 @@ from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.files import locked, write_new, write_text, written_whole
-from jcr.pipeline import selection
+from jcr.pipeline import backend_selection
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.stages import begun, complete, is_unchanged
 from jcr.records import CellCamera
@@ -148,12 +148,12 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(selection, "reconstruct", lambda *_: made)
-        patched.setattr(selection, "calibrate_reconstruction", killed)
+        patched.setattr(backend_selection, "reconstruct", lambda *_: made)
+        patched.setattr(backend_selection, "calibrate_reconstruction", killed)
         with pytest.raises(KeyboardInterrupt):
             calibrate(str(small_capture), tmp_path / "out", backend="colmap")
     assert (tmp_path / "out" / "reconstruction.npz").is_file()
-    monkeypatch.setattr(selection, "reconstruct", lambda *_: pytest.fail("reconstructed again"))
+    monkeypatch.setattr(backend_selection, "reconstruct", lambda *_: pytest.fail("reconstructed again"))
     result = calibrate(str(small_capture), tmp_path / "out", backend="colmap")
     before = RunResult(small_done).gripper_from_camera
     np.testing.assert_allclose(result.gripper_from_camera, before, atol=1e-9)

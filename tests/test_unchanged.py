@@ -13,11 +13,11 @@ import pytest
 import capture_writers as writers
 import jcr
 from conftest import shrunk_capture
+from jcr.backends import ReconstructOptions
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
-from jcr.pipeline import selection
+from jcr.pipeline import backend_selection
 from jcr.pipeline.stages import begun
-from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunOptions
 from scenes import reconstruction_of
@@ -51,8 +51,8 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made.append(options.backend)
         return reconstruction_of(PROBLEM.recon_from_camera[: len(capture)], backend=options.backend)
 
-    monkeypatch.setattr(selection, "reconstruct", reconstruct)
-    monkeypatch.setattr(selection, "view_findings", lambda _: ())
+    monkeypatch.setattr(backend_selection, "reconstruct", reconstruct)
+    monkeypatch.setattr(backend_selection, "view_findings", lambda _: ())
     return made
 
 

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 import jcr
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.drift import Located, Reference, check_series, step_of
 from jcr.calibration.record import write_calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import project
 from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
@@ -38,7 +38,7 @@ from jcr.geometry import (
     transform,
 )
 from jcr.pipeline import recalibrate as recalibrating
-from jcr.pipeline.old_scene import OldScene
+from jcr.pipeline.calibrated_scene import OldScene
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
 from jcr.pipeline.verify import TOLERANCE, of_two_poses

@@ -125,7 +125,7 @@ for name in sys.argv[1:]:
     with contextlib.redirect_stdout(io.StringIO()):
         dispatch([name, "--help"] if name else ["--help"])
     print(name or "jcr", *sorted(heavy & sys.modules.keys()))
-import jcr.cli.run, jcr.pipeline.run
+import jcr.cli.run_calibrate_batch, jcr.pipeline.run
 print("calibrate", *sys.modules)
 """
     first = ["", "run", "calibrate", "check", "map", "view"]

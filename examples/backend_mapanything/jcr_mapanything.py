@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from jcr import Capture, InputError, Reconstruction
+from jcr.backends import Backend, ReconstructOptions, device_of, network_weights
 from jcr.geometry import apply, inverse
-from jcr.pointmaps.grid import image_grid, resize_and_crop
-from jcr.pointmaps.posed import PosedPointmaps
-from jcr.reconstruct import Backend, ReconstructOptions, device_of, network_weights
+from jcr.pointmaps.image_grid import image_grid, resize_and_crop
+from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 
 LONG_EDGE, PATCH = 518, 14
 

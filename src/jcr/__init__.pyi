@@ -1,5 +1,6 @@
 """Public names of jcr; `__init__.py` imports each when it is first used."""
 
+from .backends import ReconstructOptions as ReconstructOptions
 from .calibration.difference import Difference as Difference
 from .calibration.difference import compare as compare
 from .calibration.hand_eye import solve_hand_eye as solve_hand_eye
@@ -8,9 +9,9 @@ from .calibration.record import Calibration as Calibration
 from .calibration.record import PublishedCalibration as PublishedCalibration
 from .capture.options import ReadOptions as ReadOptions
 from .capture.read import read_capture as read_capture
-from .capture.ros import read_ros_camera_info as read_ros_camera_info
-from .capture.ros import read_ros_depth as read_ros_depth
-from .capture.ros import read_ros_image as read_ros_image
+from .capture.ros_messages import read_ros_camera_info as read_ros_camera_info
+from .capture.ros_messages import read_ros_depth as read_ros_depth
+from .capture.ros_messages import read_ros_image as read_ros_image
 from .cell.placement import CameraPlacement as CameraPlacement
 from .cell.placement import CamerasFile as CamerasFile
 from .cell.placement import ImageUse as ImageUse
@@ -32,9 +33,9 @@ from .live.robot import RobotState as RobotState
 from .live.server import LiveServer as LiveServer
 from .live.session import LiveSession as LiveSession
 from .live.session import SessionOptions as SessionOptions
+from .pipeline.calibrated_scene import NewImages as NewImages
 from .pipeline.check import Examination as Examination
 from .pipeline.check import check_capture as check_capture
-from .pipeline.old_scene import NewImages as NewImages
 from .pipeline.run import add_camera as add_camera
 from .pipeline.run import build_map as build_map
 from .pipeline.run import calibrate as calibrate
@@ -45,11 +46,10 @@ from .pipeline.touch import touch as touch
 from .pipeline.verify import Move as Move
 from .pipeline.verify import Verification as Verification
 from .pipeline.verify import verify_run as verify_run
-from .pipeline.watch import Verified as Verified
+from .pipeline.verify_history import Verified as Verified
 from .pointmaps.global_alignment.align import Alignment as Alignment
 from .pointmaps.global_alignment.align import global_align as global_align
-from .pointmaps.pairs import PairPredictions as PairPredictions
-from .reconstruct import ReconstructOptions as ReconstructOptions
+from .pointmaps.pair_predictions import PairPredictions as PairPredictions
 from .records import Budget as Budget
 from .records import Capture as Capture
 from .records import CellCamera as CellCamera
@@ -69,12 +69,12 @@ from .records import Uncertainty as Uncertainty
 from .result import RunOptions as RunOptions
 from .result import RunResult as RunResult
 from .result import load_run as load_run
-from .scene.distance import DistanceGrid as DistanceGrid
 from .scene.map_file import load_map as load_map
 from .scene.options import CloudOptions as CloudOptions
 from .scene.options import MapOptions as MapOptions
 from .scene.scene_map import Sample as Sample
 from .scene.scene_map import SceneMap as SceneMap
+from .scene.signed_distance import DistanceGrid as DistanceGrid
 from .scene.uncertainty import MapUncertainty as MapUncertainty
 from .segments.measure import Measurement as Measurement
 from .segments.options import SegmentOptions as SegmentOptions

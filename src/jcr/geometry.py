@@ -17,7 +17,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
-from jcr.rounding import HUGE
+from jcr.number_format import HUGE
 
 Transform = Float[ndarray, "4 4"]
 Transforms = Float[ndarray, "*batch 4 4"]

@@ -15,6 +15,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jcr.backends import ReconstructOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import (
     AnyCalibration,
@@ -23,7 +24,7 @@ from jcr.calibration.record import (
     PublishedCalibration,
     read_calibration,
 )
-from jcr.capture.added import read_added
+from jcr.capture.added_capture import read_added
 from jcr.capture.read import read_capture
 from jcr.cell.added_cameras import read_added_cameras
 from jcr.cell.placement import CamerasFile, read_cameras
@@ -32,9 +33,8 @@ from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
 from jcr.files import read_bytes
-from jcr.reconstruct import ReconstructOptions
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
-from jcr.records.npz import read_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import FILE as MAP
 from jcr.scene.map_file import load_map

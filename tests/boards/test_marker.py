@@ -11,10 +11,11 @@ import pytest
 
 import jcr
 import scenes
+from jcr.backends import ReconstructOptions, reconstruct
 from jcr.boards.detection import boards
 from jcr.boards.marker import reconstruct_marker
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.difference import compare
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png
@@ -22,8 +23,7 @@ from jcr.capture.read import read_capture
 from jcr.files import write_bytes
 from jcr.findings import FindingKind
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, step_between, transform
-from jcr.pipeline.selection import select_reconstruction
-from jcr.reconstruct import ReconstructOptions, reconstruct
+from jcr.pipeline.backend_selection import select_reconstruction
 from jcr.records import CellCamera, Intrinsics
 from jcr.result import RunOptions
 from places import SHARED

@@ -15,12 +15,12 @@ from jcr.boards import corners
 from jcr.boards.detection import Sighting, boards
 from jcr.boards.proposal import board_in_view
 from jcr.boards.sheet import PAPERS_MM, as_pdf, board_sheet
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.camera import project
 from jcr.findings import FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Capture, Reconstruction
-from jcr.records.npz import read_reconstruction, write_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction, write_reconstruction
 from simulation.faults import Faults, FaultyCapture, faulty_capture, reconstructed
 
 pytestmark = pytest.mark.slow

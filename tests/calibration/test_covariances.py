@@ -14,7 +14,7 @@ from jcr.calibration.summary import mixed_pair_mm, summary
 from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
 from jcr.geometry import ROOT_FROM_OPTICAL, inverse, retract, rotation_exp, transform
-from jcr.rounding import significant
+from jcr.number_format import significant
 from places import ROOT
 
 ACCEPTED = ROOT / "tests" / "calibrations" / "accepted.json"

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.checks.lengths import depth_check
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration, validated
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.summary import details
 from jcr.camera import rays
 from jcr.capture.images import encode_png, read_depth_images
 from jcr.capture.read import read_capture
-from jcr.depth.measured import with_measured_depth
+from jcr.depth.depth_camera import with_measured_depth
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.findings import Finding, FindingKind

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration, validated
 from jcr.calibration.required_accuracy import advised
-from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.calibration.summary import summary
 from jcr.cli.output import VerboseOutput
-from jcr.cli.run import show, show_calibration
+from jcr.cli.run_calibrate_batch import show, show_calibration
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.records import PosePairs
 from jcr.report.html import report_html

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from jcr.calibration.adjust import adjusted
+from jcr.calibration.bundle_adjustment import adjusted
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.case import Case, Model
-from jcr.calibration.checks.capture import REPETITIVE, share_of_twins
+from jcr.calibration.checks.images import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.estimation.intrinsics_prior import camera_about

@@ -16,7 +16,7 @@ import jcr
 from jcr.capture.frame_choice import best_frames
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
-from jcr.capture.ros import image_of, read_ros_depth
+from jcr.capture.ros_messages import image_of, read_ros_depth
 from jcr.records import Capture, FrameNames
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag

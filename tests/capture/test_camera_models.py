@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 import jcr
 from jcr.capture.intrinsics import intrinsics_of_file
-from jcr.capture.ros import intrinsics_of_ros
+from jcr.capture.ros_messages import intrinsics_of_ros
 from jcr.export import ros
 from jcr.records import Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry

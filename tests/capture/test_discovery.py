@@ -20,7 +20,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.readings import readings_of
 from jcr.estimation.pose_misfit import Misfit, pose_misfit
 from jcr.geometry import inverse, transform
-from jcr.pipeline.decision import decide
+from jcr.pipeline.reading_decision import decide
 from jcr.records import Capture
 from places import ROOT
 from scenes import capture_of
@@ -248,7 +248,7 @@ def test_poses_of_another_capture_and_permuted_ones_fit_no_reading(monkeypatch: 
         fitted.append(len(given[0]))
         return pose_misfit(given[0], given[1])
 
-    monkeypatch.setattr("jcr.pipeline.decision.pose_misfit", counted)
+    monkeypatch.setattr("jcr.pipeline.reading_decision.pose_misfit", counted)
     other = hand_eye_problem(np.random.default_rng(8), 12).base_from_gripper
     for poses in (other, PROBLEM.base_from_gripper[np.random.default_rng(2).permutation(12)]):
         for notation in ("rotvec", "quat:wxyz"):

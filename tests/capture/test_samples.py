@@ -7,7 +7,7 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from jcr.calibration.stage import calibrate_pose_pairs
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.summary import summary
 from jcr.capture.read import format_of, read_source
 from jcr.geometry import scale_translation

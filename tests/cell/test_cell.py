@@ -10,11 +10,12 @@ import pytest
 
 import jcr
 from benchmarks.cameras import answered, wanted
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.checks.effects import effects
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added_cameras import added_camera
+from jcr.cell.place_cameras import _adopted, place_cameras
 from jcr.cell.placement import (
     CameraPlacement,
     CamerasFile,
@@ -22,7 +23,6 @@ from jcr.cell.placement import (
     write_cameras,
 )
 from jcr.cell.rigs import CameraViews, fit_views
-from jcr.cell.stage import _adopted, place_cameras
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.hypotheses import Examined
 from jcr.estimation.intrinsics_prior import camera_with_prior

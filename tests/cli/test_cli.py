@@ -18,7 +18,7 @@ from in_process import run_jcr
 from jcr.calibration.record import Calibration, read_calibration
 from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
-from jcr.cli.use import read_points
+from jcr.cli.map_query_export_view import read_points
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation

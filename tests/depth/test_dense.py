@@ -119,7 +119,7 @@ def test_memory_that_ends_in_a_worker_thread_ends_the_stage(scene: Scene, monkey
     def exhausted(*arguments: object) -> None:
         raise MemoryError("Unable to allocate 5.62 MiB")
 
-    monkeypatch.setattr("jcr.depth.matched.spread_planes", exhausted)
+    monkeypatch.setattr("jcr.depth.patch_match_stereo.spread_planes", exhausted)
     monkeypatch.setattr("jcr.depth.densify.MOST_THREADS", 2)
     with pytest.raises(MemoryError, match="Unable to allocate"):
         _dense(scene, scene.recon_from_camera, scene.tracks)
@@ -155,7 +155,7 @@ def test_neighbours_are_first_those_that_see_the_points_from_15_degrees_away() -
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
     from jcr.depth.consistency import agreement, inverse_depth_evidence
-    from jcr.depth.matched import grid, relative
+    from jcr.depth.patch_match_stereo import grid, relative
 
     poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
     inverse_depth = np.ones((4, PINHOLE.height, PINHOLE.width), np.float32)

@@ -10,9 +10,9 @@ import pytest
 from benchmarks.coverage import FACTOR, predicted
 from capture_writers import write_easy_handeye2
 from in_process import run_jcr
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration
 from jcr.calibration.robot_errors import errors_of
-from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.capture.read import read_source
 from jcr.estimation.prediction import assumed, predict, typical_camera
 from jcr.geometry import scale_translation

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 import jcr
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.stage import calibrate_pose_pairs
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations

@@ -42,7 +42,7 @@ from simulation.scenes import make_scene, solid_labels
 from simulation.truth import read_truth
 
 if TYPE_CHECKING:
-    from jcr.export.views import PosedImages
+    from jcr.export.nerfstudio_colmap import PosedImages
     from jcr.scene.scene_map import SceneMap
 
 DOUBT = "scale: every view rotates about <one> point -- vary the distance"
@@ -362,7 +362,7 @@ INTRINSICS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3,
 @pytest.fixture
 def views(tmp_path: Path) -> "PosedImages":
     """Three noisy images through intrinsics with all five coefficients, and the exact pixels of 60 points."""
-    from jcr.export.views import PosedImages
+    from jcr.export.nerfstudio_colmap import PosedImages
 
     rng = np.random.default_rng(5)
     folder = tmp_path / "capture"
@@ -395,7 +395,7 @@ def views(tmp_path: Path) -> "PosedImages":
 
 @pytest.mark.parametrize(("undistorted", "read"), [(False, "read_binary"), (True, "read_text")])
 def test_colmap_model_reprojects_points(views: "PosedImages", undistorted: bool, read: str, tmp_path: Path):
-    from jcr.export.views import write_colmap
+    from jcr.export.nerfstudio_colmap import write_colmap
 
     out = tmp_path / "model"
     write_colmap(out, views, provenance("base_link", DOUBT), ExportOptions(undistort=undistorted))
@@ -420,7 +420,7 @@ def test_colmap_model_reprojects_points(views: "PosedImages", undistorted: bool,
 
 @pytest.mark.parametrize("undistorted", [False, True])
 def test_nerfstudio_cameras_see_points_as_images_do(views: "PosedImages", undistorted: bool, tmp_path: Path):
-    from jcr.export.views import write_nerfstudio
+    from jcr.export.nerfstudio_colmap import write_nerfstudio
 
     out = tmp_path / "splat"
     cloud = analytic_scene.cloud(300)

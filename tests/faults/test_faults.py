@@ -30,7 +30,7 @@ from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import scale_translation
 from jcr.pipeline import stages
-from jcr.records.npz import read_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.result import RunResult
 from simulation.problems import hand_eye_problem
 from waiting import until

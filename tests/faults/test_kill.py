@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 
 from jcr.calibration.record import read_calibration
 from jcr.cli import main
-from jcr.records.npz import read_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
@@ -27,7 +27,9 @@ WRITES = 10
 """Times that a run writes a file."""
 PROCESSES = multiprocessing.get_context("forkserver")
 # What a run imports is imported once: what is killed before it works has done nothing.
-PROCESSES.set_forkserver_preload(["jcr.cli.run", "jcr.pipeline.run", "jcr.sfm.colmap", "jcr.report.html"])
+PROCESSES.set_forkserver_preload(
+    ["jcr.cli.run_calibrate_batch", "jcr.pipeline.run", "jcr.sfm.colmap", "jcr.report.html"]
+)
 
 
 def is_locked(path: Path) -> bool:

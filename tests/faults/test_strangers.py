@@ -33,14 +33,14 @@ from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import natural, pair
 from jcr.capture.read import read_source
-from jcr.capture.ros import read_ros_depth, read_ros_image
+from jcr.capture.ros_messages import read_ros_depth, read_ros_image
 from jcr.cli import dispatch
 from jcr.errors import InputError, shown
 from jcr.geometry import Similarity, transform
 from jcr.records import Intrinsics, Reading, Tracks
-from jcr.records.npz import read_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud, write_cloud
-from jcr.segments.segments import read_labels
+from jcr.segments.segmentation import read_labels
 from jcr.sfm.given import reconstruct_given
 from scenes import NO_TRACKS, capture_of, cloud_of, hand_eye_of, maps_of, reconstruction_of
 from scripted_capture import a_capture, still_frames
@@ -223,7 +223,7 @@ from types import SimpleNamespace
 sys.path[:0] = {paths}
 import jcr
 from jcr.capture.images import read_depth_images, read_image
-from jcr.capture.ros import image_of, read_ros_image
+from jcr.capture.ros_messages import image_of, read_ros_image
 from test_strangers import labelled
 folder = Path({folder!r})
 image = SimpleNamespace(format="png", data=(folder / "image.png").read_bytes())
@@ -349,7 +349,7 @@ def test_images_in_messages_are_read_or_refused(what: str):
 
 def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_path: Path):
     """Three images of each stop are damaged, as by a camera that is switched on."""
-    from jcr.capture.recording import Recording, capture_of_recording
+    from jcr.capture.frame_extraction import Recording, capture_of_recording
 
     poses = np.repeat(hand_eye_problem(np.random.default_rng(0), 6).base_from_gripper, 5, axis=0)
     draw = np.random.default_rng(1)
@@ -429,8 +429,8 @@ def test_two_images_share_no_label_image(tmp_path: Path):
 
 @pytest.mark.parametrize("undistort", [False, True])
 def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
+    from jcr.export.nerfstudio_colmap import PosedImages, write_nerfstudio
     from jcr.export.options import ExportOptions
-    from jcr.export.views import PosedImages, write_nerfstudio
 
     images = ("1.jpg", "1.png", "1.PNG")
     for k, name in enumerate(images):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.findings import FindingKind, kinds_of, without_consequences
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.pipeline.check import check_capture

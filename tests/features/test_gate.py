@@ -8,9 +8,9 @@ from numpy import ndarray
 
 from jcr.camera import project
 from jcr.estimation.closed_form import motions
-from jcr.features.gate import Pair, classify_pairs, rotation_of_x
 from jcr.features.matchers import estimate_geometry, hidden, still_cells
-from jcr.features.pairs import hand_eye_of_pairs
+from jcr.features.pair_choice import hand_eye_of_pairs
+from jcr.features.pair_verification import Pair, classify_pairs, rotation_of_x
 from jcr.features.two_view import CameraMotion, camera_motions
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
 from jcr.records import Intrinsics

@@ -80,7 +80,7 @@ def test_a_rotated_image_is_matched_when_it_is_rotated_back(roll: float, tableto
 @pytest.mark.long
 def test_a_chessboard_before_a_plain_background(real_captures: Path):
     """SIFT registers none of its images; what says which way round the board is, is the robot."""
-    from jcr.calibration.stage import calibrate_reconstruction
+    from jcr.calibration.calibrate import calibrate_reconstruction
     from jcr.geometry import rotation_between_deg
     from jcr.sfm.colmap import reconstruct_colmap
 

@@ -25,9 +25,9 @@ from jcr.capture.images import read_image, read_one_channel
 from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import natural
 from jcr.capture.read import read_source
-from jcr.capture.ros import image_of, read_ros_depth, read_ros_image
+from jcr.capture.ros_messages import image_of, read_ros_depth, read_ros_image
 from jcr.errors import InputError
-from jcr.export.views import _file_names
+from jcr.export.nerfstudio_colmap import _file_names
 from jcr.files import path_inside
 from jcr.live.page import PACKAGE
 from jcr.report.render import render

@@ -88,7 +88,7 @@ def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_th
     assert np.abs(away / np.sqrt(np.diag(batch.covariance)[:6])).max() < 1e-3, "the files round"
     assert np.allclose(result.covariance, batch.covariance, rtol=1e-2, atol=0)
     # A run of the same folder begins with that reconstruction.
-    monkeypatch.setattr("jcr.pipeline.selection.reconstruct", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr("jcr.pipeline.backend_selection.reconstruct", lambda *_: pytest.fail("made again"))
     run = jcr.calibrate(tmp_path / "capture", tmp_path / "run")
     assert np.allclose(run.gripper_from_camera, result.gripper_from_camera, rtol=0, atol=1e-9)
     assert (tmp_path / "run" / "reconstruction.npz").is_file()

@@ -82,7 +82,7 @@ def test_the_record_has_residuals_and_no_covariance_and_is_read_back(tmp_path: P
 @pytest.mark.skipif(not (FIXTURES / "make_synthetic.py").is_file(), reason="../shared/align is absent")
 def test_the_alignment_is_as_accurate_as_the_published_one(tmp_path: Path):
     from jcr.paper.alignment import align
-    from jcr.pointmaps.pairs import read_pairs
+    from jcr.pointmaps.pair_predictions import read_pairs
 
     made, result = tmp_path / "pairs.npz", tmp_path / "aligned.npz"
     subprocess.run([sys.executable, FIXTURES / "make_synthetic.py", "128", "96", "10", made], check=True)

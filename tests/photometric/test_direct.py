@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.camera import rays
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture

@@ -88,7 +88,7 @@ class Fake:
 
     def __call__(self, views):
         from jcr.pointmaps.da3 import grid_of
-        from jcr.pointmaps.posed import PosedPointmaps
+        from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 
         rotation_deg, bend = self.errors
         rng = np.random.default_rng(1)
@@ -119,7 +119,7 @@ def reconstructed(capture: Capture, predict) -> Reconstruction:
 
 
 def test_matches_by_colour_put_predicted_cameras_right(capture: Capture) -> None:
-    from jcr.calibration.stage import calibrate_reconstruction
+    from jcr.calibration.calibrate import calibrate_reconstruction
 
     found = reconstructed(capture, Fake())
     assert found.evidence is None and "refined" in found.notes[-1]
@@ -144,7 +144,7 @@ def test_matches_by_colour_put_predicted_cameras_right(capture: Capture) -> None
 
 def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
     from jcr.pointmaps.any_view import Views
-    from jcr.pointmaps.grid import ImageGrid, prepare_images
+    from jcr.pointmaps.image_grid import ImageGrid, prepare_images
     from jcr.pointmaps.reconstruction import refine
 
     unknown = replace(capture, intrinsics=None)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from jcr.capture.images import read_image
-from jcr.pointmaps.grid import image_grid, prepare_images, resize_and_crop
+from jcr.pointmaps.image_grid import image_grid, prepare_images, resize_and_crop
 from jcr.records import Intrinsics
 from places import SHARED
 from scenes import capture_of

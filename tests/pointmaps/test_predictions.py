@@ -15,8 +15,8 @@ from jcr.errors import InputError
 from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
 from jcr.hub import Weights
 from jcr.pointmaps import predictions
-from jcr.pointmaps.grid import PreparedImages
-from jcr.pointmaps.pairs import complete_pairs, pairs_from_arrays
+from jcr.pointmaps.image_grid import PreparedImages
+from jcr.pointmaps.pair_predictions import complete_pairs, pairs_from_arrays
 from jcr.pointmaps.predictions import reconstruct_predictions
 from jcr.records import Capture, Intrinsics, Reconstruction
 from scenes import capture_of

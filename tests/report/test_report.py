@@ -14,16 +14,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.estimation.observability import excitation
 from jcr.geometry import inverse, transform
+from jcr.number_format import decimals_of, significant
 from jcr.records import COVARIANCE_ORDER, CellCamera, Reconstruction
 from jcr.report.html import report_html
 from jcr.report.images import MAGNIFIED
 from jcr.report.motion import excitation_bars
 from jcr.result import RunResult
-from jcr.rounding import decimals_of, significant
 from jcr.scene.cloud import point_cloud
 from jcr.scene.options import MapOptions
 from jcr.segments.tabletop import label_tabletop
@@ -251,7 +251,9 @@ def test_a_rejected_calibration_is_not_recommended(run: RunResult):
     found = Elements(with_reconstruction(run.with_parts(capture=of_sliding), sliding))
     text = found.text
     assert "Rejected:" in text and "does not support the result" in text and "Accepted:" not in text
-    assert not any("data-copy" in attributes for _, attributes in found.found), "a rejected transform is not copied"
+    assert not any("data-copy" in attributes for _, attributes in found.found), (
+        "a rejected transform is not copied"
+    )
     bars = list(excitation_bars(excitation(still, run.found.gripper_from_camera)))
     assert [kind for kind, *_ in bars] == ["rejected"] * 3 + ["used"] * 4
 

@@ -388,7 +388,7 @@ def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Pa
 
 
 def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
-    from jcr.scene.seen import CROSSED, HIT, carve
+    from jcr.scene.seen_space import CROSSED, HIT, carve
 
     side = np.linspace(-0.05, 0.05, 101)
     wall = np.stack([*np.meshgrid(side, side), np.full((101, 101), 0.002)], -1).reshape(-1, 3)
@@ -410,7 +410,7 @@ def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
 def test_priors_make_surfaces_and_nothing_free() -> None:
     from jcr.scene.build import build_scene
     from jcr.scene.options import MapOptions
-    from jcr.scene.seen import CROSSED, HIT, carve
+    from jcr.scene.seen_space import CROSSED, HIT, carve
 
     whole = analytic_scene.cloud(20_000)
     left = whole.points_in_base[:, 0] < 0

@@ -10,7 +10,7 @@ import pytest
 
 from jcr.calibration.record import Calibration
 from jcr.camera import rays, resized, undistortion
-from jcr.capture.added import read_added, with_added_images, write_added
+from jcr.capture.added_capture import read_added, with_added_images, write_added
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture

@@ -18,7 +18,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
 from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
-from jcr.segments.segments import label_cloud, read_labels
+from jcr.segments.segmentation import label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
 from scenes import capture_of, hand_eye_of, maps_of, reconstruction_of
 

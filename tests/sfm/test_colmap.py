@@ -12,7 +12,7 @@ from PIL import Image
 
 import jcr
 from capture_writers import write_colmap
-from jcr.calibration.stage import calibrate_reconstruction
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.camera import project
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.read import read_capture

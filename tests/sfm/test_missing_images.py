@@ -11,9 +11,9 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.features.gate import Key
 from jcr.features.matchers import Matcher
 from jcr.features.pair_search import MatchedPairs, match_with_robot
+from jcr.features.pair_verification import Key
 from jcr.geometry import (
     Transforms,
     apply,

@@ -39,6 +39,7 @@ from jcr.findings import (
     without_consequences,
 )
 from jcr.geometry import Similarity, require_rigid
+from jcr.number_format import significant
 from jcr.records import (
     Attempt,
     Capture,
@@ -60,11 +61,10 @@ from jcr.records import (
     RobotNoise,
     Uncertainty,
 )
-from jcr.records.checked import require_fields
+from jcr.records.field_checks import require_fields
 from jcr.records.json_fields import Matrix, Positive, rounded
 from jcr.records.json_file import read_json
-from jcr.records.npz import read_npz, write_npz
-from jcr.rounding import significant
+from jcr.records.reconstruction_npz import read_npz, write_npz
 
 FORMAT = "jcr.calibration/2"
 UNCERTAINTY, ARRAYS = "uncertainty.npz", "jcr.uncertainty/1"

@@ -18,8 +18,8 @@ from jcr.findings import (
     verdict_of,
     without_consequences,
 )
+from jcr.number_format import labelled, significant
 from jcr.records import GivenIntrinsicsResult, Intrinsics, LeaveOneOut, PointUncertaintyOverImage, share_of
-from jcr.rounding import labelled, significant
 
 NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""

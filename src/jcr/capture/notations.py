@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jcr.capture.options import tolerated
 from jcr.errors import InputError, did_you_mean, shown
 from jcr.geometry import nearest_rotation, transform
-from jcr.rounding import HUGE
+from jcr.number_format import HUGE
 
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres in each unit of length."""

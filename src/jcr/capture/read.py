@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import folder as folders
-from jcr.capture import samples
+from jcr.capture import marker_samples
 from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.formats import bag, capture_json, lerobot
 from jcr.capture.notations import notation_of
@@ -23,7 +23,7 @@ FORMATS: dict[str, Any] = {
     "capture": capture_json,
     "bag": bag,
     "lerobot": lerobot,
-    "samples": samples,
+    "samples": marker_samples,
     "table": folders,
 }
 """Reader module of each format, in the order in which the formats are tested."""

@@ -25,8 +25,8 @@ from jcr.capture.notations import (
 from jcr.capture.options import ReadOptions, tolerated
 from jcr.errors import InputError
 from jcr.geometry import inverse
+from jcr.number_format import HUGE, significant
 from jcr.records import Reading
-from jcr.rounding import HUGE, significant
 
 Numbers = Float[ndarray, "n c"]
 Candidate = tuple[Reading, Float[ndarray, "n 4 4"]]

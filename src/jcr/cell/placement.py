@@ -15,10 +15,10 @@ from jcr.errors import InputError, first_fault
 from jcr.files import write_text
 from jcr.findings import Finding, Verdict, doubt_of, strongest_first, verdict_of, warnings_of
 from jcr.geometry import skew
+from jcr.number_format import significant
 from jcr.records import CellCamera, IntrinsicsAndStd, Mount
 from jcr.records.json_fields import Covariance6, Matrix, Part, Spread, Spread3
 from jcr.records.json_file import read_json
-from jcr.rounding import significant
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"
 

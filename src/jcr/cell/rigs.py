@@ -13,8 +13,8 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
-from jcr.calibration.checks.capture import SAME
 from jcr.calibration.checks.effects import EXAMINED_FROM, effects_of_fit
+from jcr.calibration.checks.images import SAME
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors

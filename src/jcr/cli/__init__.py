@@ -17,37 +17,37 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-from jcr.allocator import MORE_MEMORY, require_address_space
 from jcr.cli.output import Quiet
 from jcr.errors import InputError, RejectedError, did_you_mean, printable
+from jcr.memory import MORE_MEMORY, require_address_space
 
 GROUPS = {
     "calibrate": {
-        "run.run": "calibrate a capture, build the map, and write the report",
-        "run.calibrate": "calibrate a capture without the map",
-        "run.add-camera": "locate a fixed camera from its images of a run's scene",
-        "run.batch": "run many captures, on this machine or a Ray cluster",
+        "run_calibrate_batch.run": "calibrate a capture, build the map, and write the report",
+        "run_calibrate_batch.calibrate": "calibrate a capture without the map",
+        "run_calibrate_batch.add-camera": "locate a fixed camera from its images of a run's scene",
+        "run_calibrate_batch.batch": "run many captures, on this machine or a Ray cluster",
     },
     "use": {
-        "use.export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
-        "use.query": "query the map at points: occupancy, distance, colour, label",
-        "use.measure": "measure the support plane and the objects on it",
-        "use.view": "show a run in 3D, in the browser",
-        "use.map": "build or rebuild the map of a run",
+        "map_query_export_view.export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
+        "map_query_export_view.query": "query the map at points: occupancy, distance, colour, label",
+        "map_query_export_view.measure": "measure the support plane and the objects on it",
+        "map_query_export_view.view": "show a run in 3D, in the browser",
+        "map_query_export_view.map": "build or rebuild the map of a run",
     },
     "check": {
-        "check.check": "check a capture before the calibration, in seconds (a fixed camera: up to minutes)",
-        "check.verify": "test with a few new images whether the camera has moved",
-        "check.compare": "test whether the uncertainties of two calibrations explain their difference",
-        "check.touch": "compare points that the robot's tip touches with the map",
+        "check_verify_compare.check": "check a capture before the calibration, in seconds (fixed camera: up to minutes)",
+        "check_verify_compare.verify": "test with a few new images whether the camera has moved",
+        "check_verify_compare.compare": "test whether the uncertainties of two calibrations explain their difference",
+        "check_verify_compare.touch": "compare points that the robot's tip touches with the map",
     },
     "prepare": {
         "capture.capture": "take a capture live, with its accuracy after each image",
-        "prepare.board": "draw a calibration board to print",
+        "board_docs_models.board": "draw a calibration board to print",
     },
     "more": {
-        "prepare.models": "list back ends with their licences; download weights",
-        "prepare.docs": "print the pages of the manual",
+        "board_docs_models.models": "list back ends with their licences; download weights",
+        "board_docs_models.docs": "print the pages of the manual",
     },
 }
 """Commands and their descriptions by group; a key is MODULE.COMMAND."""
@@ -132,7 +132,7 @@ def _dispatched(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
         raise InputError(f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (--help)")
-    from jcr.cli.usage import parsed
+    from jcr.cli.arguments import parsed
 
     try:
         record = parsed(command(name), f"jcr {name}", rest)

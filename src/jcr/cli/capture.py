@@ -18,7 +18,7 @@ from jcr.files import locked
 from jcr.live.cameras import open_camera
 from jcr.live.robot import states_of
 from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
-from jcr.rounding import labelled
+from jcr.number_format import labelled
 
 if TYPE_CHECKING:
     from jcr.result import RunResult
@@ -70,7 +70,7 @@ class CaptureCommand:
 
     def main(self) -> int:
         """Take images until the user ends or `--until-accurate` is met, and calibrate with all."""
-        from jcr.cli.check import verification_lines
+        from jcr.cli.check_verify_compare import verification_lines
         from jcr.live.calibration import LiveCalibration
         from jcr.live.server import LiveServer
         from jcr.pipeline.verify import verify_run

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.compiled import compiled, inlined
+from jcr.numba_compile import compiled, inlined
 
 SEEN_THROUGH = 0.01
 """Relative difference of depth: a neighbour whose depth at a point is farther by more sees through this point. Beside

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.allocator import give_back
 from jcr.camera import pinhole_inside, rays, undistortion
 from jcr.capture.images import read_image
 from jcr.depth.options import DepthOptions
 from jcr.geometry import apply, inverse, transform
+from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
@@ -157,8 +157,8 @@ def dense_pointmaps(
     With `before`, only later images are matched, the scene may have changed, and `priors` is ignored; the result has
     all m images.
     """
-    from jcr.depth.fused import fused_depth
-    from jcr.depth.matched import match_depth
+    from jcr.depth.fusion import fused_depth
+    from jcr.depth.patch_match_stereo import match_depth
 
     threads = min(os.cpu_count() or 1, MOST_THREADS)
     images = colors, recon_from_camera, pinhole, neighbours

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from jcr.depth.densify import pointmaps_of, undistorted
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
-from jcr.records.npz import read_npz, require_shapes, write_npz
+from jcr.records.reconstruction_npz import read_npz, require_shapes, write_npz
 
 FILE = "depth.npz"
 FORMAT = "jcr.depth/2"

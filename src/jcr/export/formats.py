@@ -20,15 +20,15 @@ from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.extras import extra
 from jcr.files import written_whole
 from jcr.geometry import scale_translation, transform
+from jcr.number_format import significant
 from jcr.options import checked_options
 from jcr.result import CLOUD, RunResult
-from jcr.rounding import significant
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
-    from jcr.export.views import PosedImages
+    from jcr.export.nerfstudio_colmap import PosedImages
     from jcr.records import Intrinsics, PointCloud, Pointmaps
     from jcr.scene.scene_map import SceneMap
 
@@ -61,25 +61,25 @@ FORMATS = (
     ExportFormat("easy_handeye2", "hand_eye.calib", ".calib for its publisher", "ros.easy_handeye2", "mount path.stem"),
     ExportFormat("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager",
                  "ros.camera_info", "camera_frame"),
-    ExportFormat("ply", "cloud.ply", "points, colours, labels", "views.write_cloud", "cloud notes"),
-    ExportFormat("glb", "map.glb", "mesh of the seen surface with colours", "volume.write_glb", "scene map_notes"),
+    ExportFormat("ply", "cloud.ply", "points, colours, labels", "nerfstudio_colmap.write_cloud", "cloud notes"),
+    ExportFormat("glb", "map.glb", "mesh of the seen surface with colours", "planner_maps.write_glb", "scene map_notes"),
     ExportFormat("octomap", "map.bt", "occupied, free and unknown voxels",
-                 "volume.write_octomap", "scene map_notes options"),
-    ExportFormat("esdf", "esdf.npz", "voxels of signed distance", "volume.write_esdf", "scene map_notes options"),
+                 "planner_maps.write_octomap", "scene map_notes options"),
+    ExportFormat("esdf", "esdf.npz", "voxels of signed distance", "planner_maps.write_esdf", "scene map_notes options"),
     ExportFormat("spheres", "spheres.npz", "spheres that cover what is solid",
-                 "volume.write_spheres", "scene map_notes options"),
+                 "planner_maps.write_spheres", "scene map_notes options"),
     ExportFormat("nerfstudio", "nerfstudio/", "transforms.json, images and first points for a splat or NeRF",
-                 "views.write_nerfstudio", "views cloud notes options"),
+                 "nerfstudio_colmap.write_nerfstudio", "views cloud notes options"),
     ExportFormat("colmap", "colmap/", "COLMAP model in the base frame, binary and text",
-                 "views.write_colmap", "views notes options"),
+                 "nerfstudio_colmap.write_colmap", "views notes options"),
     ExportFormat("depth", "depth/", "depth and colour images with their cameras, for TSDF mappers",
-                 "views.write_depth", "pointmaps views notes options"),
+                 "nerfstudio_colmap.write_depth", "pointmaps views notes options"),
     ExportFormat("lerobot", "cameras.parquet", "cameras of a LeRobot data set, by episode",
-                 "dataset.write_lerobot", "episodes notes"),
+                 "lerobot.write_lerobot", "episodes notes"),
     ExportFormat("mjcf", "hand_eye.xml", "camera for MuJoCo", "simulators.mjcf", "mount"),
     ExportFormat("usd", "hand_eye.usda", "camera for Isaac Sim and others that read USD", "simulators.usd", "mount"),
     ExportFormat("rerun", "run.rrd", "recording for the Rerun viewer",
-                 "volume.write_rrd", "views cloud scene map_notes"),
+                 "planner_maps.write_rrd", "views cloud scene map_notes"),
 )
 # fmt: on
 
@@ -153,7 +153,7 @@ def write_run(
 
 def _sound_runs(out: Path, options: ExportOptions) -> list[Path]:
     """Return the runs of a batch that are not rejected (with `options.force` all), or the run `out` alone."""
-    from jcr.export.dataset import runs_in
+    from jcr.export.lerobot import runs_in
 
     folders = runs_in(out)
     sound = [one for one in folders if options.force or RunResult(one).calibration.doubt is None]
@@ -340,7 +340,7 @@ class ExportedRun:
     @property
     def episodes(self) -> list[dict[str, Any]]:
         """Row of each run of an episode of a LeRobot data set."""
-        from jcr.export.dataset import episodes_of
+        from jcr.export.lerobot import episodes_of
 
         return episodes_of(self.folders)
 
@@ -358,7 +358,7 @@ class ExportedRun:
         The camera poses are those of the reconstruction after one similarity transform, so they agree with each other
         to a fraction of a pixel. Poses computed from the gripper poses of most arms do not.
         """
-        from jcr.export.views import PosedImages
+        from jcr.export.nerfstudio_colmap import PosedImages
 
         calibration, capture, found = self.run.of_wrist_camera()
         base_from_recon = calibration.base_from_recon

@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.ndimage import binary_dilation, label
 
 from jcr.camera import HALF_PIXEL, unproject
-from jcr.features.gate import Key, Pair
+from jcr.features.pair_verification import Key, Pair
 from jcr.features.two_view import camera_motions
 from jcr.records import Intrinsics
 

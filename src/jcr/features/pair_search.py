@@ -15,7 +15,17 @@ from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, unproject
 from jcr.estimation.closed_form import motions
-from jcr.features.gate import (
+from jcr.features.matchers import Geometries, Matcher, matrices, still_cells
+from jcr.features.pair_choice import (
+    ALL_PAIRS_UP_TO,
+    FIRST_NEIGHBOURS,
+    NEIGHBOURS,
+    hand_eye_of_pairs,
+    near_pairs,
+    pairs_of_common_scene,
+    repeats,
+)
+from jcr.features.pair_verification import (
     SYSTEMATIC,
     SYSTEMATIC_OF_GUESS,
     Gate,
@@ -24,16 +34,6 @@ from jcr.features.gate import (
     RotationOfX,
     agreeing_motions,
     classify_pairs,
-)
-from jcr.features.matchers import Geometries, Matcher, matrices, still_cells
-from jcr.features.pairs import (
-    ALL_PAIRS_UP_TO,
-    FIRST_NEIGHBOURS,
-    NEIGHBOURS,
-    hand_eye_of_pairs,
-    near_pairs,
-    pairs_of_common_scene,
-    repeats,
 )
 from jcr.features.two_view import starting_motions
 from jcr.features.upright import by_quarters, rolls

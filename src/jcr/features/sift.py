@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from jcr.features.gate import Key
+from jcr.features.pair_verification import Key
 from jcr.progress import Progress, steps
 
 WORKING_SIZE_PX = 1600

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.extras import extra, install
-from jcr.features.gate import Key
+from jcr.features.pair_verification import Key
 from jcr.progress import Progress, silent, steps
 
 LONG_SIDE_PX = 1024

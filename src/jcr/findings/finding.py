@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.errors import RejectedError
 from jcr.findings.messages import MOTIONS, REACHED, FindingKind
-from jcr.rounding import significant
+from jcr.number_format import significant
 
 Severity = Literal["rejects", "warns", "informs"]
 Concerns = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]

@@ -9,7 +9,7 @@ from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from jcr.calibration.checks.capture import STILL as MOVED
+from jcr.calibration.checks.images import STILL as MOVED
 from jcr.capture.checks import far_faults
 from jcr.capture.formats.capture_json import FILE, frame_of, read_capture_json, stated_fields
 from jcr.capture.images import encode_png, read_image, size_of_all

@@ -15,11 +15,11 @@ from jcr.capture.images import encode_jpeg, read_image
 from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import accuracy_line, advice, faults, finding_lines, reached_accuracy
 from jcr.live.session import LiveSession, SessionState
+from jcr.number_format import significant
 from jcr.records import Intrinsics
 from jcr.report.render import render
 from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
-from jcr.rounding import significant
 
 PACKAGE = "jcr.live"
 PARTS = ("head", "images")

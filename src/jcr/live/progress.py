@@ -9,8 +9,8 @@ from numpy import ndarray
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.summary import leave_one_out_text
 from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
+from jcr.number_format import significant
 from jcr.records import LeaveOneOut
-from jcr.rounding import significant
 
 CONFIRMING_IMAGES = 8
 """Least number of used images with which the leave-one-out error is reported and can confirm the accuracy."""

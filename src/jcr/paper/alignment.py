@@ -18,7 +18,7 @@ from jcr.pointmaps.global_alignment.align import PIXELS, Alignment
 from jcr.pointmaps.global_alignment.initial_estimate import initial_state
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import AlignmentState, initial_depth
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pair_predictions import PairPredictions
 from jcr.progress import Progress, silent
 
 Depths = Float[ndarray, "n p"]

@@ -13,7 +13,7 @@ from jcr.scene.build import carved_workspace
 from jcr.scene.fields import Field, Fields
 from jcr.scene.options import MapOptions
 from jcr.scene.scene_map import SceneMap
-from jcr.scene.seen import without_doubts
+from jcr.scene.seen_space import without_doubts
 from jcr.scene.train import rows_inside, workspace_box
 
 FREQUENCIES, HIDDEN = 10, 256

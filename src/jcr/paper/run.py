@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jcr.backends import ReconstructOptions, candidates, device_of, network_weights, ready_backend
 from jcr.calibration.record import PublishedCalibration
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.pose_equations import paper_residuals
@@ -15,12 +16,11 @@ from jcr.geometry import inverse, scale_translation
 from jcr.paper.alignment import align
 from jcr.paper.hand_eye import LEAST_IMAGES, solve
 from jcr.pointmaps.dust3r.dust3r import predict_capture
-from jcr.pointmaps.pairs import complete_pairs, read_arrays
-from jcr.pointmaps.posed import PosedPointmaps
+from jcr.pointmaps.pair_predictions import complete_pairs, read_arrays
+from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 from jcr.pointmaps.predictions import predicted_pairs, reconstruct_predictions
 from jcr.pointmaps.reconstruction import reconstruct_pointmaps
 from jcr.progress import Progress
-from jcr.reconstruct import ReconstructOptions, candidates, device_of, network_weights, ready_backend
 from jcr.records import Capture, ImageVerdict, PaperResiduals, PosePairs, Reconstruction
 from jcr.sfm.given import reconstruct_given
 from jcr.sfm.model import quiet_colmap

@@ -6,7 +6,7 @@ gripper frame. Rotations about this direction and tilts of it are tried on image
 goes from coarse to fine, with a depth for each of a few thousand pixels. In the last stages every camera moves by
 itself, so that disagreement with the robot's motion shows.
 
-Pointmaps are matched near edges; plain surfaces between the edges are filled with planes (jcr/depth/priors.py). The
+Pointmaps are matched near edges; plain surfaces between them are filled with planes (jcr/depth/planar_priors.py). The
 page `plain-tables` describes when this back end works, and its errors.
 """
 
@@ -35,6 +35,7 @@ from jcr.photometric.coarse_to_fine import (
     free_directions,
     tied_directions,
 )
+from jcr.photometric.hand_eye_search import SIZES, search
 from jcr.photometric.residuals import (
     FAINT,
     Cameras,
@@ -47,7 +48,6 @@ from jcr.photometric.residuals import (
     sample,
     squared_misfit,
 )
-from jcr.photometric.search import SIZES, search
 from jcr.progress import Progress, silent
 from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tracks
 

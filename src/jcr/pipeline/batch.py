@@ -25,8 +25,8 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import locked, write_text
 from jcr.findings import Verdict, sentence, verdict_of
+from jcr.pipeline.episode_agreement import agreement, letter
 from jcr.pipeline.options import BatchOptions
-from jcr.pipeline.placements import agreement, letter
 from jcr.pipeline.run import run
 from jcr.progress import Progress, silent
 from jcr.report.render import render

@@ -8,14 +8,14 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.boards.proposal import proposed
+from jcr.calibration.calibrate import calibrate_pose_pairs, calibration_of, checked_case
 from jcr.calibration.case import Case
-from jcr.calibration.checks.capture import as_causes, view_findings
-from jcr.calibration.checks.left_out import left_out_poses
+from jcr.calibration.checks.images import as_causes, view_findings
+from jcr.calibration.checks.unused_images import left_out_poses
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration
 from jcr.calibration.required_accuracy import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
-from jcr.calibration.stage import calibrate_pose_pairs, calibration_of, checked_case
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import RejectedError
@@ -40,7 +40,7 @@ from jcr.findings import (
     verdict_of,
 )
 from jcr.geometry import largest_motion
-from jcr.pipeline.decision import decided_by_images, first_reading
+from jcr.pipeline.reading_decision import decided_by_images, first_reading
 from jcr.progress import Progress
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.sfm.colmap import reconstruct_colmap

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from jcr.backends import BackendName
+from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.stage import calibrate_pose_pairs
-from jcr.capture.added import with_added_images
+from jcr.capture.added_capture import with_added_images
 from jcr.capture.formats.capture_json import kept
 from jcr.capture.formats.capture_json import read as read_kept
 from jcr.capture.options import ReadOptions
@@ -24,8 +25,8 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.files import locked, write_text
 from jcr.options import checked_options
-from jcr.pipeline.decision import decided_by_images
-from jcr.pipeline.selection import NEARLY_ALL, NothingFoundError, solved_pairs
+from jcr.pipeline.backend_selection import NEARLY_ALL, NothingFoundError, solved_pairs
+from jcr.pipeline.reading_decision import decided_by_images
 from jcr.pipeline.stages import (
     FIRST,
     REST,
@@ -39,7 +40,6 @@ from jcr.pipeline.stages import (
     place,
 )
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BackendName
 from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud

@@ -15,13 +15,13 @@ import numpy as np
 from numpy import ndarray
 
 from jcr import __version__
-from jcr.allocator import give_back
+from jcr.backends import candidates, device_of
 from jcr.boards.proposal import proposed
 from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibration, write_calibration
 from jcr.calibration.summary import log
-from jcr.capture.added import FOLDER as ADDED
-from jcr.capture.added import write_added
-from jcr.cell.carried import with_moving_parts
+from jcr.capture.added_capture import FOLDER as ADDED
+from jcr.capture.added_capture import write_added
+from jcr.cell.moving_parts import with_moving_parts
 from jcr.cell.placement import FILE as CAMERAS
 from jcr.cell.placement import CamerasFile, write_cameras
 from jcr.depth.densify import densify
@@ -30,11 +30,16 @@ from jcr.depth.depth_npz import is_made_from, write_depth
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_text
 from jcr.findings import sentence
-from jcr.pipeline.selection import NothingFoundError, select_published, select_reconstruction, timings_of
+from jcr.memory import give_back
+from jcr.pipeline.backend_selection import (
+    NothingFoundError,
+    select_published,
+    select_reconstruction,
+    timings_of,
+)
 from jcr.progress import Progress, silent
-from jcr.reconstruct import candidates, device_of
 from jcr.records import Capture, ImageVerdict, Reconstruction
-from jcr.records.npz import FORMAT, write_reconstruction
+from jcr.records.reconstruction_npz import FORMAT, write_reconstruction
 from jcr.result import (
     CALIBRATION,
     CLOUD,
@@ -292,7 +297,7 @@ def write_state(result: RunResult) -> None:
 
 def place(result: RunResult, progress: Progress) -> CamerasFile:
     """Calibrate the other cameras of the cell in the run's reconstruction; return the content of cameras.json."""
-    from jcr.cell.stage import place_cameras
+    from jcr.cell.place_cameras import place_cameras
 
     parts = result.capture, result.others, result.reconstruction, result.found
     return place_cameras(*parts, result.state.options.calibrate, progress)[0]
@@ -327,13 +332,13 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     """
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added_images import extend
-    from jcr.depth.measured import with_measured_depth
+    from jcr.depth.depth_camera import with_measured_depth
     from jcr.paper.fields import published_scene
     from jcr.scene.build import build_scene
     from jcr.scene.cloud import point_cloud
     from jcr.scene.uncertainty import map_uncertainty
     from jcr.segments.measure import measure_objects
-    from jcr.segments.segments import image_labels, label_cloud
+    from jcr.segments.segmentation import image_labels, label_cloud
     from jcr.segments.tabletop import fit_support
 
     options, capture, hand_eye, added = result.state.options, result.capture, result.solved, result.added

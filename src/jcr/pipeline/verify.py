@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.drift import Cause, detectable
 from jcr.calibration.options import GRASPING
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.distributions import chi2
@@ -20,9 +20,23 @@ from jcr.estimation.robot_noise import REACH
 from jcr.files import locked
 from jcr.findings import Verdict
 from jcr.geometry import Transform, retract, step_between
-from jcr.pipeline.old_scene import NewImages, calibration_digest, name_of, new_images, old_scene, require_new
+from jcr.pipeline.calibrated_scene import (
+    NewImages,
+    calibration_digest,
+    name_of,
+    new_images,
+    old_scene,
+    require_new,
+)
 from jcr.pipeline.options import TOLERANCE
-from jcr.pipeline.watch import History, Verified, read_history, with_capture, without_part, write_history
+from jcr.pipeline.verify_history import (
+    History,
+    Verified,
+    read_history,
+    with_capture,
+    without_part,
+    write_history,
+)
 from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.result import RunResult
@@ -267,7 +281,9 @@ def _fixed_cameras(
     The old and the new pose of the camera are estimated together, so that errors of the wrist camera's calibration
     cancel in their difference. Raises RejectedError if the images share too few features with the scene.
     """
-    from jcr.cell.stage import place_cameras  # imports pycolmap, which the command-line help does not need
+    from jcr.cell.place_cameras import (
+        place_cameras,  # imports pycolmap, which the command-line help does not need
+    )
 
     _, capture, reconstruction = run.of_wrist_camera()
     calibrate_options = run.state.options.calibrate

@@ -15,8 +15,8 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import nearest_rotation
 from jcr.hub import Weights
-from jcr.pointmaps.grid import ImageGrid, prepare_images, resize_and_crop
-from jcr.pointmaps.posed import PosedPointmaps
+from jcr.pointmaps.image_grid import ImageGrid, prepare_images, resize_and_crop
+from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 from jcr.pointmaps.reconstruction import reconstruct_pointmaps
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction

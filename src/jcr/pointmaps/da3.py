@@ -22,8 +22,8 @@ from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.hub import Weights
 from jcr.pointmaps.any_view import Predict, Views, normalised, output, reconstruct_any_view, rigid
-from jcr.pointmaps.grid import ImageGrid
-from jcr.pointmaps.posed import PosedPointmaps
+from jcr.pointmaps.image_grid import ImageGrid
+from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction
 

@@ -10,15 +10,15 @@ from numpy import ndarray
 from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, require_rigid
-from jcr.pointmaps.grid import ImageGrid, PreparedImages, image_grid, read_colors
-from jcr.pointmaps.pairs import (
+from jcr.pointmaps.image_grid import ImageGrid, PreparedImages, image_grid, read_colors
+from jcr.pointmaps.pair_predictions import (
     PairPredictions,
     camera_of_arrays,
     check_arrays,
     pairs_from_arrays,
     read_arrays,
 )
-from jcr.pointmaps.posed import PosedPointmaps, fit_pinhole
+from jcr.pointmaps.posed_pointmaps import PosedPointmaps, fit_pinhole
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress
 from jcr.records import Capture, Reconstruction

@@ -12,9 +12,9 @@ from jcr.extras import xfeat_is_installed
 from jcr.features.matchers import FeatureName
 from jcr.geometry import apply, inverse
 from jcr.pointmaps.global_alignment.align import global_align
-from jcr.pointmaps.grid import PreparedImages
-from jcr.pointmaps.pairs import PairPredictions
-from jcr.pointmaps.posed import FOCAL_STD, PosedPointmaps, fit_pinhole, published_covariance
+from jcr.pointmaps.image_grid import PreparedImages
+from jcr.pointmaps.pair_predictions import PairPredictions
+from jcr.pointmaps.posed_pointmaps import FOCAL_STD, PosedPointmaps, fit_pinhole, published_covariance
 from jcr.progress import Progress, silent
 from jcr.records import CameraEvidence, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.sfm.colmap import reconstruct_near_cameras

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, PlainSerializer, computed_field
 from jcr.errors import InputError
 from jcr.findings import Finding, remedy, unobservable
 from jcr.records.capture import Intrinsics
-from jcr.records.checked import require_fields
+from jcr.records.field_checks import require_fields
 from jcr.records.json_fields import (
     Covariance7,
     Matrix,

@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import ConfigDict, Field, StringConstraints
 
 from jcr.errors import InputError
-from jcr.records.checked import require_counts, require_fields, require_finite, require_rows
+from jcr.records.field_checks import require_counts, require_fields, require_finite, require_rows
 from jcr.records.json_fields import Positive, Spread
 
 DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]

@@ -20,9 +20,9 @@ from pydantic import (
 
 from jcr.errors import InputError, other_size
 from jcr.geometry import require_rigid
+from jcr.number_format import HUGE
 from jcr.records.capture import COEFFICIENTS, DistortionModel, FrameNames, Intrinsics, Mount, Reading
 from jcr.records.json_fields import Positive
-from jcr.rounding import HUGE
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,63}"
 """Regular expression of valid names of cameras and arms."""

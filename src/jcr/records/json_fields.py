@@ -16,7 +16,7 @@ from pydantic import (
     PlainSerializer,
 )
 
-from jcr.rounding import HUGE
+from jcr.number_format import HUGE
 
 
 class Part(BaseModel):

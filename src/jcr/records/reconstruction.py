@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.records.capture import Intrinsics
-from jcr.records.checked import require_fields, require_finite, require_rows
+from jcr.records.field_checks import require_fields, require_finite, require_rows
 from jcr.records.json_fields import Positive
 
 

@@ -13,8 +13,8 @@ from jcr.calibration.record import AnyCalibration
 from jcr.calibration.summary import facts
 from jcr.cell.placement import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
+from jcr.number_format import decimals_of, significant
 from jcr.report.render import Content, label_colors
-from jcr.rounding import decimals_of, significant
 from jcr.segments.measure import Measurement
 
 StageOptions = Mapping[str, Mapping[str, Any]]

@@ -7,6 +7,7 @@ from jcr.calibration.record import FailedCalibration, PublishedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.readings import decision_in_words
 from jcr.errors import InputError, printable
+from jcr.number_format import significant
 from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
 from jcr.report.images import images_section
@@ -17,7 +18,6 @@ from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
 from jcr.report.verdict import failure_section, head
 from jcr.result import RunResult
-from jcr.rounding import significant
 
 UNNAMED = {"poses", "capture", "metadata"}
 """Stems of file names that are the same in every capture, so that the folder names the capture."""

@@ -12,10 +12,10 @@ import numpy as np
 from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import encode_jpeg, read_image
 from jcr.geometry import apply, inverse
+from jcr.number_format import significant
 from jcr.records import Capture, ImageVerdict, Intrinsics
 from jcr.report.render import Content
 from jcr.result import RunResult
-from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Largest and smallest width (px) of the images in the report, and largest number of all their pixels, about 1 MB."""

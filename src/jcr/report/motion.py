@@ -6,10 +6,10 @@ import numpy as np
 
 from jcr.calibration.summary import given_in_words, seen_in_words
 from jcr.estimation.observability import WEAK, excitation
+from jcr.number_format import significant
 from jcr.records import Excitation
 from jcr.report.render import Content
 from jcr.result import RunResult
-from jcr.rounding import significant
 
 PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
 """Names of the seven components of a direction, in records.COVARIANCE_ORDER."""

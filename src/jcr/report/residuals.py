@@ -3,10 +3,10 @@
 import numpy as np
 
 from jcr.calibration.summary import leave_one_out_text
+from jcr.number_format import significant
 from jcr.report.images import shown_names
 from jcr.report.render import Content
 from jcr.result import RunResult
-from jcr.rounding import significant
 
 NOTICEABLE = 1.05
 """Ratio of noise with systematic errors to random noise, above which the report states both."""

@@ -22,9 +22,9 @@ from jcr.export.ros import (
     urdf_origin,
 )
 from jcr.geometry import apply, roll_pitch_yaw
+from jcr.number_format import significant
 from jcr.records import COVARIANCE_ORDER, Intrinsics, Mount
 from jcr.report.render import Content
-from jcr.rounding import significant
 
 FIXED_AXES = "fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll)"
 WIDTH, HEIGHT, MARGIN = 440, 320, 34

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.calibration.summary import leave_one_out_text, only_centre_meets, worst_direction
 from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
+from jcr.number_format import significant
 from jcr.report.render import Content
-from jcr.rounding import significant
 
 Tile = tuple[str, str, str, bool]
 """Number in a box: its name, the number as text, a remark, and whether it is one of the main numbers."""

@@ -16,7 +16,7 @@ from jcr.records import PointCloud
 from jcr.scene.fields import Field, Fields, Lattice
 from jcr.scene.options import MapOptions
 from jcr.scene.scene_map import SceneMap
-from jcr.scene.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
+from jcr.scene.seen_space import HIT, SeenGrid, carve, dilate, halve, without_doubts
 from jcr.scene.train import NEAR, rows_inside, train, workspace_box, workspace_rays
 
 HIDDEN = 32

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from jcr.scene.fields import Lattice
     from jcr.scene.scene_map import SceneMap
-    from jcr.scene.seen import SeenGrid
+    from jcr.scene.seen_space import SeenGrid
 
 FILE = "map.safetensors"
 SLACK = 1e-3
@@ -107,7 +107,7 @@ def _scene_of(about: "MapHeader", tensors: "dict[str, Tensor]") -> "SceneMap":
 
     from jcr.scene.fields import Field, Fields
     from jcr.scene.scene_map import SceneMap
-    from jcr.scene.seen import SeenGrid
+    from jcr.scene.seen_space import SeenGrid
     from jcr.scene.uncertainty import MapUncertainty
 
     for name, tensor in tensors.items():

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.files import write_bytes
-from jcr.scene.distance import DistanceGrid, distance_grid
 from jcr.scene.fields import Fields, in_chunks, interpolate_grid
-from jcr.scene.seen import CROSSED, HIT, SeenGrid, dilate, halve
+from jcr.scene.seen_space import CROSSED, HIT, SeenGrid, dilate, halve
+from jcr.scene.signed_distance import DistanceGrid, distance_grid
 from jcr.scene.uncertainty import MapUncertainty
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2

@@ -26,7 +26,7 @@ def surface_mesh(
     from skimage.measure import marching_cubes
 
     from jcr.scene.fields import in_chunks
-    from jcr.scene.seen import HIT, SeenGrid, dilate
+    from jcr.scene.seen_space import HIT, SeenGrid, dilate
 
     seen = scene.seen
     hit = dilate((seen.state & HIT) != 0, 1)

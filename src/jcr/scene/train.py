@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from jcr.errors import InputError
 from jcr.records import PointCloud
 from jcr.scene.fields import Field
-from jcr.scene.seen import CROSSED, HIT, SeenGrid
+from jcr.scene.seen_space import CROSSED, HIT, SeenGrid
 
 CLEARANCE = 0.1
 """Distance (cells) of the nearest positives and negatives of occupancy behind and before a surface point."""

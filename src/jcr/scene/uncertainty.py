@@ -11,7 +11,7 @@ from jcr.calibration.record import Calibration
 from jcr.camera import NORMALIZED
 from jcr.estimation.point_uncertainty import point_covariance
 from jcr.records import COVARIANCE_ORDER, PointCloud
-from jcr.records.checked import require_fields, require_finite
+from jcr.records.field_checks import require_fields, require_finite
 from jcr.records.json_fields import Positive, Spread
 
 if TYPE_CHECKING:

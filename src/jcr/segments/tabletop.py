@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
-from jcr.depth.support import robust_std, support_plane
+from jcr.depth.support_plane import robust_std, support_plane
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, transform
 from jcr.records import PRIOR, PointCloud

@@ -19,7 +19,6 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from jcr.allocator import give_back
 from jcr.camera import (
     HALF_PIXEL,
     USUAL_FOCAL,
@@ -35,6 +34,7 @@ from jcr.extras import extra
 from jcr.features.matchers import FeatureName, Geometries, Matcher
 from jcr.features.pair_search import MatchedPairs, match_alone, match_with_robot
 from jcr.features.sift import WORKING_SIZE_PX, SiftFeatures, grey_of
+from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.missing_images import ROUGHLY, model_near_cameras, nearer_to_robot, with_missing_images

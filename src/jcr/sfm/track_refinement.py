@@ -17,8 +17,8 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import by_point, project, unproject
-from jcr.compiled import compiled, inlined
 from jcr.geometry import inverse
+from jcr.numba_compile import compiled, inlined
 from jcr.records import Intrinsics, Tracks
 
 MOST_PX = 4.0

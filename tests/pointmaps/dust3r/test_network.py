@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jcr.allocator import give_back
+from jcr.memory import give_back
 from places import SHARED
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from jcr.backends import BACKENDS, ReconstructOptions, network_weights
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.hub import Weights
-from jcr.pointmaps.grid import PreparedImages, image_grid
-from jcr.pointmaps.pairs import PairPredictions, complete_pairs, read_pairs
-from jcr.reconstruct import BACKENDS, ReconstructOptions, network_weights
+from jcr.pointmaps.image_grid import PreparedImages, image_grid
+from jcr.pointmaps.pair_predictions import PairPredictions, complete_pairs, read_pairs
 from jcr.records import Intrinsics
 from simulation.pairs import write_pairs
 

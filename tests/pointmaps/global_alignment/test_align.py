@@ -10,7 +10,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.geometry import Similarity, fit_similarity, rotation_between_deg
 from jcr.paper.alignment import align
 from jcr.pointmaps.global_alignment.align import Alignment, global_align
-from jcr.pointmaps.pairs import complete_pairs, window_pairs
+from jcr.pointmaps.pair_predictions import complete_pairs, window_pairs
 from simulation.pairs import PairErrors, PairTruth, synthetic_pairs
 
 SMALL = (48, 36)

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.record import Calibration
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.camera import unproject
 from jcr.estimation.point_uncertainty import point_covariance
 from jcr.findings import FindingKind
 from jcr.findings.finding import text
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.pointmaps.global_alignment import align
-from jcr.pointmaps.grid import ImageGrid, PreparedImages
-from jcr.pointmaps.pairs import PairPredictions, complete_pairs
+from jcr.pointmaps.image_grid import ImageGrid, PreparedImages
+from jcr.pointmaps.pair_predictions import PairPredictions, complete_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.records import Capture, Reconstruction
-from jcr.records.npz import read_reconstruction, write_reconstruction
+from jcr.records.reconstruction_npz import read_reconstruction, write_reconstruction
 from scenes import capture_of
 from simulation.pairs import PairErrors, synthetic_pairs
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.adjust import solved
+from jcr.calibration.bundle_adjustment import solved
 from jcr.calibration.case import Case
 from jcr.distributions import f as f_distribution
 from jcr.estimation.boards import FEWEST_CORNERS, STRETCH_STD, STRETCHED_STD

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import solution_of, solved
+from jcr.calibration.bundle_adjustment import solution_of, solved
 from jcr.calibration.case import MATERIAL, Case, with_prism
 from jcr.calibration.options import GRASPING
 from jcr.calibration.record import Calibration
@@ -39,7 +39,7 @@ from jcr.estimation.robot_noise import solve_equations
 from jcr.estimation.solve import Solution, solve
 from jcr.findings import Concerns, Finding, FindingKind, joined, kinds_of
 from jcr.geometry import Poses, step_between
-from jcr.rounding import significant
+from jcr.number_format import significant
 
 MOST_EFFECTS = 3
 """Largest number of effects that are reported for one capture."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.adjust import solved
+from jcr.calibration.bundle_adjustment import solved
 from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.record import Calibration
 from jcr.calibration.verdict import with_uncertainty
@@ -23,8 +23,8 @@ from jcr.estimation.problem import SCALE, LinearPrior
 from jcr.estimation.solve import size_of_boards
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import apply, inverse
+from jcr.number_format import significant
 from jcr.records import Capture, DepthCheck, LengthCheck, Reconstruction
-from jcr.rounding import significant
 
 DEPTH_STD, NETWORK_STD = 0.02, 0.05
 """Relative standard deviations of the scale of depth cameras (errors of a few percent) and networks (up to 10 %)."""

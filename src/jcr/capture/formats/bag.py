@@ -14,10 +14,10 @@ from numpy import ndarray
 
 from jcr.capture.documents import read_content
 from jcr.capture.formats import foxglove
+from jcr.capture.frame_extraction import Picture, Recording, capture_of_recording
 from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import PosesAt, Stamps, TfTree, interpolated_poses, poses_of_numbers, speed
-from jcr.capture.recording import Picture, Recording, capture_of_recording
-from jcr.capture.ros import image_of, intrinsics_of_ros
+from jcr.capture.ros_messages import image_of, intrinsics_of_ros
 from jcr.capture.urdf_chain import read_arm
 from jcr.errors import LONGEST_SHOWN, InputError, shown
 from jcr.extras import extra

@@ -11,8 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from jcr.allocator import require_memory
 from jcr.extras import extra
+from jcr.memory import require_memory
 
 ENCODINGS = ("protobuf", "json")
 """Encodings of messages; those of ROS are read by rosbags."""

@@ -13,11 +13,11 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field
 
 from jcr.capture.documents import Table
+from jcr.capture.frame_extraction import Picture, Recording, capture_of_recording
 from jcr.capture.images import require_pixels
 from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import interpolated_poses, speed
 from jcr.capture.readings import readings_of, undecided
-from jcr.capture.recording import Picture, Recording, capture_of_recording
 from jcr.capture.urdf_chain import RecordedArm, read_arm
 from jcr.errors import InputError, shown
 from jcr.extras import extra

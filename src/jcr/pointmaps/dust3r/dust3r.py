@@ -13,14 +13,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from jcr.allocator import give_back
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.closed_form import motions
-from jcr.features.pairs import NEIGHBOURS, near_pairs
+from jcr.features.pair_choice import NEIGHBOURS, near_pairs
 from jcr.hub import HUB_FILES, Weights
+from jcr.memory import give_back
 from jcr.pointmaps.dust3r.network import Dust3r, EncodedImages
-from jcr.pointmaps.grid import PreparedImages, prepare_images
-from jcr.pointmaps.pairs import PairPredictions, complete_pairs, window_pairs
+from jcr.pointmaps.image_grid import PreparedImages, prepare_images
+from jcr.pointmaps.pair_predictions import PairPredictions, complete_pairs, window_pairs
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction

@@ -16,7 +16,7 @@ from jcr.errors import InputError
 from jcr.pointmaps.global_alignment.gauss_newton import WEIGHT_ROUNDS, AlignmentSolution, solve
 from jcr.pointmaps.global_alignment.observations import AlignmentProblem, observe
 from jcr.pointmaps.global_alignment.residuals import fitted_depth
-from jcr.pointmaps.pairs import PairPredictions, read_pairs
+from jcr.pointmaps.pair_predictions import PairPredictions, read_pairs
 from jcr.progress import Progress, silent
 from jcr.records import Intrinsics
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.pointmaps.pairs import PairPredictions
+from jcr.pointmaps.pair_predictions import PairPredictions
 
 CELL_SIDE = 4
 """Number of cells along each side of the image, whose mean residuals measure the correlation of residuals."""

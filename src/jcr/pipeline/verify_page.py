@@ -11,10 +11,10 @@ from numpy import ndarray
 from jcr.calibration.drift import Step
 from jcr.distributions import chi2
 from jcr.files import write_text
+from jcr.number_format import significant
 from jcr.pipeline.verify import Verification
-from jcr.pipeline.watch import Verified
+from jcr.pipeline.verify_history import Verified
 from jcr.report.render import render
-from jcr.rounding import significant
 
 PAGE = "verify.html"
 WIDTH, HEIGHT = 640, 150

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.compiled import random_state
-from jcr.depth.patch_match import NOT_COMPARED, random_planes, spread_planes
-from jcr.depth.window import LANES, MARGIN, PAD, blocks_of, quads, windows
+from jcr.depth.patch_match_loops import NOT_COMPARED, random_planes, spread_planes
+from jcr.depth.window_correlation import LANES, MARGIN, PAD, blocks_of, quads, windows
 from jcr.geometry import inverse
+from jcr.numba_compile import random_state
 from jcr.records import Intrinsics
 
 COMPARED = 5
@@ -61,7 +61,7 @@ class _Level:
     def views(
         self, i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"]
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """Return the arguments `packed`, `motions`, `windows` and `k` of patch_match.py to match image i with `others`.
+        """Return the arguments `packed`, `motions`, `windows` and `k` of the loops that match image i with `others`.
 
         `others` are n image indices. `packed` are their greys, packed by `quads`; `motions` (n,12) are the rows of K R,
         and K t, to each of them. `windows` are those of image i; `k` is (fx, fy, cx, cy).

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import jaxtyped
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jcr.allocator import require_memory
 from jcr.errors import InputError, first_fault, shown
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
+from jcr.memory import require_memory
 from jcr.records.reconstruction import Reconstruction
 
 FORMAT = "jcr.reconstruction/9"

@@ -15,8 +15,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional as F
 
-from jcr.compiled import compiled
 from jcr.errors import InputError
+from jcr.numba_compile import compiled
 
 CROSSED, HIT = 1, 2
 """Bits of a cell's state: crossed by rays, hit by a ray's end; 0 = unseen."""

@@ -18,8 +18,8 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.compiled import compiled, inlined, uniform
-from jcr.depth.window import LANES, STRIDE, correlate
+from jcr.depth.window_correlation import LANES, STRIDE, correlate
+from jcr.numba_compile import compiled, inlined, uniform
 
 MOST_SLANTED = 0.12
 """Least cosine between a plane's normal and the ray; a more slanted surface shows too few pixels to be matched."""
@@ -69,7 +69,7 @@ def _score(v, u, tried, packed, windows, k, near, each):
     The pixels are those of row v from column u on. Rows 0 to 2 of `tried` (7,16) are their planes p, with p·x = 1 in
     the camera frame. Rows 3 to 5 are overwritten with the input of `correlate`. The correlations are written to `each`
     (n,16), one row per neighbour. `packed` (n,y,x) are the neighbours' greys from `quads`, and `near` comes from
-    `_look`. `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy.
+    `_look`. `windows` is the result of `window_correlation.windows` for this image; `k` is fx, fy, cx, cy.
     """
     su, sv = np.float32(STRIDE) / k[0], np.float32(STRIDE) / k[1]
     for lane in range(LANES):
@@ -183,9 +183,10 @@ def spread_planes(found, packed, motions, windows, k, search, number, state):
 
     `found` (4,h,w), plane and score, is changed in place.
     `packed` (n,y,x) are the neighbours' greys from `quads`, and `motions` (n,12) the rows of K R, and K t, to them.
-    `windows` is the result of window.py's `windows` for this image; `k` is fx, fy, cx, cy. `number` counts the passes
-    at one resolution. Rows are visited downwards for even and upwards for odd numbers (Bleyer et al. 2011, section
-    3.2); in pass 0 the planes have no score yet. `search` is (lowest inverse depth, highest one, relative change to try,
+    `windows` is the result of `window_correlation.windows` for this image; `k` is fx, fy, cx, cy. `number` counts the
+    passes at one resolution. Rows are visited downwards for even and upwards for odd numbers (Bleyer et al. 2011,
+    section 3.2); in pass 0 the planes have no score yet. `search` is (lowest inverse depth, highest one, relative
+    change to try,
     number of tries). The change of inverse depth and normal halves from try to try. `state` is the state of the random
     generator `uniform`, which is updated.
     """

@@ -16,15 +16,15 @@ from jcr.cli.output import Output, VerboseOutput, numbers
 from jcr.errors import InputError
 from jcr.findings import sentence, warnings_of
 from jcr.findings.finding import joined
+from jcr.number_format import labelled, significant
 from jcr.pipeline.options import TOLERANCE
 from jcr.progress import Progress, progress_bars
 from jcr.records import Capture, PosePairs
-from jcr.rounding import labelled, significant
 
 if TYPE_CHECKING:
     from jcr.pipeline.check import Examination
     from jcr.pipeline.verify import Verification
-    from jcr.pipeline.watch import Verified
+    from jcr.pipeline.verify_history import Verified
 
 MOST_POSES = 5
 """Number of poses that `jcr verify --check-poses` prints; more images than that add little."""
@@ -319,7 +319,7 @@ class VerifyCommand:
         from jcr.calibration.summary import summary
         from jcr.pipeline.recalibrate import recalibrate
         from jcr.pipeline.verify import verify_run
-        from jcr.pipeline.watch_page import write_page
+        from jcr.pipeline.verify_page import write_page
 
         if self.check_poses:
             return self._print_poses()
@@ -365,7 +365,7 @@ class VerifyCommand:
         """Print the gripper poses of the run at which new images would tell most; return the exit status 0."""
         from scipy.spatial.transform import Rotation
 
-        from jcr.pipeline.watch import telling_poses
+        from jcr.pipeline.verify_history import telling_poses
         from jcr.result import load_run
 
         run, lines, facts = load_run(self.out), list[str](), list[dict[str, object]]()

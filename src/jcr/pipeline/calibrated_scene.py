@@ -23,9 +23,9 @@ from jcr.capture.images import read_image
 from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, motion_length, require_rigid
 from jcr.pipeline.stages import fingerprint
-from jcr.pipeline.watch import NewCapture
+from jcr.pipeline.verify_history import NewCapture
 from jcr.records import Capture, CellCamera
-from jcr.records.npz import read_npz, write_npz
+from jcr.records.reconstruction_npz import read_npz, write_npz
 from jcr.result import RunResult
 from jcr.sfm.register import ImageFeatures, KnownImages, Registration, features, registrations
 

@@ -18,8 +18,8 @@ from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.findings import sentence
+from jcr.number_format import decimals_of
 from jcr.progress import progress_bars
-from jcr.rounding import decimals_of
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 

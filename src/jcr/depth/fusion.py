@@ -11,9 +11,9 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.depth.consistency import agreement, inverse_depth_evidence
-from jcr.depth.matched import Relative, grid, relative
-from jcr.depth.priors import ON_PLANE, PlanarPrior, evened, planar_prior
-from jcr.depth.support import support_plane
+from jcr.depth.patch_match_stereo import Relative, grid, relative
+from jcr.depth.planar_priors import ON_PLANE, PlanarPrior, evened, planar_prior
+from jcr.depth.support_plane import support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 

@@ -15,8 +15,8 @@ from numba.core.typing.templates import signature
 from numba.extending import intrinsic
 from numpy import ndarray
 
-from jcr.compiled import compiled
-from jcr.depth.lanes import INT, LONG, Lanes
+from jcr.depth.vector_registers import INT, LONG, Lanes
+from jcr.numba_compile import compiled
 
 LANES = 16
 """Number of pixels of a row that are correlated at once; the rows of all maps are padded to a multiple of it."""
@@ -119,7 +119,7 @@ def correlate(typing, out, slot, packed, motions, windows, place, tried):
     context, which is not used. `windows` is the result of `windows` for this image; `place` is the row v and the block
     of 16 columns in it. `packed` (n,y,x) are the other images (made by `quads`, padded by `PAD`). Rows 3 and 4 of
     `tried` (7,16) are the changes of inverse depth from one window sample to the next, in u and v. Row 5 is the inverse
-    depth. The array motions[slot] (12,16) has the projections into the other images (`near` of patch_match.py).
+    depth. The array motions[slot] (12,16) has the projections into the other images (`near` in patch_match_loops).
     """
     sums = signature(types.void, out, types.int64, packed, motions, windows, place, tried)
 
@@ -153,9 +153,9 @@ def _window_there(motion: list[Lanes], plane: list[Lanes], size: list[Lanes]) ->
 
     The places are six vectors (px). They are the centre x, y, and the steps x, y from one window sample to the next in
     a row, and in a column. A window lies inside if its centre is in the image without padding and no sample leaves the
-    padding. `motion` are the 12 numbers of the projection (`near` of patch_match.py). `plane` is the change of inverse
-    depth from one sample to the next in a row, in a column, and the inverse depth. `size` is width and height of the
-    padded images. The homography of a window is approximated as affine about its centre, which saves divisions.
+    padding. `motion` are the 12 numbers of the projection (`near` in patch_match_loops). `plane` is the change of
+    inverse depth from one sample to the next in a row, in a column, and the inverse depth. `size` is width and height of
+    the padded images. The homography of a window is approximated as affine about its centre, which saves divisions.
     """
     (x0, y0, z0, x1, y1, z1, x, y, z, tx, ty, tz), (du, dv, here) = motion, plane
     z = z + tz * here

@@ -21,7 +21,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.verdict import MAX_STD
 from jcr.capture.images import read_image
 from jcr.cell.board_images import located_by_board
-from jcr.cell.images import cell_images
+from jcr.cell.cell_problem import cell_images
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part

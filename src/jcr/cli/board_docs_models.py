@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from jcr.backends import BACKENDS, weights_command
 from jcr.cli.output import Output
 from jcr.errors import InputError, did_you_mean
 from jcr.extras import DISTRIBUTION
 from jcr.files import write_bytes
 from jcr.hub import HUB_ID, download
-from jcr.reconstruct import BACKENDS, weights_command
 
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.depth.colour_regions import FEWEST_MATCHED, colour_regions, region_planes
 from jcr.depth.consistency import colours_agree
-from jcr.depth.matched import Relative, grid
-from jcr.depth.regions import FEWEST_MATCHED, colour_regions, region_planes
+from jcr.depth.patch_match_stereo import Relative, grid
 from jcr.records import Intrinsics
 
 ON_PLANE = 0.006

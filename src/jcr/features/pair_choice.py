@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.features.gate import Gate, Key
+from jcr.features.pair_verification import Gate, Key
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 from jcr.records import Intrinsics
 

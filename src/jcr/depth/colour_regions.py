@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.compiled import compiled, inlined
+from jcr.numba_compile import compiled, inlined
 
 SCALE = 0.35
 """Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; it grows with the regions' size."""

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, rays
-from jcr.pointmaps.grid import ImageGrid
+from jcr.pointmaps.image_grid import ImageGrid
 from jcr.records import Intrinsics
 
 SAMPLES = 20_000

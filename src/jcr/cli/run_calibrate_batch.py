@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from jcr.backends import ReconstructOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput
@@ -17,11 +18,10 @@ from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.files import locked
 from jcr.findings.finding import joined
+from jcr.number_format import labelled, significant
 from jcr.pipeline.options import BatchOptions
 from jcr.progress import Progress, progress_bars
-from jcr.reconstruct import ReconstructOptions
 from jcr.records import Capture, PosePairs
-from jcr.rounding import labelled, significant
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
@@ -219,8 +219,8 @@ def _run(
 
     If no back end found a reconstruction, the result's calibration.json contains the reason.
     """
+    from jcr.pipeline.backend_selection import NothingFoundError
     from jcr.pipeline.run import run
-    from jcr.pipeline.selection import NothingFoundError
     from jcr.result import load_run
 
     show_early = partial(show_calibration, capture=capture, output=command.output)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.allocator import require_memory
 from jcr.errors import InputError
-from jcr.pointmaps.grid import ImageGrid
+from jcr.memory import require_memory
+from jcr.pointmaps.image_grid import ImageGrid
 from jcr.records import Intrinsics
 
 ARRAYS = {

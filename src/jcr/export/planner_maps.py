@@ -20,7 +20,7 @@ from jcr.scene.scene_map import FREE, OCCUPIED, SceneMap
 from jcr.scene.surface import surface_mesh
 
 if TYPE_CHECKING:
-    from jcr.export.views import PosedImages
+    from jcr.export.nerfstudio_colmap import PosedImages
 
 MAX_VOXELS = 50_000_000
 _GRIPPER_AXES_M = 0.05

@@ -29,9 +29,9 @@ from jcr.estimation.pose_misfit import (
     pose_misfit,
 )
 from jcr.geometry import Poses, rotation_angle
+from jcr.number_format import significant
 from jcr.progress import Progress
 from jcr.records import Capture, Reading, Reconstruction
-from jcr.rounding import significant
 
 LEAST_MISFIT = 0.3
 """Misfit (mm) below which two readings are not told apart: 0.1 mm and 0.04°, the best of structure from motion."""

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.adjust import adjusted
+from jcr.calibration.bundle_adjustment import adjusted
 from jcr.calibration.case import Case, Model, camera_of
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
-from jcr.calibration.checks.capture import check_mount, check_pieces, check_remarks
 from jcr.calibration.checks.convention import better_reading, check_convention, inverted_pair
 from jcr.calibration.checks.effects import check_effects, effects_of_fit
-from jcr.calibration.checks.left_out import check_pairing
+from jcr.calibration.checks.images import check_mount, check_pieces, check_remarks
 from jcr.calibration.checks.lengths import LEAST_CONTRADICTION, check_lengths, check_predicted_focal
 from jcr.calibration.checks.robot import check_robot, check_smooth_errors
+from jcr.calibration.checks.unused_images import check_pairing
 from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from jcr.allocator import give_back
-from jcr.calibration.checks.capture import as_causes, view_findings
+from jcr.backends import BACKENDS, MARKER, ReconstructOptions, reconstruct, tries
+from jcr.calibration.calibrate import calibrate_reconstruction
+from jcr.calibration.checks.images import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, PublishedCalibration
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate_reconstruction
 from jcr.calibration.summary import leave_one_out_text
 from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
@@ -25,8 +25,8 @@ from jcr.findings import (
     strongest_first,
     text,
 )
+from jcr.memory import give_back
 from jcr.progress import Progress, silent
-from jcr.reconstruct import BACKENDS, MARKER, ReconstructOptions, reconstruct, tries
 from jcr.records import Attempt, Capture, PosePairs, Reconstruction
 from jcr.result import RunOptions
 

@@ -5,8 +5,8 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.calibration.case import MIN_IMAGES, Case
-from jcr.calibration.checks.capture import SAME
 from jcr.calibration.checks.effects import POLICIES, of_step
+from jcr.calibration.checks.images import SAME
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
