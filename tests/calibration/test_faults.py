@@ -29,83 +29,37 @@ from simulation.problems import bent_problem, hand_eye_problem, observed
 
 pytestmark = pytest.mark.slow
 
+SLIPPED = r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png"
 NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
-    "focus follows distance": (
-        Faults(focal_by_distance=0.02),
-        r"the focal length grows by ([\d.]+) ± \S+ % from the nearest view",
-        [2.0],
-        0.3,  # simulated as linear in the distance, named by its logarithm
-    ),
-    "focus scatters": (
-        Faults(focal_scatter=0.01),
-        r"the focal length differs between images by ([\d.]+) % \(rms",
-        [1.0],
-        0.6,
-    ),
+    # Simulated as linear in the distance, named by its logarithm.
+    "focus follows distance": (Faults(focal_by_distance=0.02),
+        r"the focal length grows by ([\d.]+) ± \S+ % from the nearest view", [2.0], 0.3),
+    "focus scatters": (Faults(focal_scatter=0.01),
+        r"the focal length differs between images by ([\d.]+) % \(rms", [1.0], 0.6),
     "zoom": (Faults(zoom=0.03), r"changes by \+([\d.]+) ± \S+ % after 05.png", [3.0], 0.2),
-    "principal point": (
-        Faults(intrinsics=(("cx", 12.0),)),
-        r"a principal point of \(([\d.]+), ([\d.]+)\)",
-        [INTRINSICS.cx + 12, INTRINSICS.cy],
-        3.0,
-    ),
+    "principal point": (Faults(intrinsics=(("cx", 12.0),)), r"a principal point of \(([\d.]+), ([\d.]+)\)",
+        [INTRINSICS.cx + 12, INTRINSICS.cy], 3.0),
     "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
-    "thin prism": (
-        Faults(prism=(0.02, 0.0, 0.01, 0.0)),
-        r"a thin-prism distortion of up to ([\d.]+) ± \S+ px",
-        [5.6],
-        0.6,
-    ),
-    "slight slip": (
-        Faults(slip=(3.6e-3, np.radians(0.8))),
-        r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png",
-        [3.6, 0.8],
-        0.6,
-    ),
+    "thin prism": (Faults(prism=(0.02, 0.0, 0.01, 0.0)),
+        r"a thin-prism distortion of up to ([\d.]+) ± \S+ px", [5.6], 0.6),
+    "slight slip": (Faults(slip=(3.6e-3, np.radians(0.8))), SLIPPED, [3.6, 0.8], 0.6),
     # Another TCP: the adjustment takes it for robot pose noise.
-    "tool changed": (
-        Faults(slip=(0.03, 0.0), robot_noise=(1e-4, 2e-4)),
-        r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png",
-        [30.0, 0.0],
-        1.0,
-    ),
-    "lift too long": (
-        Faults(lengths=(0.0, 0.0, 0.02)),
-        r"along the base's z axis the robot's positions are ([\d.]+) ± \S+ % too long",
-        [2.0],
-        0.5,  # ± 0.2
-    ),
-    "stand leans": (
-        Faults(tilt_by_reach=float(np.radians(4))),
-        r"the robot's base leans towards the gripper by ([\d.]+) ± \S+° per metre of reach",
-        [4.0],
-        0.3,
-    ),
-    "tool sags": (
-        Faults(sag=0.02),
-        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as by a tool",
-        [np.degrees(0.02)],
-        0.1,
-    ),
-    "camera drifts": (
-        Faults(drift=(6e-3, np.radians(2.0))),
-        r"drift on the gripper by ([\d.]+) mm and ([\d.]+)° from the first image to the last",
-        [6.0, 2.0],
-        0.6,
-    ),
-    "base pushed": (
-        Faults(base_moved=(0.01, np.radians(0.5))),
-        r"moved against each other by ([\d.]+) mm and ([\d.]+)° after 05.png",
-        [10.0, 0.5],
-        4.0,  # the rotation is about the base's origin, and moves the scene with it
-    ),
-    "delay": (
-        Faults(delay_s=0.1, view_s=4.0),
-        r"as if read ([\d.]+) ± \S+ of the time from one image to the next too late",
-        [0.025],
-        0.003,
-    ),
-}
+    "tool changed": (Faults(slip=(0.03, 0.0), robot_noise=(1e-4, 2e-4)), SLIPPED, [30.0, 0.0], 1.0),
+    "lift too long": (Faults(lengths=(0.0, 0.0, 0.02)),
+        r"along the base's z axis the robot's positions are ([\d.]+) ± \S+ % too long", [2.0], 0.5),
+    "stand leans": (Faults(tilt_by_reach=float(np.radians(4))),
+        r"the robot's base leans towards the gripper by ([\d.]+) ± \S+° per metre of reach", [4.0], 0.3),
+    "tool sags": (Faults(sag=0.02), r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as by a tool",
+        [np.degrees(0.02)], 0.1),
+    "camera drifts": (Faults(drift=(6e-3, np.radians(2.0))),
+        r"drift on the gripper by ([\d.]+) mm and ([\d.]+)° from the first image to the last", [6.0, 2.0], 0.6),
+    # The rotation is about the base's origin, and moves the scene with it.
+    "base pushed": (Faults(base_moved=(0.01, np.radians(0.5))),
+        r"moved against each other by ([\d.]+) mm and ([\d.]+)° after 05.png", [10.0, 0.5], 4.0),
+    "delay": (Faults(delay_s=0.1, view_s=4.0),
+        r"as if read ([\d.]+) ± \S+ of the time from one image to the next too late", [0.025], 0.003),
+}  # fmt: skip
+"""Faults of a capture, words that name them, their sizes, and how far the named sizes may be off."""
 
 
 OF_CAMERA = [*NAMED][:6]

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import jcr
+from benchmarks.inputs import _outcome
 from capture_writers import rows_as, write_easy_handeye2, write_moveit
 from in_process import run_jcr
 from jcr.capture.discovery import find_images
@@ -24,7 +25,9 @@ from jcr.pipeline.reading_decision import decide
 from jcr.records import Capture
 from places import ROOT
 from scenes import capture_of
+from simulation.layouts import LAYOUTS, Layout
 from simulation.problems import HandEyeProblem, hand_eye_problem
+from simulation.recordings import simulated_recordings
 
 COUNT = 6
 POSES = hand_eye_problem(np.random.default_rng(3), COUNT).base_from_gripper
@@ -50,59 +53,26 @@ def write(file: Path, lines: list[str]) -> Path:
     return file
 
 
-def in_images(folder: Path, *others: str) -> Path:
-    """Write the images below images/ and other pictures beside them."""
-    return draw(draw(folder / "a", [f"images/{name}" for name in NAMES]), [*others], (16, 12), 9)
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
+def test_layouts_of_people_are_read_right_without_options(layout: Layout, tmp_path: Path):
+    """What names and numbers leave open is decided by the camera poses of ten images."""
+    (one,) = simulated_recordings(tmp_path / "simulated", [10])
+    found = _outcome(tmp_path / "layout", layout, one, "", one.base_from_gripper)
+    assert found.kind == "right", found.message
 
 
-def each(folder: Path, name: str) -> None:
-    """Write a matrix for each image."""
-    for k, pose in enumerate(POSES):
-        text = "\n".join(" ".join(map(repr, row)) for row in pose.tolist())
-        write(folder / name.format(k, stem=NAMES[k][:-4]), [text])
-
-
-def index(folder: Path) -> None:
-    """Write poses under names that say nothing, and a file that pairs them with the images."""
+def test_a_file_pairs_poses_of_any_name_with_images(tmp_path: Path):
+    draw(tmp_path, [f"images/{name}" for name in NAMES])
     lines = []
-    for k, (name, row) in enumerate(zip(NAMES, rows_as("quat:xyzw", POSES).tolist(), strict=True)):
-        keys = HEADER.split(",")
-        write(
-            folder / f"data/{'dbfaec'[k]}.yaml",
-            [f"{key}: {value!r}" for key, value in zip(keys, row, strict=True)],
-        )
-        lines += [f"- {{image: images/{name}, pose: data/{'dbfaec'[k]}.yaml}}"]
-    write(folder / "index.yaml", lines)
-
-
-Layout = Callable[[Path], object]
-LAYOUTS: dict[str, Layout] = {
-    "any name": lambda f: write(in_images(f) / "tcp_pose_Fri_Nov_25.txt", [HEADER, *ROWS]),
-    "subfolder": lambda f: write(in_images(f) / "robot/log/data.csv", [HEADER, *ROWS]),
-    "beside the images": lambda f: write(in_images(f) / "images/numbers.dat", [HEADER, *ROWS]),
-    "above": lambda f: [in_images(f), write(f / "poses.txt", [HEADER, *ROWS])],
-    "images and poses in one folder": lambda f: write(draw(f / "a") / "p.txt", [HEADER, *ROWS]),
-    "image column, another order": lambda f: write(in_images(f) / "p.csv", [f"{HEADER},Bild", *sorted(NAMED_ROWS)]),
-    "a file for each image": lambda f: each(in_images(f), "robot/{stem}.txt"),
-    "a file for each image, counted": lambda f: each(in_images(f), "poses/pos{}.txt"),
-    "index": lambda f: index(in_images(f)),
-    "empty rows and a preamble": lambda f: write(
-        in_images(f) / "p.csv", ["# my robot", "", HEADER, *ROWS, ",,,,,,", ""]
-    ),
-    "masks, depth and thumbnails": lambda f: write(
-        in_images(f, *(f"masks/{name}" for name in NAMES), *(f"depth/{name}" for name in NAMES), "images/thumb.png")
-        / "p.csv", [HEADER, *ROWS],
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_folders_are_read_without_options(layout: str, tmp_path: Path):
-    LAYOUTS[layout](tmp_path)
-    got = jcr.read_capture(tmp_path / "a")
+    for name, row, letter in zip(NAMES, rows_as("quat:xyzw", POSES).tolist(), "dbfaec", strict=True):
+        cells = zip(HEADER.split(","), row, strict=True)
+        write(tmp_path / f"data/{letter}.yaml", [f"{key}: {value!r}" for key, value in cells])
+        lines += [f"- {{image: images/{name}, pose: data/{letter}.yaml}}"]
+    write(tmp_path / "index.yaml", lines)
+    got = jcr.read_capture(tmp_path)
     assert [Path(name).name for name in got.images] == NAMES
-    fitting = [got.base_from_gripper] if got.reading else [poses for _, poses in got.candidates]
-    assert any(np.allclose(poses, POSES, rtol=0, atol=1e-9) for poses in fitting)
+    np.testing.assert_allclose(got.base_from_gripper, POSES, atol=1e-9)
     assert any("paired with the images" in note for note in got.notes)
 
 
@@ -150,10 +120,6 @@ def test_a_copy_of_the_poses_in_another_file_counts_once(tmp_path: Path):
 
 
 PROBLEM = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4))
-NOTATIONS = (
-    *("quat:xyzw", "quat:wxyz", "rotvec", "matrix", "matrix:columns"),
-    *("euler:xyz", "euler:ZYX", "euler:ZYZ", "euler:XYZ"),
-)
 
 
 def undecided(
@@ -181,23 +147,6 @@ def assert_refused(
     with pytest.raises(jcr.InputError, match=words) as caught:
         decided(capture, problem, rows)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("notation", "inverted"), [*((one, False) for one in NOTATIONS), ("euler:xyz", True), ("matrix", True)]
-)
-def test_the_right_reading_is_taken_among_all(notation: str, inverted: bool):
-    poses = PROBLEM.base_from_gripper
-    got = decided(undecided(inverse(poses) if inverted else poses, notation))
-    assert got.reading is not None and not got.candidates and got.reading.decided_by == "images"
-    assert (got.reading.notation, got.reading.inverted, got.reading.units[:2]) == (notation, inverted, "mm")
-    assert (
-        got.reading.misfit_mm is not None
-        and got.reading.misfit_mm < 1.0
-        and got.reading.next_best is not None
-    )
-    np.testing.assert_allclose(got.base_from_gripper, poses, atol=1e-9)
 
 
 def test_images_without_a_camera_pose_do_not_change_the_reading():

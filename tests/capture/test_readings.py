@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
-from capture_writers import rows_as
-from jcr.capture.documents import Table, read_tables
+from jcr.capture.documents import Table
 from jcr.capture.notations import (
-    EULERS,
     MAKERS,
     NUMBERS,
     angle_unit,
@@ -217,37 +215,6 @@ def test_names_of_columns_state_the_notation(name: str):
         assert text_of(reading).startswith((reading.columns and f"{reading.columns}: ") + "x y z in m")
 
 
-UNDECIDED = {
-    "q0": (W_FIRST, f"{XYZ} q0 q1 q2 q3", "quat:wxyz", {"quat:wxyz", "quat:xyzw"}),
-    "q1": (QUATERNION, f"{XYZ} q1 q2 q3 q4", "quat:xyzw", {"quat:wxyz", "quat:xyzw"}),
-    "kuka": (as_numbers("euler:ZYX", 1e3, np.degrees(1)), "X Y Z A B C", "euler:ZYX", set(EULERS)),
-    "rx ry rz": (VECTOR, f"{XYZ} rx ry rz", "rotvec", {"rotvec", *EULERS}),
-    "ur log": (VECTOR, " ".join(f"actual_TCP_pose_{k}" for k in range(6)), "rotvec", {"rotvec", *EULERS}),
-    "unnamed": (RPY, "", "euler:xyz", {"rotvec", *EULERS}),
-}
-
-
-@pytest.mark.parametrize("name", UNDECIDED)
-def test_names_that_leave_notations_give_each_of_them(name: str):
-    """The images decide; an option leaves one."""
-    numbers, columns, right, possible = UNDECIDED[name]
-    found = read(table_of(numbers, columns))
-    assert {reading.notation for reading, _ in found} == possible and len(found) >= len(possible)
-    assert sum(np.abs(poses - POSES).max() < 1e-9 for _, poses in found) == 1
-    direct = [one for one in read(table_of(numbers, columns), pose_convention=right)]
-    assert notations(direct) == [right] and direct[0][0].decided_by == "option"
-    np.testing.assert_allclose(direct[0][1], POSES, atol=1e-9)
-
-
-@pytest.mark.parametrize("columns", [16, 12])
-def test_matrices_without_names(columns: int):
-    """The last row of sixteen numbers shows whether they are written by rows or by columns."""
-    for written in (POSES, np.swapaxes(POSES, 1, 2)) if columns == 16 else (POSES[:, :3],):
-        found = read(table_of(written.reshape(12, -1)))
-        assert sorted(reading.inverted for reading, _ in found) == [False, True]
-        np.testing.assert_allclose(found[0][1], POSES, atol=1e-9)
-
-
 def test_numbers_exclude_what_cannot_be():
     """A quaternion is found among more numbers by its length; angles beyond 2π are no radians."""
     joints = np.random.default_rng(0).uniform(-3, 3, (12, 6))
@@ -283,18 +250,6 @@ OTHER = np.hstack([BOARD[:, :3, 3], Rotation.from_matrix(BOARD[:, :3, :3]).as_qu
 PARTS = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
-@pytest.mark.parametrize(
-    ("robot", "other"),
-    [("robot", "board"), ("tcp", "target"), ("ee_pose", "marker_pose"), ("end2base", "board2cam"), ("flange", "camera"),
-     ("robot_coords", "board_pose"), ("gripper", "tag"), ("ToolPose", "CameraPose")],
-)  # fmt: skip
-def test_the_robots_pose_is_read_beside_a_boards(robot: str, other: str):
-    names = [f"{name}.{part}" for name in (other, robot) for part in PARTS]
-    found = read(table_of(np.hstack([OTHER, QUATERNION]), " ".join(names)))
-    assert len(found) == 1
-    np.testing.assert_allclose(found[0][1], POSES, atol=1e-9)
-
-
 def test_two_poses_that_could_be_the_robots_are_both_read_and_a_name_chooses():
     names = " ".join(f"{name}.{part}" for name in ("flange", "tcp") for part in PARTS)
     table = table_of(np.hstack([OTHER, QUATERNION]), names)
@@ -325,28 +280,6 @@ def test_words_state_the_direction(place: str, file: str, inverted: list[bool]):
         np.testing.assert_allclose(poses, inverse(POSES) if reading.inverted else POSES, atol=1e-9)
     ((reading, poses),) = read(table, pose_inverted=True)
     assert reading.inverted and np.allclose(poses, inverse(POSES), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("text", "convention"),
-    [
-        ("movej(p[{}], a=1.2)", "ur"),
-        ("{k}.png, p[{}]", "ur"),
-        ("{k}.png; p [{}]", "ur"),
-        ('{k}.png\t"p[{}]"', "ur"),
-        ("CONST robtarget p{k}:=[[{xyz}],[{rest}],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];", "abb"),
-    ],
-)
-def test_a_makers_word_beside_the_numbers_states_the_notation(text: str, convention: str, tmp_path: Path):
-    lines = []
-    for k, row in enumerate(rows_as(convention, POSES).tolist()):
-        cells = [*map(repr, row)]
-        parts = {"k": k, "xyz": ",".join(cells[:3]), "rest": ",".join(cells[3:])}
-        lines.append(text.format(", ".join(cells), **parts))
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
-    found = [one for table in read_tables(tmp_path / "poses.txt") for one in read(table)]
-    assert {reading.notation for reading, _ in found} == {MAKERS[convention].notation}
-    assert any(np.abs(poses - POSES).max() < 1e-9 for reading, poses in found if not reading.inverted)
 
 
 def test_the_configuration_of_a_robtarget_is_no_quaternion():

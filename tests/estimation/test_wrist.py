@@ -341,6 +341,7 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
 
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     x, uncertainty, camera, noise = estimated()
+    noise = replace(noise, systematic_left=(1e-3, np.radians(0.1)))
     pose = inverse(np.linalg.inv(x))
     ray = unproject(camera, X_PX)
     depth_m = DISTANCE_M * ray[:, 2] / np.linalg.norm(ray, axis=1)
@@ -360,7 +361,7 @@ def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
 @pytest.mark.slow
 def test_points_of_the_scene_are_where_they_are_said_to_be():
     inside, sizes = [], []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
         found, _, _ = adjusted(problem, seed)

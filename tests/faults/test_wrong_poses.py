@@ -59,15 +59,14 @@ def first_kinds(capture: Capture, reconstruction: Reconstruction) -> tuple[list[
     return said, found.doubt
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "what"),
     [
-        ("cobotta_stage", "inverses"),
-        pytest.param("cobotta_stage", "permuted", marks=pytest.mark.long),
-        pytest.param("ur_snack_table", "of another capture", marks=pytest.mark.long),
+        *(("cobotta_stage", what) for what in ("permuted", "inverses", "Euler order")),
+        ("ur_snack_table", "of another capture"),
         # Five of its poses are then permuted in one cycle, and the other ten images agree.
-        pytest.param("elephant_floor", "second half permuted", marks=pytest.mark.long),
+        ("elephant_floor", "second half permuted"),
     ],
 )
 def test_the_first_message_names_the_poses(real_captures: Path, name: str, what: str):

@@ -127,7 +127,7 @@ def mapped(
 
     box = tuple(truth.workspace_in_base.ravel().tolist())
     cloud = point_cloud(capture, reconstruction, hand_eye, options=CloudOptions(confidence_percentile=0.0))
-    return build_scene(cloud, MapOptions(workspace=box))
+    return build_scene(cloud, MapOptions(workspace=box, cell=0.015))
 
 
 def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
