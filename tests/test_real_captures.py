@@ -14,7 +14,6 @@ from jcr.sfm.colmap import reconstruct_colmap
 from scenes import center_errors, reference_of
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "max_mm", "max_deg", "count"),
     [pytest.param("franka_wood_table", 4.0, 0.5, 12, marks=pytest.mark.long), ("doosan_bench", 5.0, 0.7, 15)],
@@ -34,7 +33,6 @@ def test_near_the_marker_reference(real_captures: Path, name: str, max_mm: float
     assert np.median(off_m) < 3e-3 and off_m.max() < 0.01
 
 
-@pytest.mark.slow
 def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path):
     """The reference of this capture was made with them, and belongs to them."""
     capture = jcr.read_capture(real_captures / "franka_tabletop")

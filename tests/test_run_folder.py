@@ -138,7 +138,6 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_named_back_end(
     small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -159,7 +158,6 @@ def test_a_kill_during_the_calibration_does_not_lose_the_reconstruction_of_a_nam
     np.testing.assert_allclose(result.gripper_from_camera, before, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_a_capture_with_changed_images_is_not_read_with_an_earlier_run(small_capture: Path, small_done: Path):
     capture = read_capture(small_capture)
     assert len(RunResult(small_done, capture=capture).of_wrist_camera()[1]) == 5

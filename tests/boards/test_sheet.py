@@ -73,7 +73,6 @@ def test_what_cannot_be_printed_is_one_line(spec: str, words: str):
         board_sheet(spec)
 
 
-@pytest.mark.slow
 def test_the_command_writes_the_file_and_names_the_option(tmp_path: Path):
     done = run_jcr("board", tmp_path / "b.pdf")
     assert done.returncode == 0 and "--board charuco:8x5:0.030:0.022:DICT_4X4_50" in done.stdout
@@ -99,7 +98,6 @@ def seen(spec: str, views: int = 3) -> list[ndarray]:
     return photographs
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("printed", "found"),
     [
@@ -111,7 +109,6 @@ def test_a_board_is_recognised(printed: str, found: str):
     assert board_in_view(seen(printed)) == found
 
 
-@pytest.mark.slow
 def test_single_tags_are_recognised():
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     scene = np.full((700, 900), 200, np.uint8)
@@ -121,7 +118,6 @@ def test_single_tags_are_recognised():
     assert board_in_view(images) == "apriltag:SIDE:36h11"
 
 
-@pytest.mark.slow
 def test_a_table_without_a_board_is_none(tabletop):
     images = [
         cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in sorted(tabletop.glob("images/*"))

@@ -15,6 +15,8 @@ from jcr.records import Reading
 from scenes import MISTAKES
 from simulation.problems import hand_eye_problem
 
+pytestmark = pytest.mark.slow
+
 
 def misfit(words: object) -> float:
     """Return the misfit (mm) that a finding states: translation plus 5 mm per degree."""
@@ -22,7 +24,6 @@ def misfit(words: object) -> float:
     return float(mm) + 5 * float(deg)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_each_mistake_is_named(mistake: str):
     write, words = MISTAKES[mistake]
@@ -38,7 +39,6 @@ def test_each_mistake_is_named(mistake: str):
     assert found.kind is FindingKind.POSE_CONVENTION
 
 
-@pytest.mark.slow
 def test_images_that_are_mirrored_are_named():
     problem = hand_eye_problem(np.random.default_rng(3), 10, robot_noise=(2e-4, 5e-4))
     mirror = np.diag([-1, 1, 1, 1.0])
@@ -46,7 +46,6 @@ def test_images_that_are_mirrored_are_named():
     assert found.details["reading"] == MIRRORED and "over 10 images" in str(found.details["fits"])
 
 
-@pytest.mark.slow
 def test_rows_in_another_order_of_the_images_names_are_named():
     problem = hand_eye_problem(np.random.default_rng(2), 12, robot_noise=(2e-4, 5e-4))
     names, poses = [f"images/{k}.png" for k in range(1, 13)], problem.base_from_gripper
@@ -61,7 +60,6 @@ def test_rows_in_another_order_of_the_images_names_are_named():
         assert found.details["reading"] == order and "add a column image" in sentence(found)
 
 
-@pytest.mark.slow
 def test_the_order_counts_images_without_a_camera_pose():
     """The reverse order of the images that registered is no reverse order."""
     problem = hand_eye_problem(np.random.default_rng(4), 10, robot_noise=(2e-4, 5e-4))
@@ -70,14 +68,12 @@ def test_the_order_counts_images_without_a_camera_pose():
     assert "reverse order" in str(found.details["reading"]) and "over 9 images" in str(found.details["fits"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-3, np.radians(1.0))])
 def test_sound_poses_are_left_alone(noise):
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)
     assert better_reading(problem.base_from_gripper, problem.recon_from_camera) == ()
 
 
-@pytest.mark.slow
 def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
     """ZYZ angles that were read as ZYX: the remedy is an option that reads the file."""
     problem = hand_eye_problem(np.random.default_rng(5), 10, robot_noise=(2e-4, 5e-4))
@@ -98,7 +94,6 @@ def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
     )
 
 
-@pytest.mark.slow
 def test_inverted_samples_name_both_possibilities():
     """Of pairs without images, the gripper's or the marker's poses may be inverted: G⁻¹·X = Z·C and G·Z = X·C⁻¹."""
     problem = hand_eye_problem(np.random.default_rng(6), 10)
@@ -113,7 +108,6 @@ def test_inverted_samples_name_both_possibilities():
         assert min(abs(float(one) - near) for one in distances if one is not None) < 1e-6
 
 
-@pytest.mark.slow
 def test_poses_of_the_camera_itself_are_named():
     """A board's inverse pose, given for the robot's: gripper_from_camera would be the identity."""
     problem = hand_eye_problem(np.random.default_rng(7), 10)

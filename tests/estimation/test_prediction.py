@@ -31,7 +31,6 @@ def test_what_is_expected_is_what_is_reported():
     assert (np.abs(np.median(ratios, axis=0)) < np.log(1.25)).all()
 
 
-@pytest.mark.slow
 def test_check_finds_the_bundled_capture_good_and_expects_what_its_run_reports(
     tabletop: Path, done: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -203,7 +203,6 @@ def looking(**more: Any) -> ros.CameraMount:
 
 
 @pytest.mark.gl
-@pytest.mark.slow
 def test_mujoco_renders_points_at_our_pixels(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
     mujoco: Any = pytest.importorskip("mujoco")

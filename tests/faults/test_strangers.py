@@ -141,18 +141,6 @@ def test_a_link_to_poses_elsewhere_is_refused_and_no_linked_folder_is_searched(t
         jcr.read_capture(tmp_path / "linked")
 
 
-@pytest.mark.parametrize("name", ["\ud800{}", "字" * 200 + "{}", "loop{}", "../poses{}", "images"])
-def test_a_table_that_lists_no_files_is_read_itself(tmp_path: Path, name: str):
-    capture = table_capture(tmp_path / "cap", str)
-    for k in range(5):
-        (capture / f"loop{k}").symlink_to(f"loop{k}")
-    header, *rows = (line.split(",") for line in (capture / "poses.csv").read_text().splitlines())
-    listed = [dict(zip(header, row, strict=True)) | {"file": name.format(k)} for k, row in enumerate(rows)]
-    (capture / "poses.csv").unlink()
-    (capture / "poses.json").write_text(json.dumps(listed))
-    assert len(jcr.read_capture(capture)) == 5
-
-
 def test_numbers_of_any_length_are_names(tmp_path: Path):
     capture = table_capture(tmp_path / "cap", str)
     table = Table(
@@ -742,7 +730,6 @@ def test_names_command_no_terminal(capsys: pytest.CaptureFixture[str]):
 MARKUP = "<img src=x onerror=alert(1)>{1+1}**b**[a](javascript:x).png"
 
 
-@pytest.mark.slow
 def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
     from jcr.report.scene3d import BY_LABEL
     from jcr.result import load_run

@@ -83,7 +83,6 @@ def test_the_first_message_names_the_poses(real_captures: Path, name: str, what:
         assert said[0] in OF_POSES and check_capture(wrong).findings[0].kind in OF_POSES, said
 
 
-@pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("what", ["inverses", "reversed"])
 def test_wrong_poses_of_few_images_without_intrinsics_lead(real_captures: Path, what: str):

@@ -7,8 +7,6 @@ import io
 import os
 import time
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
@@ -19,12 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-import capture_writers as writers
-from corpus import small_capture
 from jcr.capture.images import read_image, read_one_channel
-from jcr.capture.options import ReadOptions
 from jcr.capture.pairing import natural
-from jcr.capture.read import read_source
 from jcr.capture.ros_messages import image_of, read_ros_depth, read_ros_image
 from jcr.errors import InputError
 from jcr.export.nerfstudio_colmap import _file_names
@@ -174,54 +168,3 @@ def test_fields_of_messages_are_of_any_type(fields: dict[str, Any]):
     for message in (SimpleNamespace(**usual | fields), SimpleNamespace(**fields)):
         for read in (read_ros_image, read_ros_depth, lambda one: image_of(one, "x")):
             read_or_refused(lambda read=read, message=message: read(message))
-
-
-CELLS: dict[str, Callable[[int], list[Any]]] = {
-    "null": lambda n: [None] * n,
-    "one null": lambda n: [1.0] * (n - 1) + [None],
-    "NaN": lambda n: [float("nan")] * n,
-    "huge": lambda n: [1e300] * n,
-    "large whole": lambda n: [2**62] * n,
-    "negative": lambda n: [-1] * n,
-    "text": lambda n: ["3"] * n,
-    "bytes": lambda n: [b"\xff\xd8\xff"] * n,
-    "truth": lambda n: [True] * n,
-    "list": lambda n: [[1.0, 2.0]] * n,
-    "ragged": lambda n: [[1.0] * (k % 2) for k in range(n)],
-    "record": lambda n: [{"bytes": "text", "path": "../x"}] * n,
-    "empty record": lambda n: [{"bytes": b"", "path": None}] * n,
-    "record of damaged bytes": lambda n: [{"bytes": b"\x89PNG\r\n", "path": None}] * n,
-    "the same": lambda n: [0] * n,
-}
-
-
-def test_columns_of_a_data_set_are_of_any_type(tmp_path: Path):
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    capture = small_capture(tmp_path / "images", (16, 12), 4)
-    pixels = [read_image(capture.folder / name) for name in capture.images for _ in range(3)]
-    states = np.repeat(writers.rows_as("rpy", capture.base_from_gripper), 3, axis=0)
-    names, ended = ["x", "y", "z", "roll", "pitch", "yaw"], []
-    for version, codec in (("v2.1", None), ("v3.0", None), ("v3.0", "mpeg4")):
-        place = tmp_path / f"{version} {codec}"
-        folder = writers.write_lerobot(
-            place, [(pixels, states)], version, "observation.state", names, codec=codec
-        )
-        for file in sorted(folder.rglob("*.parquet")):
-            whole, table = file.read_bytes(), pq.read_table(file, partitioning=None)
-            for k, column in enumerate(table.column_names):
-                for kind, cells in CELLS.items():
-                    try:
-                        changed = table.set_column(k, column, pa.array(cells(len(table))))
-                    except pa.ArrowException:
-                        continue
-                    pq.write_table(changed, file)
-                    into = tmp_path / f"into {len(ended)}"
-                    read = partial(read_source, folder, ReadOptions(frames=3), into=into)
-                    try:
-                        ended.append(read_or_refused(read))
-                    except Exception as error:
-                        raise AssertionError(f"{version} {file.name}: {column} of {kind}") from error
-            file.write_bytes(whole)
-    assert len(ended) > 200 and 0.02 < np.mean(ended) < 0.6

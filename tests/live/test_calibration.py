@@ -74,7 +74,6 @@ def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_e
     assert error is not None and error.translation_mm < REQUIRED[0] and error.rotation_deg < REQUIRED[1]
 
 
-@pytest.mark.slow
 def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_the_images(
     small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

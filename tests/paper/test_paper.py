@@ -108,7 +108,6 @@ def predicted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return made, folder / "pairs.npz"
 
 
-@pytest.mark.slow
 @pytest.mark.gl
 def test_one_switch_runs_the_published_method_from_images_to_the_map(
     predicted: tuple[Path, Path], tmp_path: Path
@@ -137,7 +136,6 @@ def test_one_switch_runs_the_published_method_from_images_to_the_map(
     assert jcr.run(made, tmp_path / "out", options).is_unchanged
 
 
-@pytest.mark.slow
 @pytest.mark.gl
 def test_options_and_back_ends_that_the_method_lacks_are_refused(
     predicted: tuple[Path, Path], tmp_path: Path

@@ -136,7 +136,6 @@ def test_given_distortion_with_which_no_image_registers_is_estimated_and_named(t
     assert found.intrinsics is not None and abs(found.intrinsics.fx / capture.intrinsics.fx - 1) < 1e-3
 
 
-@pytest.mark.slow
 def test_a_given_focal_length_of_another_resolution_is_named_and_not_used(half_capture: Path) -> None:
     """Half as long again, it was kept: the result was 32 mm off, and the remedy was to name the arm."""
     capture = read_capture(half_capture)
