@@ -1,6 +1,5 @@
 """Records a bag with librealsense itself, of a device in software: colour, and depth of 0.5005 m everywhere."""
 
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,14 +11,8 @@ WIDTH, HEIGHT, FRAMES = 640, 480, 10
 
 def intrinsics(rs: ModuleType) -> Any:
     found = rs.intrinsics()
-    found.width, found.height, found.fx, found.fy, found.ppx, found.ppy = (
-        WIDTH,
-        HEIGHT,
-        600.0,
-        601.0,
-        315.0,
-        242.0,
-    )
+    found.width, found.height = WIDTH, HEIGHT
+    found.fx, found.fy, found.ppx, found.ppy = 600.0, 601.0, 315.0, 242.0
     found.model, found.coeffs = rs.distortion.inverse_brown_conrady, 5 * [0.0]
     return found
 
@@ -59,17 +52,11 @@ def record(file: Path) -> None:
             frame = rs.software_video_frame()
             frame.pixels, frame.bpp, frame.stride = pixels, size, size * WIDTH
             frame.timestamp, frame.frame_number = 100.0 * (number + 1), number + 1
-            frame.domain, frame.profile = (
-                rs.timestamp_domain.hardware_clock,
-                profile.as_video_stream_profile(),
-            )
+            frame.domain = rs.timestamp_domain.hardware_clock
+            frame.profile = profile.as_video_stream_profile()
             sensor.on_video_frame(frame)
         queue.wait_for_frame()
         queue.wait_for_frame()
     for sensor in sensors:
         sensor.stop()
         sensor.close()
-
-
-if __name__ == "__main__":
-    record(Path(sys.argv[1]))

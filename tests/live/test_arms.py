@@ -7,7 +7,6 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,15 +20,6 @@ from places import ROOT
 
 POSE = transform(rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.42, -0.11, 0.36]))
 JOINTS = np.array([0.3, -1.2, 1.5, -1.8, -1.5, 0.4])
-
-
-def named_by(script: str, *words: object) -> Any:
-    """What a script of its own process prints as JSON, its last line; garbage is collected before it ends."""
-    lines = [*script.strip("\n").splitlines(), "    import gc", "    gc.collect()"]
-    command = [sys.executable, "-c", "\n".join(line.removeprefix("    ") for line in lines), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def test_an_xarm_gives_pose_and_joints_from_its_makers_units(monkeypatch: pytest.MonkeyPatch):
@@ -63,32 +53,33 @@ def test_an_xarm_gives_pose_and_joints_from_its_makers_units(monkeypatch: pytest
 
 
 FILMED = """
-    import json, sys
-    import numpy as np
-    import pyrealsense2 as rs
-    from jcr.live.cameras import open_camera
-    with open_camera("realsense:" + sys.argv[1]) as camera:
-        frames = list(camera.frames)
-    depth = np.unique(frames[0].depth_mm).tolist()
-    print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics.model_dump()]))
+import gc, json, sys
+from pathlib import Path
+import numpy as np
+from record_realsense import record
+from jcr.live.cameras import open_camera
+record(Path(sys.argv[1]))
+with open_camera("realsense:" + sys.argv[1]) as camera:
+    frames = list(camera.frames)
+depth = np.unique(frames[0].depth_mm).tolist()
+print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics.model_dump()]))
+del frames
+gc.collect()
 """
+"""Records with librealsense and reads the recording, in a process of its own: in that of the tests it broke others."""
 
 
 @pytest.mark.slow
 def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its_maker(tmp_path: Path):
-    if find_spec("pyrealsense2") is None:  # imported here it would break the process in which tests run on
+    if find_spec("pyrealsense2") is None:
         pytest.skip("not installed: pyrealsense2")
-    file = tmp_path / "recording.db3"
     path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", path)
-        made = subprocess.run(
-            [sys.executable, ROOT / "tests" / "record_realsense.py", file], capture_output=True
-        )
-        if b"libusb" in made.stderr:
-            pytest.skip("pyrealsense2 needs libusb-1.0")
-        assert made.returncode == 0, made.stderr
-        count, shape, depth_mm, intrinsics = named_by(FILMED, file)
+    command = [sys.executable, "-c", FILMED, str(tmp_path / "recording.db3")]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
+    if "libusb" in done.stderr:
+        pytest.skip("pyrealsense2 needs libusb-1.0")
+    assert done.returncode == 0, done.stderr
+    count, shape, depth_mm, intrinsics = json.loads(done.stdout.splitlines()[-1])
     assert count >= 3 and shape == [480, 640, 3]
     # 1001 units of half a millimetre.
     assert set(depth_mm) <= {0, 500, 501}

@@ -137,7 +137,7 @@ def untrained(cloud: PointCloud) -> "SceneMap":
     """The published representation without a step of training."""
     from jcr.paper.fields import published_scene
 
-    return published_scene(cloud, replace(OPTIONS, preset="paper", max_seconds=0.0))
+    return published_scene(cloud, replace(OPTIONS, preset="paper", max_seconds=0.0, cell=0.03))
 
 
 def test_the_published_representation_is_plain_torch(untrained: "SceneMap"):
