@@ -84,7 +84,8 @@ def test_a_png_holds_the_same_pixels(shape: tuple[int, ...], kind: type):
     [
         ({"mapp": None}, "RunOptions: no option 'mapp'; did you mean map?"),
         ({"calibrate": {"reqire": (1, 1)}}, "CalibrateOptions: no option 'reqire'; did you mean require?"),
-        ({"calibrate": {"require": (1, "far")}}, "CalibrateOptions: require.1: 'far'"),
+        ({"calibrate": {"require": (1, "far")}}, "require: give (MM, DEG) or 'none', not (1, 'far')"),
+        ({"calibrate": {"require": 2}}, "CalibrateOptions: require: give (MM, DEG) or 'none', not 2"),
         ({"reconstruct": {"backend": "colmp"}}, "did you mean colmap?"),
     ],
 )

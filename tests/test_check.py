@@ -20,6 +20,7 @@ from jcr.findings import FindingKind
 from jcr.geometry import inverse, step_between
 from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics
+from places import SHARED
 from scenes import capture_of, reconstruction_of
 from simulation.problems import hand_eye_problem
 
@@ -88,6 +89,19 @@ def test_each_pose_of_a_usual_capture_is_compared(half_capture: Path):
     (wrong,) = [one for one in found.findings if one.kind is FindingKind.POSE_CONTRADICTS_IMAGE]
     assert wrong.images == (capture.images[4],)
     assert 4 not in found.counted and len(found.counted) == len(capture) - 1
+
+
+@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="the real captures are not here")
+@pytest.mark.long
+def test_check_names_the_remedy_and_the_board_that_a_run_names():
+    """The systematic robot error was named, which is the main part for a simulated scene; for the images it is not."""
+    found = check_capture(SHARED / "data/realman_carpet")
+    (missed,) = [one for one in found.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
+    assert missed.concerns == "intrinsics" and "not as exact as needed, 20 images, a point within" in repr(
+        found
+    )
+    (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
+    assert "--board chessboard:11x8:SIDE" in board.remedy
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ("options", "words"),
     [
         (ReconstructOptions(backend="colmap", predictions=Path("p.npz")), "--predictions p.npz: .*predictions"),
-        (ReconstructOptions(backend="predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3"),
+        (ReconstructOptions(backend="predictions", weights="p.npz"), "weights p.npz: .*mast3r or dust3r or da3"),
         (ReconstructOptions(backend="direct", board="b"), "--board b: .*colmap or marker or given"),
         (ReconstructOptions(board="b", predictions=Path("c")), r"--board b: .*\(predictions\) does not use it"),
         (ReconstructOptions(weights="w", predictions=Path("p")), "--weights and --predictions select"),
@@ -92,7 +92,7 @@ def test_what_a_back_end_does_not_use_is_refused(options: ReconstructOptions, wo
 )
 def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, flag: str) -> None:
     capture = capture_of(np.eye(4)[None])
-    with pytest.raises(InputError, match=f"--backend {name}: name the .* with {flag}[ ,]"):
+    with pytest.raises(InputError, match=f"backend {name}: name the .* with {flag}[ ,]"):
         backends.reconstruct(capture, ReconstructOptions(backend=name))
 
 

@@ -52,7 +52,7 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
     ) -> Reconstruction:
         """Run the back end with its options."""
         if "device" in arguments:
-            extra("torch", "networks", f"--backend {options.backend}")
+            extra("torch", "networks", f"backend {options.backend}")
         chosen = {"weights": network_weights, "device": device_of}
         values = [chosen[a](options) if a in chosen else getattr(options, a) for a in arguments]
         return resolve_name(function)(capture, *values, progress)
@@ -296,9 +296,9 @@ def ready_backend(options: ReconstructOptions, name: str) -> Backend:
     row = BACKENDS[name]
     if not row.is_installed():
         more = ", or choose another" if row.has_weights() else f"; then {weights_command(row)}"
-        raise InputError(f"--backend {name} needs {row.package}, which is not installed: {row.install}{more}")
+        raise InputError(f"backend {name} needs {row.package}, which is not installed: {row.install}{more}")
     if row.needs and getattr(options, row.needs) is None:
-        raise InputError(f"--backend {name}: name {NEEDED[row.needs]}")
+        raise InputError(f"backend {name}: name {NEEDED[row.needs]}")
     return row
 
 
@@ -315,7 +315,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     if options.backend != "auto":
         names = [options.backend]
         if options.backend not in BACKENDS:
-            raise InputError(f"--backend {options.backend}: no such back end; take {', '.join(BACKENDS)}")
+            raise InputError(f"backend {options.backend}: no such back end; take {', '.join(BACKENDS)}")
     elif len(selecting) > 1:
         raise InputError(
             f"{' and '.join(f'--{row.selected_by}' for row in selecting)} select different back ends "
@@ -388,7 +388,7 @@ def network_weights(options: ReconstructOptions) -> Weights:
     remedy = "give a file, a folder or a hub id (jcr models)"
     if HUB_ID.fullmatch(name) and Path(name).suffix != ".safetensors":
         remedy = f"jcr models get {name} downloads them"
-    raise InputError(f"--weights {name}: no such weights on this machine; {remedy}")
+    raise InputError(f"weights {name}: no such weights on this machine; {remedy}")
 
 
 def weights_command(row: Backend) -> str:
@@ -412,9 +412,9 @@ def device_of(options: ReconstructOptions) -> str:
     """
     if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
         return "cpu"
-    torch = extra("torch", "networks", "--device cuda")
+    torch = extra("torch", "networks", "device cuda")
     if options.device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: this machine has no CUDA device that torch sees; use --device cpu")
+        raise InputError("device cuda: this machine has no CUDA device that torch sees; choose device cpu")
     if options.device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return options.device

@@ -28,6 +28,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {like[0]}?" if like else ""
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, such as "1 image" or "2 images"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def first_few(names: Sequence[str]) -> str:
     """Return the first ten names as text, separated by commas, and the number of the remaining ones."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
@@ -96,7 +101,10 @@ def first_fault(error: "ValidationError") -> str:
     """Return the first fault of a validation as "place: fault"; the place is a path of keys such as frames.0.pose."""
     first = error.errors()[0]
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
-    what = "is missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":
+        like = get_close_matches(str(first["loc"][-1]), map(str, first["input"]), n=1)
+        what = "is missing" + "".join(f"; rename {shown(key)}" for key in like)
     return f"{place}: {what}" if place else what
 
 

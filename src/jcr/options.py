@@ -34,6 +34,18 @@ def checked_options(options: object, kind: type[Options]) -> Options:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
+        # The command line's help has the form of a tuple, such as "MM DEG|none"; pydantic's message does not.
+        described = get_type_hints(kind, include_extras=True).get(str(first["loc"][0]))
+        form = next(
+            (one for m in get_args(described)[1:] if " " in (one := getattr(m, "metavar", None) or "")), ""
+        )
+        if form:
+            written = " or ".join(
+                f"({part.replace(' ', ', ')})" if " " in part else repr(part) for part in form.split("|")
+            )
+            raise InputError(
+                f"{kind.__name__}: {first['loc'][0]}: give {written}, not {content[first['loc'][0]]!r:.80}"
+            ) from None
         # pydantic puts the type of a union's member into the place.
         place = ".".join(str(part) for part in first["loc"] if "[" not in str(part))
         allowed = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")

@@ -16,7 +16,7 @@ from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
 from jcr.errors import InputError
-from jcr.findings import Finding, FindingKind, remedy, sentence, text
+from jcr.findings import Finding, FindingKind, sentence
 from jcr.findings.finding import verdict_of
 from jcr.findings.messages import GROUPS
 from jcr.geometry import rotation_exp, transform
@@ -65,9 +65,9 @@ def example(kind: FindingKind) -> Finding:
 @pytest.mark.parametrize("kind", FindingKind)
 def test_every_kind_has_words_of_one_line(kind: FindingKind):
     finding = example(kind)
-    for words in (text(finding), sentence(finding)):
+    for words in (finding.text, sentence(finding)):
         assert words and "\n" not in words and "nan" not in words and not words.endswith(".")
-    assert sentence(finding).startswith(text(finding)) and sentence(finding).endswith(remedy(finding))
+    assert sentence(finding).startswith(finding.text) and sentence(finding).endswith(finding.remedy)
 
 
 @pytest.mark.parametrize("kind", FindingKind)
@@ -184,4 +184,4 @@ def test_images_that_are_left_out_lead_the_warnings_where_they_are_most():
     case = fitted_case(capture, made, CalibrateOptions(), errors_of(problem.base_from_gripper[:5]))
     first = check_remarks(case).calibration.findings[0]
     assert first.kind is FindingKind.HALF_UNUSED and first.severity == "warns"
-    assert "only 5 of 12 images are used: 7 were not registered, 0 contradict the others" in text(first)
+    assert "only 5 of 12 images are used: 7 were not registered, 0 contradict the others" in first.text

@@ -82,7 +82,9 @@ def test_poses_without_an_image_are_left_out_with_a_note(tmp_path: Path):
     write(tmp_path / "p.csv", [f"{HEADER},image", *NAMED_ROWS])
     got = jcr.read_capture(tmp_path)
     np.testing.assert_allclose(got.base_from_gripper, POSES[2:], atol=1e-9)
-    assert any("2 poses of p.csv have no image" in note and "(poses 1, 2)" in note for note in got.notes)
+    assert any(
+        "2 poses of p.csv without an image" in note and "row 1, 2 of its table" in note for note in got.notes
+    )
 
 
 def test_images_left_out_and_chosen_are_stated(tmp_path: Path):
@@ -93,7 +95,7 @@ def test_images_left_out_and_chosen_are_stated(tmp_path: Path):
     images, notes = find_images(tmp_path)
     assert images == tuple(f"rgb/{name}" for name in NAMES)
     assert "images taken from rgb/, not from other" in notes
-    assert any("1 images of another size than 32x24 are left out: rgb/preview.png" in note for note in notes)
+    assert any("left out: 1 image of another size than 32x24: rgb/preview.png" in note for note in notes)
 
 
 def test_pictures_in_other_formats_are_named(tmp_path: Path):

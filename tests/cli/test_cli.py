@@ -18,7 +18,7 @@ from in_process import run_jcr
 from jcr.calibration.record import Calibration, read_calibration
 from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
-from jcr.cli.map_query_export_view import read_points
+from jcr.cli.map_query_export_view import PRINTED, read_points
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation
@@ -184,6 +184,9 @@ def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     answered = run_jcr("query", done, points, "--json")
     assert answered.returncode == 0, answered.stderr
     answers = json.loads(answered.stdout)
+    _, first, second, *more = run_jcr("query", done, points).stdout.splitlines()
+    assert f": {1e3 * answers['distance'][0]:.1f} ± " in first and "outside of the mapped" in second
+    assert len(more) == PRINTED - 2
     # High over the table everyone looked and saw nothing; nine metres away nobody did; points lie on surfaces.
     assert answers["occupancy"][0] < 0.5 and not answers["unknown"][0]
     assert answers["unknown"][1]
@@ -220,6 +223,7 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
         (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
         (["export", "a", "octomapp"], "did you mean octomap?"),
         (["run", "a", "b", "--require", "2"], "--require takes MM DEG|none, not '2' (jcr run --help)"),
+        (["run", "a", "-o", "b"], "jcr run has no option -o"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),

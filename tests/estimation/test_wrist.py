@@ -22,6 +22,7 @@ from jcr.estimation.intrinsics_prior import (
     TYPICAL,
     CameraPrior,
     camera_with_prior,
+    size_of,
 )
 from jcr.estimation.point_uncertainty import (
     point_covariance,
@@ -376,3 +377,9 @@ def test_points_of_the_scene_are_where_they_are_said_to_be():
         sizes.append(np.trace(scene.covariance_at(in_base), axis1=1, axis2=2).mean())
         assert sizes[-1] == pytest.approx(np.trace(together[n, :, n], axis1=1, axis2=2).mean(), rel=0.1)
     assert np.concatenate(inside).mean() > 0.8
+
+
+def test_a_distortion_that_the_images_do_not_determine_has_a_finite_size():
+    """Far from the solution their information may be negative; the size of the distortion then grew without end."""
+    likeliest, variance = np.r_[0.5, np.full(9, 1e-4)], np.r_[0.2, np.full(9, 1e-9)]
+    assert size_of(likeliest, np.diag(variance), std=0.1) < 0.1

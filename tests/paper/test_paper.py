@@ -141,7 +141,7 @@ def test_options_and_back_ends_that_the_method_lacks_are_refused(
     predicted: tuple[Path, Path], tmp_path: Path
 ):
     made, _ = predicted
-    with pytest.raises(InputError, match="does not use --require"):
+    with pytest.raises(InputError, match="does not use require"):
         jcr.calibrate(made, tmp_path, {"method": "paper", "calibrate": {"require": (1.0, 0.1)}})
     with pytest.raises(InputError, match="has no back end direct"):
         jcr.calibrate(made, tmp_path, {"method": "paper", "reconstruct": {"backend": "direct"}})

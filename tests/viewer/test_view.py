@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from chromium import Chromium
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.records import Capture
@@ -182,3 +183,16 @@ def test_command_serves_this_machine_alone_until_interrupted(done: Path, monkeyp
     (host, answer), closed = answers
     assert status == 0 and host == "127.0.0.1" and b"200" in answer and closed
     assert printed.getvalue().count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_panel_is_closed_on_a_phone_and_open_on_a_desktop(viewer: "Viewer", tmp_path: Path):
+    gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    chromium = Chromium(tmp_path, *gpu)
+    panel = "document.querySelector('.mantine-ScrollArea-root')?.offsetHeight ?? 0"
+    try:
+        for width, low, high in ((1000, 150, 900), (390, 20, 100)):
+            chromium.open(f"http://127.0.0.1:{viewer.server.get_port()}", width, 900)
+            until(lambda low=low, high=high: low < chromium.js(panel) < high)
+    finally:
+        chromium.close()

@@ -89,7 +89,7 @@ def boards(spec: str) -> list[Board]:
             case _:
                 raise ValueError(f"no such board; write it as {'; '.join(KINDS)}")
     except ValueError as error:
-        raise InputError(f"--board {spec}: {error}") from None
+        raise InputError(f"board {spec}: {error}") from None
     size_std = None if SIDE in parts else PRINTED
     return [Board(name, detect, _length(side), size_std) for name, detect in detectors.items()]
 

@@ -183,7 +183,7 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
     rotation = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
     if np.sqrt((wander**2).mean()) > ONE_AXIS or rotation.max() < ONE_AXIS:
         raise InputError(
-            "--known-height: the gripper does not rotate about one common axis, along which a height could be "
+            "known_height: the gripper does not rotate about one common axis, along which a height could be "
             "known; leave the option out"
         )
     return axis_in_gripper, height, HEIGHT_STD

@@ -75,6 +75,15 @@ class Difference:
     """Other intrinsics or another frame that explain a difference beyond the reported errors, or of transforms without
     errors; None without such a cause."""
 
+    def __repr__(self) -> str:
+        """Return translation, rotation, and whether the reported errors explain them, on one line."""
+        mm, deg = 1e3 * np.linalg.norm(self.translation_m), np.degrees(np.linalg.norm(self.rotation_vector))
+        explained = "no errors are known"
+        if self.p_value is not None:
+            explained = f"{'not ' * (self.p_value < UNLIKELY)}explained by the reported errors (p = {self.p_value:.2g})"
+        rejected = ", of a rejected calibration" * any(self.doubts)
+        return f"<Difference: {mm:.3f} mm, {deg:.4f}°, {explained}{rejected}>"
+
 
 class _Reference(BaseModel):
     """Content of a reference.json: gripper_from_camera and its standard deviations along the gripper's axes."""

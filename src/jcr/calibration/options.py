@@ -45,12 +45,12 @@ def check_options(options: CalibrateOptions) -> None:
     from jcr.estimation.arms import arm_named
 
     required = None if options.require == "none" else options.require
-    for flag, pair in (("--require", required), ("--robot-noise", options.robot_noise)):
+    for flag, pair in (("require", required), ("robot_noise", options.robot_noise)):
         if pair is not None and not all(0 < value < inf for value in pair):
             raise InputError(f"{flag} {pair[0]:g} {pair[1]:g}: give two positive numbers, mm and degrees")
     if options.scale is not None and not 0 < options.scale < inf:
-        raise InputError(f"--scale {options.scale:g}: give a positive number, metres per unit")
+        raise InputError(f"scale {options.scale:g}: give a positive number, metres per unit")
     if options.known_height is not None and not isfinite(options.known_height):
-        raise InputError(f"--known-height {options.known_height:g}: give millimetres")
+        raise InputError(f"known_height {options.known_height:g}: give millimetres")
     if options.robot is not None:
         arm_named(options.robot)

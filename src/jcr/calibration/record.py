@@ -30,10 +30,8 @@ from jcr.findings import (
     FindingKind,
     Verdict,
     doubt_of,
-    remedy,
     sentence,
     strongest_first,
-    text,
     verdict_of,
     warnings_of,
     without_consequences,
@@ -85,7 +83,7 @@ and 30 is about the geometric mean of 1 and 1000, so ± 50 % changes nothing."""
 
 def as_json(finding: Finding) -> dict[str, Any]:
     """Return a finding as a JSON object: its fields, and its message (key `text`) and remedy in words."""
-    return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
+    return vars(finding) | {"text": finding.text, "remedy": finding.remedy}
 
 
 FindingJson = Annotated[Finding, PlainSerializer(as_json)]
@@ -443,7 +441,7 @@ class FailedCalibration(_WithoutUncertainty):
     @property
     def observability(self) -> Observability:
         """Observability of a failed calibration: nothing is observable; the remedy is that of the first finding."""
-        advice = remedy(self.findings[0]) or text(self.findings[0])
+        advice = self.findings[0].remedy or self.findings[0].text
         kind, motion = FindingKind.UNOBSERVABLE, "no camera poses"
         return Observability((Finding.of(kind, "rejects", "motion", motion=motion, advice=advice),))
 

@@ -63,7 +63,7 @@ def robot_errors(
         raise
     except InputError as error:
         if options.robot is not None:
-            raise InputError(f"--robot {options.robot}: {error}") from None
+            raise InputError(f"robot {options.robot}: {error}") from None
         unused = Finding.of(FindingKind.ROBOT_UNUSED, "warns", "robot", text=str(error))
         return replace(errors_of(gripper), unused=unused)
 

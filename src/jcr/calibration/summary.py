@@ -7,14 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.camera import unproject
+from jcr.errors import counted
 from jcr.findings import (
     LENGTHS,
     Finding,
     FindingKind,
     joined,
-    remedy,
     sentence,
-    text,
     verdict_of,
     without_consequences,
 )
@@ -46,7 +45,7 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     warnings = sum(one.severity == "warns" and one.kind not in told for one in findings)
     if verdict == "rejected" or not warnings:
         return verdict.upper()
-    return f"{verdict.upper()}, with {warnings} warning{'s' * (warnings > 1)}"
+    return f"{verdict.upper()}, with {counted(warnings, 'warning')}"
 
 
 def only_centre_meets(content: AnyCalibration) -> bool:
@@ -67,7 +66,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
         unmet = ", not met in the corners" if only_centre_meets(content) else ""
         limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
-    used = f"{content.images_used} of {len(content.images)} images"
+    used = f"{content.images_used} of {counted(len(content.images), 'image')}"
     seconds = sum(content.timings_s.values())
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
@@ -177,11 +176,11 @@ def actions(findings: Sequence[Finding], most: int) -> list[str]:
     if verdict_of(findings) == "rejected":
         cause, *others = findings
         findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
-        lines = labelled("Cause", text(cause)) + labelled("Remedy", *filter(None, [remedy(cause)]))
+        lines = labelled("Cause", cause.text) + labelled("Remedy", *filter(None, [cause.remedy]))
     for one in sorted(findings, key=lambda one: one.kind is not FindingKind.NOT_EXACT_ENOUGH):
         if one.kind is FindingKind.NOT_EXACT_ENOUGH:
             # Other lines of the summary state the required and the reached accuracy.
-            lines += labelled("Remedy", remedy(one))
+            lines += labelled("Remedy", one.remedy)
         elif one.severity != "informs":
             lines += labelled("WARNING", sentence(one))
     if len(lines) <= most:

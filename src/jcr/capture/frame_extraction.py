@@ -15,7 +15,7 @@ from jcr.capture.images import encode_png, read_image, sharpness
 from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER
-from jcr.errors import InputError
+from jcr.errors import InputError, counted
 from jcr.files import path_inside, write_bytes
 from jcr.progress import Progress
 from jcr.records import Capture, FrameNames, Intrinsics
@@ -88,7 +88,10 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     capture, kept = checked_capture(into, images, poses[rows], str(recording.source))
     notes = (f"{len(kept)} of {len(fresh)} frames chosen", *stale)
     if faults:
-        notes = (*notes, f"left out: {len(faults)} images that cannot be read: {faults[min(faults)]}")
+        notes = (
+            *notes,
+            f"left out: {counted(len(faults), 'image')} that cannot be read: {faults[min(faults)]}",
+        )
     return replace(
         capture,
         joints=None if recording.joints is None else recording.joints[rows[kept]],

@@ -116,7 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _dispatched(arguments: Sequence[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if arguments[:1] == ["help"] and arguments[1:]:
+        return _dispatched([arguments[1], "--help"])
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
         groups = (
             "\n".join([f"{group}:", *(f"  {key.split('.')[1]:<10} {about}" for key, about in rows.items())])
             for group, rows in GROUPS.items()

@@ -37,8 +37,9 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
         """Raise InputError that states what is wrong with the arguments."""
-        known, why = {*_flags(record), "--help"}, "the arguments cannot be understood"
-        options = (word.partition("=")[0].replace("_", "-") for word in arguments if word.startswith("--"))
+        known, why = {*_flags(record), "--help", "-h"}, "the arguments cannot be understood"
+        words = (word.partition("=")[0] for word in arguments if word.startswith("-"))
+        options = (word.replace("_", "-") for word in words if word.lstrip("-")[:1].isalpha())
         match event:
             case _ if unknown := next((word for word in options if word not in known), None):
                 why = f"{program} has no option {unknown}{did_you_mean(unknown, known)}"

@@ -2,7 +2,9 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -12,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output, warn
+from jcr.cli.output import Output, numbers, warn
 from jcr.errors import InputError, RejectedError
 from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
@@ -24,6 +26,8 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
+PRINTED = 10
+"""Number of points whose answers are printed; those of all are in the file."""
 _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d,%.5f"
 
 
@@ -172,8 +176,29 @@ class QueryCommand:
             lines = (_FORMATS % row for row in zip(*(column.tolist() for column in columns), strict=True))
             write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
             summary = f"wrote {path}: {summary}"
-        self.output.result([summary], answers)
+        of_points = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy, sample.label))
+        few = zip(x_in_base, *of_points, strict=True)
+        lines = [summary] + [_answer(*one, scene.label_names) for one in islice(few, PRINTED)]
+        self.output.result(lines, answers)
         return 0
+
+
+def _answer(
+    x_in_base: Float[ndarray, "3"],
+    distance: float,
+    std: float,
+    occupancy: float,
+    label: int,
+    names: Sequence[str],
+) -> str:
+    """Return the map's answer at one point on one line: distance with its standard deviation, occupancy, and label."""
+    at = f"({numbers(x_in_base, 3)}) m"
+    if np.isnan(distance):
+        return f"{at}: outside of the mapped workspace"
+    error = "" if np.isnan(std) else f" ± {1e3 * std:.1f}"
+    return (
+        f"{at}: {1e3 * distance:.1f}{error} mm to the surface (1σ), occupancy {occupancy:.2f}, {names[label]}"
+    )
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:

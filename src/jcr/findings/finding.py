@@ -97,6 +97,16 @@ class Finding:
         return made
 
     @property
+    def text(self) -> str:
+        """Message of the finding: the fault in one sentence."""
+        return self.kind.row.message.format_map(quantities(self))
+
+    @property
+    def remedy(self) -> str:
+        """Remedy of the finding in one sentence; empty if there is none or none is needed."""
+        return self.kind.row.remedy.format_map(quantities(self))
+
+    @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """Part s·sᵀ of the calibration's covariance due to the shift s, in COVARIANCE_ORDER; zero without a shift."""
         shift = np.zeros(7) if self.shift is None else np.array(self.shift)
@@ -189,16 +199,6 @@ def joined(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def text(finding: Finding) -> str:
-    """Return the message of a finding: the fault in one sentence."""
-    return finding.kind.row.message.format_map(quantities(finding))
-
-
-def remedy(finding: Finding) -> str:
-    """Return the remedy of a finding in one sentence; empty if there is none or none is needed."""
-    return finding.kind.row.remedy.format_map(quantities(finding))
-
-
 def unobservable(finding: Finding) -> str:
     """Return the direction of a finding of kind UNOBSERVABLE in words, with "nearly unobservable" before a weak one."""
     return "{nearly:nearly unobservable: |}{direction}".format_map(quantities(finding))
@@ -212,7 +212,7 @@ def reached_in_words(required: Requirement) -> str:
 
 def sentence(finding: Finding) -> str:
     """Return message and remedy of a finding, separated by a semicolon."""
-    return "; ".join(filter(None, (text(finding), remedy(finding))))
+    return "; ".join(filter(None, (finding.text, finding.remedy)))
 
 
 def doubt_of(findings: Iterable[Finding]) -> str | None:

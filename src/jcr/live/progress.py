@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.summary import leave_one_out_text
-from jcr.findings import Finding, FindingKind, remedy, sentence, text, without_consequences
+from jcr.findings import Finding, FindingKind, sentence, without_consequences
 from jcr.number_format import significant
 from jcr.records import LeaveOneOut
 
@@ -82,7 +82,7 @@ class LiveProgress:
             "verdict": None if self.hand_eye is None else self.hand_eye.verdict,
             "findings": [
                 {"kind": one.kind.value, "severity": one.severity, "images": list(one.images)}
-                | {"text": text(one), "remedy": remedy(one)}
+                | {"text": one.text, "remedy": one.remedy}
                 for one in self.findings
             ],
             "leave_one_out": None if error is None else [error.translation_mm, error.rotation_deg],

@@ -42,7 +42,7 @@ def reconstruct_published(
     known = [name for name in (FILE, *NETWORKS, BASELINE) if name in names]
     if not known:
         others = ", ".join((*NETWORKS, FILE, BASELINE))
-        raise InputError(f"--method paper: has no back end {names[0]}; choose {others}")
+        raise InputError(f"method paper: has no back end {names[0]}; choose {others}")
     name, device, notes = ready_backend(options, known[0]).name, device_of(options), ()
     if name == BASELINE:
         return reconstruct_baseline(capture, options.seed)

@@ -21,9 +21,7 @@ from jcr.findings import (
     FindingKind,
     is_lasting,
     no_reconstruction,
-    remedy,
     strongest_first,
-    text,
 )
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
@@ -55,7 +53,7 @@ class NothingFoundError(RejectedError):
         if first.kind is FindingKind.NO_RECONSTRUCTION:
             super().__init__(failure.what, *failure.remedies, also=failure.also)
         else:  # the failure and its remedies are consequences of the finding on the images
-            super().__init__(text(first), *filter(None, [remedy(first)]))
+            super().__init__(first.text, *filter(None, [first.remedy]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,10 +185,10 @@ def solved_pairs(pairs: PosePairs, options: CalibrateOptions | None = None) -> P
 
 def require_published(options: CalibrateOptions) -> None:
     """Raise InputError without torch, and for an option of the calibration, because the published method has none."""
-    extra("torch", "map", "--method paper")
+    extra("torch", "map", "method paper")
     for name, value in vars(CalibrateOptions()).items():
         if getattr(options, name) != value:
-            raise InputError(f"--method paper: does not use --{name.replace('_', '-')}; leave it out")
+            raise InputError(f"method paper: does not use {name}; leave it out")
 
 
 def select_published(
@@ -206,7 +204,7 @@ def select_published(
     """
     require_published(options.calibrate)
     if capture.mount != "gripper":
-        raise InputError("--method paper: is for a camera on the gripper; leave it out")
+        raise InputError("method paper: is for a camera on the gripper; leave it out")
     # Torch and pycolmap take seconds to import, and torch may be absent.
     from jcr.paper.run import calibrate_published, reconstruct_published
 
@@ -234,7 +232,7 @@ def _why_untried(
         if rejection is None:
             return None, False
         if is_lasting(rejection) or rejection.concerns not in HELPS:
-            return f"no other back end was tried, for none can help: {text(rejection)}", False
+            return f"no other back end was tried, for none can help: {rejection.text}", False
     if best.is_doubtful and any(one.severity == "rejects" for one in of_images()):
         return None, False
     textured = [one for one in trials if one.is_textured(images)]

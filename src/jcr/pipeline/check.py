@@ -18,7 +18,7 @@ from jcr.calibration.required_accuracy import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
-from jcr.errors import RejectedError
+from jcr.errors import RejectedError, counted
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import (
     MIN_PREDICTED_IMAGES,
@@ -40,6 +40,7 @@ from jcr.findings import (
     verdict_of,
 )
 from jcr.geometry import largest_motion
+from jcr.number_format import significant
 from jcr.pipeline.reading_decision import decided_by_images, first_reading
 from jcr.progress import Progress
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
@@ -79,6 +80,13 @@ class Examination:
     def verdict(self) -> Verdict:
         """Expected verdict on a calibration of the capture."""
         return verdict_of(self.findings)
+
+    def __repr__(self) -> str:
+        """Return the expected verdict, the expected accuracy of a point, and the first finding, on one line."""
+        seen = self.expected and self.expected.seen
+        point = f", a point within {significant(seen.within_95_mm)} mm (95 %)" if seen else ""
+        first = "".join(f"; {one.text}" for one in self.findings[:1])
+        return f"<Examination: {self.verdict}, {counted(len(self.capture), 'image')}{point}{first}>"
 
 
 @dataclass(frozen=True, kw_only=True)

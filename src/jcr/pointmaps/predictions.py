@@ -8,7 +8,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.camera import is_distorted, usable_intrinsics
-from jcr.errors import InputError
+from jcr.errors import InputError, counted
 from jcr.geometry import apply, inverse, require_rigid
 from jcr.pointmaps.image_grid import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.pointmaps.pair_predictions import (
@@ -115,11 +115,13 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
     if not names:
         if count != len(capture):
             raise InputError(
-                f"{source}: {count} images, the capture has {len(capture)}; add their names as array 'images'"
+                f"{source}: {counted(count, 'image')}, the capture has {len(capture)}; add their names as array 'images'"
             )
         return np.arange(count)
     if len(names) != count or len(set(names)) != count:
-        raise InputError(f"{source}: 'images' has {len(names)} names for {count} images; give one each")
+        raise InputError(
+            f"{source}: 'images' has {counted(len(names), 'name')} for {counted(count, 'image')}; give one each"
+        )
     unknown = [name for name in names if name not in capture.images]
     if unknown:
         raise InputError(f"{source}: no image {unknown[0]!r} in the capture; it has {capture.images[0]!r} …")

@@ -76,7 +76,7 @@ def reconstruct_pointmaps(
     found, misfit_px = fit_pinhole(maps)
     predicted = maps.grid.original_intrinsics(found) if np.isfinite(misfit_px) else None
     if (pinhole := images.pinhole or predicted) is None:
-        raise InputError(f"--backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
+        raise InputError(f"backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
     maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
     refined = refine(part, images, maps, pinhole, report) if refining else None
     if refined is None:

@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import AfterValidator, Field, PlainSerializer, computed_field
 
 from jcr.errors import InputError
-from jcr.findings import Finding, remedy, unobservable
+from jcr.findings import Finding, unobservable
 from jcr.records.capture import Intrinsics
 from jcr.records.field_checks import require_fields
 from jcr.records.json_fields import (
@@ -76,7 +76,7 @@ class Observability:
     @property
     def advice(self) -> tuple[str, ...]:
         """Remedy of each unobservable direction, in the order of `unobservable`."""
-        return tuple(remedy(finding) for finding in self.findings)
+        return tuple(finding.remedy for finding in self.findings)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from pydantic.fields import FieldInfo
 
-from jcr.errors import InputError, first_fault
+from jcr.errors import InputError, counted, first_fault
 
 
 def require_fields(record: Any) -> None:
@@ -56,7 +56,9 @@ def require_counts(kind: str, count: int, **parts: Any) -> None:
     """Raise InputError, begun with the name `kind` of a record, if a part that is not None has not `count` rows."""
     for name, part in parts.items():
         if part is not None and len(part) != count:
-            raise InputError(f"{kind}: {len(part)} rows of {name} for {count} images; give one each")
+            raise InputError(
+                f"{kind}: {counted(len(part), 'row')} of {name} for {counted(count, 'image')}; give one each"
+            )
 
 
 def require_rows(kind: str, name: str, index: ndarray, end: int) -> None:

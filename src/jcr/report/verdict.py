@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.calibration.summary import leave_one_out_text, only_centre_meets, worst_direction
-from jcr.findings import FindingKind, reached_in_words, remedy, sentence, text
+from jcr.findings import FindingKind, reached_in_words, sentence
 from jcr.number_format import significant
 from jcr.report.render import Content
 
@@ -23,9 +23,9 @@ def failure_section(calibration: AnyCalibration) -> Content:
     """Return the reason why no camera poses were found, the remedies, and a row for each attempt with a back end."""
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
-    remedies += filter(None, [remedy(failed)])
+    remedies += filter(None, [failed.remedy])
     return {
-        "fault": text(failed),
+        "fault": failed.text,
         "remedies": [words[0].upper() + words[1:] for words in remedies],
         "attempts": [
             (
@@ -54,7 +54,7 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     evidence = _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
         reason, evidence = (
-            text(calibration.findings[0]),
+            calibration.findings[0].text,
             "Small residuals do not prove accuracy, because X is on both sides of AX = XB.",
         )
     if isinstance(calibration, Calibration):

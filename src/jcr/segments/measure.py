@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from jcr.errors import counted
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
 from jcr.segments.tabletop import FEWEST_POINTS, Support, fit_support
@@ -55,6 +56,14 @@ class Measurement:
     support: Support
     objects: tuple[ObjectSize, ...]
     """Objects, sorted by footprint, largest first."""
+
+    def __repr__(self) -> str:
+        """Return the number of objects, each one's name and size, and the flatness of the plane, on one line."""
+        sizes = ((one.name, "x".join(f"{1e3 * m:.0f}" for m in one.box_size)) for one in self.objects)
+        named = ", ".join(f"{name} {size} mm" for name, size in sizes)
+        return (
+            f"<Measurement: {counted(len(self.objects), 'object')} on the support plane: {named or 'none'}>"
+        )
 
 
 def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measurement:

@@ -22,7 +22,7 @@ from viser.transforms import SO3
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
 from jcr.capture.urdf_chain import load_urdf
-from jcr.errors import InputError
+from jcr.errors import InputError, counted
 from jcr.geometry import scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import Capture
@@ -112,8 +112,8 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
         )
     if len(moving) < joints.shape[1]:
         raise InputError(
-            f"{urdf}: moves {len(moving)} joints, but the capture has {joints.shape[1]} values for each image; give "
-            "the URDF of the whole arm"
+            f"{urdf}: moves {counted(len(moving), 'joint')}, the capture has {joints.shape[1]} values for each image; "
+            "give the URDF of the whole arm"
         )
     try:
         robot = yourdfpy.URDF.load(str(urdf))
@@ -148,7 +148,7 @@ class Viewer:
         headline = head(self.calibration)["verdict"]
         lines = [(f"{headline['verdict']}:", f"{headline['reason']}.")]
         lines += [("", f"No map yet: make one with jcr map {run.out}")] * (self.scene is None)
-        server.gui.add_html(_lines(*lines))
+        server.gui.add_html(render("headline.html", {"lines": lines}, "jcr.viewer"))
         report("view", 0.1)
         self._add_capture()
         self.robot = None
