@@ -103,8 +103,9 @@ def first_fault(error: "ValidationError") -> str:
     place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
     what = first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
-        like = get_close_matches(str(first["loc"][-1]), map(str, first["input"]), n=1)
-        what = "is missing" + "".join(f"; rename {shown(key)}" for key in like)
+        name = str(first["loc"][-1])
+        like = get_close_matches(name, map(str, first["input"]), n=1)
+        what = "is missing" + "".join(f"; rename {shown(key)} to {name}" for key in like)
     return f"{place}: {what}" if place else what
 
 

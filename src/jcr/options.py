@@ -44,7 +44,7 @@ def checked_options(options: object, kind: type[Options]) -> Options:
                 f"({part.replace(' ', ', ')})" if " " in part else repr(part) for part in form.split("|")
             )
             raise InputError(
-                f"{kind.__name__}: {first['loc'][0]}: give {written}, not {content[first['loc'][0]]!r:.80}"
+                f"{kind.__name__}: {first['loc'][0]}: give {written}, not {content[str(first['loc'][0])]!r:.80}"
             ) from None
         # pydantic puts the type of a union's member into the place.
         place = ".".join(str(part) for part in first["loc"] if "[" not in str(part))

@@ -176,9 +176,10 @@ class QueryCommand:
             lines = (_FORMATS % row for row in zip(*(column.tolist() for column in columns), strict=True))
             write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
             summary = f"wrote {path}: {summary}"
-        of_points = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy, sample.label))
-        few = zip(x_in_base, *of_points, strict=True)
-        lines = [summary] + [_answer(*one, scene.label_names) for one in islice(few, PRINTED)]
+        values = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy, sample.label))
+        distance, std, occupancy, label = values
+        few = zip(x_in_base, distance, std, occupancy, label, strict=True)
+        lines = [summary, *(_answer(*one, scene.label_names) for one in islice(few, PRINTED))]
         self.output.result(lines, answers)
         return 0
 
