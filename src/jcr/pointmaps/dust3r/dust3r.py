@@ -157,7 +157,7 @@ def _in_batches(
         # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
         torch.cuda.empty_cache()
         if sizes[-1] == 0:
-            raise InputError("out of memory with one pair; close other programs, or use --device cpu")
+            raise InputError("out of memory with one pair; close other programs, or choose device cpu")
 
 
 def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
@@ -187,7 +187,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
         # Channels last: the heads' convolutions take 0.94 s instead of 1.32 s on two cores at 512x384.
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
-        raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
+        raise InputError(f"device {device}: {_line(error)}; choose device cpu") from None
     if weights.note not in _ANNOUNCED:
         _ANNOUNCED.add(weights.note)
         sys.stderr.write(f"{weights.note}\n")
