@@ -6,6 +6,7 @@ Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from hashlib import blake2b
 
 import cv2
 import numpy as np
@@ -24,6 +25,10 @@ CONTRAST = 0.01
 """Least contrast of a keypoint. With COLMAP's 0.02 elephant_floor has 420 an image, and 2 of its 15 images register."""
 RATIO = 0.8
 """Largest ratio of the descriptor distances to the nearest and the second nearest keypoint (Lowe 2004)."""
+KEPT = 64
+"""Number of images whose keypoints are remembered, 1 MB each: several stages ask for those of the same image."""
+_kept: dict[bytes, tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]] = {}
+"""Keypoints and descriptors by the digest of the grey image, the oldest first."""
 FARTHEST = 0.7
 """Largest distance of the unit descriptors of a match, as in COLMAP."""
 
@@ -40,8 +45,22 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
 def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
     """Return keypoints (x, y in px; pixel centres are whole numbers) and unit descriptors (RootSIFT) of a grey image.
 
-    The arrays are empty if nothing is found.
+    The arrays are empty if nothing is found. They are not writable, because the last KEPT results are remembered.
     """
+    key = blake2b(np.ascontiguousarray(grey), key=repr(grey.shape).encode()).digest()
+    found = _kept.get(key)
+    if found is None:
+        found = _detected(grey)
+        for each in found:
+            each.flags.writeable = False
+        for oldest in list(_kept)[: len(_kept) + 1 - KEPT]:
+            _kept.pop(oldest, None)
+        _kept[key] = found
+    return found
+
+
+def _detected(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
+    """Return keypoints and descriptors as in `detect`, which remembers them."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)

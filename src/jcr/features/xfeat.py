@@ -179,6 +179,8 @@ class LearnedFeatures:
         self._network, self._matcher = networks()
         self._sets: dict[tuple[int, int], _Keypoints] = {}
         """Keypoints by row of the image and angle (degrees) of its rotation."""
+        self._matched: dict[tuple[tuple[int, int], ...], Int[ndarray, "_ 2"]] = {}
+        """Matches by the keys of two sets; a second map, with other intrinsics, needs many of them again."""
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Keypoints of every image at all angles, in pixels of images of `size`; pixel centres are whole numbers."""
         self.descriptors: list[Float32[ndarray, "_ d"]] = [np.zeros((0, LENGTH), np.float32) for _ in images]
@@ -191,26 +193,28 @@ class LearnedFeatures:
         `x_px`.
         """
         rotated = [
-            [(row, round(math.degrees(float(roll)))) for row, roll in zip(*both, strict=True)]
+            tuple((row, round(math.degrees(float(roll)))) for row, roll in zip(*both, strict=True))
             for both in zip(pairs, rolls, strict=True)
         ]
+        unmatched = [both for both in dict.fromkeys(rotated) if both not in self._matched]
 
-        def of_pair(both: list[tuple[int, int]]) -> Int[ndarray, "m 2"]:
+        def of_pair(both: tuple[tuple[int, int], ...]) -> Int[ndarray, "m 2"]:
             first, second = (self._sets[one] for one in both)
             x_px, descriptors = (first.x_px, second.x_px), (first.descriptor, second.descriptor)
             rows, _ = match(self._matcher, x_px, descriptors, (first.size, second.size))
             return rows.numpy() + [first.start, second.start]
 
         with ThreadPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
-            new = [one for one in dict.fromkeys(sum(rotated, [])) if one not in self._sets]
+            new = [one for one in dict.fromkeys(sum(rotated, ())) if one not in self._sets]
             for (row, degrees), (x_px, descriptor, size, matching_px) in zip(
                 new, pool.map(self._detected, new), strict=True
             ):
                 self._sets[row, degrees] = _Keypoints(len(self.x_px[row]), x_px, descriptor, size)
                 self.x_px[row] = np.concatenate([self.x_px[row], matching_px])
                 self.descriptors[row] = np.concatenate([self.descriptors[row], descriptor.numpy()])
-            found = pool.map(of_pair, rotated)
-            return [rows for _, rows in zip(steps(self._report, "matching", pairs), found, strict=True)]
+            found = pool.map(of_pair, unmatched)
+            self._matched |= zip(steps(self._report, "matching", unmatched), found, strict=True)
+        return [self._matched[both] for both in rotated]
 
     def _detected(
         self, key: tuple[int, int]
