@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,43 +64,6 @@ def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys)
     assert len(table) == 4 and table[-1]["status"] == "failed"
     page = (out / "summary.html").read_text()
     assert page.count("<tr>") == 5 and "not a readable image" in page
-
-
-def test_deleted_results_and_changed_facts_of_a_capture_are_made_again(
-    tmp_path: Path, captures: list[Path], monkeypatch: pytest.MonkeyPatch
-):
-    """Robot, URDF, joints and a result that is gone count as the images and poses do."""
-    capture, report = shutil.copytree(captures[1], tmp_path / "capture"), tmp_path / "all/capture/report.html"
-    (capture / "robot.urdf").write_text('<robot name="r"><link name="base"/></robot>')
-    content, file = json.loads((capture / "capture.json").read_text()), capture / "capture.json"
-    called: list[object] = []
-
-    def noted(*stages: object) -> None:
-        called.append(stages)
-        raise module.InputError("no work here")
-
-    def is_made(changed: dict) -> bool:
-        """Run the batch, with a stage in place of the work, and return whether it was called."""
-        called.clear()
-        file.write_text(json.dumps(content | changed))
-        with monkeypatch.context() as patched:
-            patched.setattr("jcr.pipeline.run.make", noted)
-            run_one(*task)
-        return bool(called)
-
-    task = capture, report.parent, RunOptions(map=None), ReadOptions()
-    file.write_text(json.dumps(content))
-    assert run_one(*task).status != "failed" and not is_made({})
-    jointed = [frame | {"joints": [0.1 * k] * 6} for k, frame in enumerate(content["frames"])]
-    for changed in (
-        {"frames": content["frames"][:4]},
-        {"robot": "ur5e"},
-        {"frames": jointed},
-        {"urdf": "robot.urdf"},
-    ):
-        assert is_made(changed) and not is_made({}), changed
-    report.unlink()
-    assert is_made({})
 
 
 def test_a_recording_is_not_extracted_where_another_process_writes(tmp_path: Path, captures: list[Path]):

@@ -82,12 +82,6 @@ def test_commands_in_the_documents_exist_and_take_their_arguments():
     assert len(found) > 100 and wrong == []
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_a_command_is_printed(name: str, capsys: pytest.CaptureFixture[str]):
-    assert dispatch([name, "--help"]) == 0
-    assert f"jcr {name}" in capsys.readouterr().out
-
-
 def test_files_and_imports_that_the_documents_name_exist():
     pattern = r"`(?:python )?((?:src|tests|simulation|benchmarks|examples|docs)/[\w/.-]+)"
     missing = []

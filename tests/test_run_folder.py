@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -53,6 +54,10 @@ def test_a_run_with_files_beside_its_images_is_complete_in_relative_folders(
         Path(file).write_bytes(before + b" ")
         assert not is_unchanged(begun(Path("out"), capture, RunOptions(map=None))), file
         Path(file).write_bytes(before)
+    for changed in ({"robot": "ur5e"}, {"joints": np.zeros((1, 6))}, {"urdf": None}):
+        assert not is_unchanged(begun(Path("out"), replace(capture, **changed), RunOptions(map=None))), (
+            changed
+        )
     Path("out/report.html").unlink()
     assert not is_unchanged(run)
 

@@ -37,6 +37,8 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     "focus scatters": (Faults(focal_scatter=0.01),
         r"the focal length differs between images by ([\d.]+) % \(rms", [1.0], 0.6),
     "zoom": (Faults(zoom=0.03), r"changes by \+([\d.]+) ± \S+ % after 05.png", [3.0], 0.2),
+    "focal length": (Faults(intrinsics=(("fx", 30.0), ("fy", 30.0))),
+        r"focal lengths of \(([\d.]+), [\d.]+\) ± \S+ px where \(620.0, 620.0\)", [INTRINSICS.fx + 30], 6.0),
     "principal point": (Faults(intrinsics=(("cx", 12.0),)), r"a principal point of \(([\d.]+), ([\d.]+)\)",
         [INTRINSICS.cx + 12, INTRINSICS.cy], 3.0),
     "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
@@ -62,7 +64,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
 """Faults of a capture, words that name them, their sizes, and how far the named sizes may be off."""
 
 
-OF_CAMERA = [*NAMED][:6]
+OF_CAMERA = [*NAMED][:7]
 
 
 @pytest.mark.parametrize("name", NAMED)

@@ -13,7 +13,7 @@ import pytest
 import jcr
 from jcr.capture.images import read_image
 from jcr.findings import FindingKind
-from jcr.geometry import rotation_exp, step_between, transform
+from jcr.geometry import rotation_exp, scale_translation, step_between, transform
 from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import LiveProgress
 from jcr.records import Capture
@@ -147,9 +147,7 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
 
 def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tabletop: Path):
     image, poses = still(tabletop, 0), jcr.read_capture(tabletop).base_from_gripper
-    in_mm, mirrored, not_finite = poses[1].copy(), poses[1] @ np.diag([1.0, 1, -1, 1]), poses[1].copy()
-    in_mm[:3, 3] *= 1e3
-    not_finite[0, 3] = np.nan
+    in_mm = scale_translation(poses[1], 1e3)
     other = still(tabletop, 1)
     path = tabletop / "images" / "00.jpg"
     with closing(LiveCalibration(tmp_path / "capture")) as live:
@@ -163,9 +161,6 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
             (other, poses[1][:3, :3], "a rotation .3x3. has no translation"),
             (other, poses[1][:3], "four rows"),
             (other, 2 * poses[1], "last row"),
-            (other, poses[1] @ np.diag([2.0, 2, 2, 1]), "scaled by 2"),
-            (other, mirrored, "a reflection"),
-            (other, not_finite, "NaN"),
             (other, in_mm, "look like millimetres: divide the translations by 1000"),
             (image, poses[1], "image 2: is the same as images/001.png, though the gripper moved by"),
             (image, poses[0], "image 2: repeats images/001.png, image and pose"),

@@ -323,6 +323,7 @@ def test_bad_samples_are_answered_and_good_ones_taken(serving: Callable[..., Any
         ):
             status, answer = posted(server, content)
             assert status == 400 and not answer["accepted"] and words in answer["reason"], content
+        assert posted(server, POSE, Content_Length="9" * 5000)[0] == 400
         assert posted(server, {"base_from_gripper": pose.tolist()})[0] == 200
         assert posted(server, POSE)[0] == 200
     assert np.allclose(taken[0].base_from_gripper, pose)
