@@ -16,12 +16,7 @@ from jcr.calibration.record import Calibration
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added_cameras import added_camera
 from jcr.cell.place_cameras import _adopted, place_cameras
-from jcr.cell.placement import (
-    CameraPlacement,
-    CamerasFile,
-    read_cameras,
-    write_cameras,
-)
+from jcr.cell.placement import CameraPlacement, CamerasFile, read_cameras, write_cameras
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.hypotheses import Examined

@@ -311,11 +311,7 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
     steps = np.random.default_rng(0).multivariate_normal(np.zeros(16), uncertainty.whole, 4000, method="eigh")
     drawn = np.array(
         [
-            placed(
-                retract(x, step[:6]),
-                with_parameters(camera, parameters(camera) + step[7:]),
-                step[6],
-            )
+            placed(retract(x, step[:6]), with_parameters(camera, parameters(camera) + step[7:]), step[6])
             for step in steps
         ]
     )
