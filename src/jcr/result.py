@@ -83,8 +83,8 @@ class RunState(BaseModel):
     attempts: tuple[Attempt, ...] = ()
     """Attempts with different back ends, from which the reconstruction was selected."""
     made: dict[str, str] = {}
-    """Fingerprints of inputs: key "reconstruct" for those of the reconstruction, key "run" (only for a finished run)
-    for all inputs."""
+    """Fingerprints of inputs: keys "reconstruct" and "densify" for those of reconstruction and depth, key "run" (only
+    for a finished run) for all inputs."""
     files: dict[str, str] = {}
     """Fingerprints of calibration.json and added images, by file name, and an empty text for each other file of a
     finished run; empty for an unfinished run."""

@@ -226,11 +226,8 @@ class Outcome:
 
     @property
     def in_short(self) -> str:
-        """Verdict, number of used images, and the error that 95 % of the points stay below, on one line."""
-        uncertainty = getattr(self, "uncertainty", None)
-        seen = None if uncertainty is None else uncertainty.seen
-        point = "" if seen is None else f", a point within {significant(seen.within_95_mm)} mm (95 %)"
-        return f"{self.verdict}, {self.images_used} of {len(self.images)} images{point}"
+        """Verdict and number of used images, on one line."""
+        return f"{self.verdict}, {self.images_used} of {len(self.images)} images"
 
     def with_findings(self: AnyOutcome, *findings: Finding) -> AnyOutcome:
         """Return the calibration with more findings, all of them sorted by `strongest_first`; its covariance stays."""
@@ -305,6 +302,13 @@ class Calibration(Outcome):
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
         """gripper_from_camera, or base_from_camera of a fixed camera."""
         return self.gripper_from_camera if self.mount == "gripper" else self.base_from_camera
+
+    @property
+    def in_short(self) -> str:
+        """Verdict, number of used images, and the error that 95 % of the points stay below, on one line."""
+        seen = self.uncertainty.seen
+        point = "" if seen is None else f", a point within {significant(seen.within_95_mm)} mm (95 %)"
+        return super().in_short + point
 
     @property
     def base_from_recon(self) -> Similarity:

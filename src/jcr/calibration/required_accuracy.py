@@ -106,26 +106,16 @@ def requirement_of(
         concerns = "robot"
     elif more is None and main_part == "intrinsics":
         concerns = "intrinsics"
-    elif (
-        more is None and _more_images(x, uncertainty, findings, images, _eased(required, images)) is not None
-    ):
-        required, concerns = replace(required, more_images=IMAGES_FIRST), "images"
+    elif more is None:
+        # The size of the errors is known to 1 ± 1/√(2k); the estimated one may be too large by one standard deviation.
+        factor = 1 / (1 - 1 / np.sqrt(2 * images))
+        in_mm, in_deg = factor * required.translation_mm, factor * required.rotation_deg
+        eased = replace(required, translation_mm=in_mm, rotation_deg=in_deg)
+        if _more_images(x, uncertainty, findings, images, eased) is not None:
+            required, concerns = replace(required, more_images=IMAGES_FIRST), "images"
     size = 1e-3 * required.reached_mm
     return required, (
         Finding.of(FindingKind.NOT_EXACT_ENOUGH, "warns", concerns, value=size, **required.details),
-    )
-
-
-def _eased(required: Requirement, images: int) -> Requirement:
-    """Return the requirement that the true errors miss if the estimated ones are too large by one standard deviation.
-
-    With k images, the size of the errors is known to a factor of about 1 ± 1/√(2k).
-    """
-    factor = 1 / (1 - 1 / np.sqrt(2 * images))
-    return replace(
-        required,
-        translation_mm=factor * required.translation_mm,
-        rotation_deg=factor * required.rotation_deg,
     )
 
 

@@ -62,7 +62,10 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
         values, looked = [], looked + len(rows)
         for k, (row, image, _) in enumerate(recording.images_of_rows(rows)):
             try:
-                values.append(sharpness(_pixels_of(image, f"{recording.source}: {recording.names[row]}")))
+                if isinstance(image, InputError):
+                    raise image
+                where = f"{recording.source}: {recording.names[row]}"
+                values.append(sharpness(read_image(image, where) if isinstance(image, bytes) else image))
             except InputError as error:
                 faults[row] = str(error)
                 values.append(UNREADABLE)
@@ -134,10 +137,3 @@ def _written(recording: Recording, rows: Rows, into: Path, report: Progress) -> 
         write_bytes(path_inside(into, images[-1], str(recording.source)), data)
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     return images
-
-
-def _pixels_of(image: bytes | UInt8[ndarray, "h w 3"] | InputError, where: str) -> UInt8[ndarray, "h w 3"]:
-    """Return the RGB pixels of an image of a recording; raise InputError if it cannot be read."""
-    if isinstance(image, InputError):
-        raise image
-    return read_image(image, where) if isinstance(image, bytes) else image

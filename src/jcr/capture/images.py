@@ -67,7 +67,10 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
             with Image.open(file, formats=FORMATS) as opened:
                 require_pixels(opened.size, where)
                 if opened.format in ("JPEG", "MPO"):
-                    _require_few_scans(source, where)
+                    data = source.read_bytes() if isinstance(source, Path) else source
+                    # Each scan decodes the whole image; the marker of a scan cannot be in its data.
+                    if (count := data.count(b"\xff\xda")) > MAX_SCANS:
+                        raise InputError(f"{where}: a JPEG of {count} scans; save it again")
                 # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
                 # Counting the images would take hours for a file of a million.
                 if opened.format != "MPO" and getattr(opened, "is_animated", False):
@@ -85,13 +88,6 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
         ) from None
     except Exception as error:  # decoders raise errors of many types for a damaged file
         raise InputError(f"{where}: not a readable image ({error}); save it again as PNG or JPEG") from None
-
-
-def _require_few_scans(source: Path | bytes, where: str) -> None:
-    """Raise InputError, begun with `where`, if a JPEG has over MAX_SCANS scans; each decodes the whole image."""
-    data = source.read_bytes() if isinstance(source, Path) else source
-    if (count := data.count(b"\xff\xda")) > MAX_SCANS:  # the marker of a scan, which its data cannot hold
-        raise InputError(f"{where}: a JPEG of {count} scans; save it again")
 
 
 def require_pixels(size: tuple[int, int], where: str) -> None:

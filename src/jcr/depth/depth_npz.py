@@ -15,31 +15,28 @@ from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
 from jcr.records.reconstruction_npz import read_npz, require_shapes, write_npz
 
 FILE = "depth.npz"
-FORMAT = "jcr.depth/2"
+FORMAT = "jcr.depth/3"
 """Version of the format; a file of another version is rejected."""
 GREY = 128
 """Grey value that replaces the colours where the images are no longer available."""
 
 
 class DepthHeader(BaseModel):
-    """Header of the file depth.npz, in JSON: version, fingerprint of what it was made from, and intrinsics."""
+    """Header of the file depth.npz, in JSON: version and intrinsics."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     format: str
-    made_from: str
-    """Fingerprint of the reconstruction and the options that the depth was estimated with."""
     intrinsics: Intrinsics
 
 
-def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> None:
+def write_depth(path: Path, reconstruction: Reconstruction) -> None:
     """Write depth z, its std and origin, and confidence of a reconstruction's pointmaps to a file depth.npz.
 
-    After an error there is no incomplete file. `made_from` is the fingerprint of reconstruction and options that
-    `is_made_from` compares.
+    After an error there is no incomplete file.
     """
     dense = reconstruction.dense
     assert dense.reason is not None and dense.depth_std is not None
-    about = {"format": FORMAT, "made_from": made_from, "intrinsics": asdict(dense.intrinsics)}
+    about = {"format": FORMAT, "intrinsics": asdict(dense.intrinsics)}
     camera_from_recon = inverse(reconstruction.recon_from_camera)
     depth = np.stack(
         [apply(pose, x)[..., 2] for pose, x in zip(camera_from_recon, dense.points_in_recon, strict=True)]
@@ -52,17 +49,6 @@ def write_depth(path: Path, reconstruction: Reconstruction, made_from: str) -> N
         "filled": np.packbits(dense.reason >> 1),
     }
     write_npz(path, about, arrays)
-
-
-def is_made_from(path: Path, made_from: str) -> bool:
-    """Test whether the file exists and was made from the input with the fingerprint `made_from`.
-
-    Raises InputError for a damaged file.
-    """
-    if not path.is_file():
-        return False
-    with read_npz(path, FORMAT) as (text, _):
-        return DepthHeader.model_validate_json(text, strict=True).made_from == made_from
 
 
 def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | None) -> Pointmaps:

@@ -22,7 +22,7 @@ from jcr.files import written_whole
 from jcr.geometry import scale_translation, transform
 from jcr.number_format import significant
 from jcr.options import checked_options
-from jcr.result import CLOUD, RunResult
+from jcr.result import CALIBRATION, CLOUD, RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import load_map
 
@@ -120,9 +120,11 @@ def write_run(
     if options.into is not None and format != "urdf":
         raise InputError(f"--into {options.into}: is for the format urdf")
     path = path or out / "export" / (row.file if options.into is None else options.into.name)
-    run = ExportedRun(
-        *_sound_runs(out, options) if format == "lerobot" else [out], options=options, path=path
-    )
+    runs = [out]
+    if format == "lerobot" and out.is_dir() and not (out / CALIBRATION).is_file():  # the folder of a batch
+        runs = sorted(file.parent for file in out.glob(f"*/{CALIBRATION}")) or runs
+        runs = [one for one in runs if options.force or RunResult(one).calibration.doubt is None] or runs[:1]
+    run = ExportedRun(*runs, options=options, path=path)
     if run.doubt is not None and not options.force:
         raise RejectedError(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
@@ -149,15 +151,6 @@ def write_run(
                 "--overwrite, or name another PATH"
             )
     return run, row, path
-
-
-def _sound_runs(out: Path, options: ExportOptions) -> list[Path]:
-    """Return the runs of a batch that are not rejected (with `options.force` all), or the run `out` alone."""
-    from jcr.export.lerobot import runs_in
-
-    folders = runs_in(out)
-    sound = [one for one in folders if options.force or RunResult(one).calibration.doubt is None]
-    return sound or folders[:1]
 
 
 class ExportedRun:

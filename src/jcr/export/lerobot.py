@@ -16,13 +16,6 @@ MATRIX = "gripper_from_camera"
 """Column of the hand-eye transform: 16 numbers, row by row."""
 
 
-def runs_in(out: Path) -> list[Path]:
-    """Return the run folder `out` alone, or the folders of all runs in it if it is the folder of a batch."""
-    if (out / "calibration.json").is_file() or not out.is_dir():
-        return [out]
-    return sorted(file.parent for file in out.glob("*/calibration.json")) or [out]
-
-
 def episodes_of(folders: Sequence[Path]) -> list[dict[str, Any]]:
     """Return the rows of the table by episode for runs of episodes of one data set; raise InputError for other runs."""
     rows = sorted((_row(folder) for folder in folders), key=lambda row: row["episode_index"])

@@ -227,16 +227,12 @@ class LiveSession:
                     name = names[number - 1]
                     self._say(f"the next image replaces {name}", {"replaces": name}, replaces=name)
                 if self._gripper is not None:
-                    self._take_now(self._gripper)
+                    try:
+                        self.take(self._gripper())
+                    except InputError as error:  # the gripper's pose cannot be read
+                        self._refuse(f"refused: {error}")
                 elif action == "take":
                     self._refuse("refused: give the pose at which the gripper rests; the image is taken then")
-
-    def _take_now(self, gripper: Callable[[], RobotState]) -> None:
-        """Take an image where the gripper is now; refuse if its pose cannot be read."""
-        try:
-            self.take(gripper())
-        except InputError as error:
-            self._refuse(f"refused: {error}")
 
     def _undo(self) -> None:
         """Undo the last change: a replacement that waits for its image, else the last addition or removal."""

@@ -90,11 +90,6 @@ class NewImages:
         return tuple(fingerprint(*one) for one in zip(self.pixels, self.base_from_gripper, strict=True))
 
 
-def calibration_digest(run: RunResult) -> str:
-    """Return a hash of the calibration of a run and the poses of its images."""
-    return fingerprint(run.found.gripper_from_camera, run.capture.base_from_gripper, run.capture.images)
-
-
 def new_images(new: Capture, camera: CellCamera | None = None) -> NewImages:
     """Return the images of a new capture, or of one of its cameras; raise InputError if its poses are undecided."""
     new = require_decided(new)

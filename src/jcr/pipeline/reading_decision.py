@@ -1,6 +1,6 @@
 """Decision between readings of gripper poses by the images: camera poses without the robot, misfit of each reading."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, islice
 from math import comb
@@ -254,7 +254,9 @@ def _rows_of_images(
     for k, (_, poses) in enumerate(capture.candidates):
         angles = pair_angles(np.nan_to_num(poses))
         choices = combinations(range(more), more - fewer)
-        every = islice(choices, MOST_CHOICES) if count <= MOST_CHOICES else _ends(more, more - fewer)
+        every = islice(choices, MOST_CHOICES)
+        if count > MOST_CHOICES:  # only the first and the last places are dropped
+            every = ((*range(k), *range(fewer + k, more)) for k in range(more - fewer + 1))
         for dropped in every:
             row, at = _places(rows, images, dropped, image_index)
             if len(at) > 3:
@@ -288,9 +290,13 @@ def _rows_of_images(
         )
     numbers = ", ".join(str(k + 1) for k in dropped)
     lag = _lag(capture, dropped)
+    remedy, source = "remove it from the file", capture.source
+    if source is not None and source.suffix == ".npy":
+        left = f"numpy.delete(numpy.load({source.name!r}), {[*dropped]}, 0)"
+        remedy = f"remove it with numpy.save({source.name!r}, {left})"
     return InputError(
         f"{plain}; by the images ({_size(misfit)}, {text_of(reading)}), row {numbers} (counted from 1) has no "
-        f"image{lag}: {_removal(capture.source, dropped)}"
+        f"image{lag}: {remedy}"
     )
 
 
@@ -306,12 +312,6 @@ def _places(
     return [row for row, _ in pairs], [k for _, k in pairs]
 
 
-def _ends(count: int, dropped: int) -> Iterator[tuple[int, ...]]:
-    """Yield the choices that drop only the first and the last of `count` places."""
-    for first in range(dropped + 1):
-        yield (*range(first), *range(count - dropped + first, count))
-
-
 def _lag(capture: Capture, dropped: tuple[int, ...]) -> str:
     """Return words that poses and images are shifted, if the images' names count from another number than 1."""
     first = "".join(c for c in Path(capture.images[0]).stem if c.isdecimal())
@@ -320,13 +320,6 @@ def _lag(capture: Capture, dropped: tuple[int, ...]) -> str:
         by = "one" if abs(shift) == 1 else abs(shift)
         return f" (image {first} has the pose of row {int(first) - shift}: the poses are {by} behind)"
     return ""
-
-
-def _removal(source: Path | None, dropped: tuple[int, ...]) -> str:
-    """Return the remedy that removes rows from a file."""
-    if source is not None and source.suffix == ".npy":
-        return f"remove it with numpy.save({source.name!r}, numpy.delete(numpy.load({source.name!r}), {[*dropped]}, 0))"
-    return "remove it from the file"
 
 
 def _size(misfit: Misfit) -> str:

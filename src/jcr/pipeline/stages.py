@@ -26,7 +26,7 @@ from jcr.cell.placement import FILE as CAMERAS
 from jcr.cell.placement import CamerasFile, write_cameras
 from jcr.depth.densify import densify
 from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
-from jcr.depth.depth_npz import is_made_from, write_depth
+from jcr.depth.depth_npz import write_depth
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_text
 from jcr.findings import sentence
@@ -64,9 +64,9 @@ LARGE = 50_000_000
 
 
 def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
-    """Return the RunResult of a run before its first stage, with capture, options and a fingerprint of the inputs.
+    """Return the RunResult of a run before its first stage, with capture, options and fingerprints of the inputs.
 
-    The fingerprint covers all inputs of the reconstruction. Raises InputError if the capture's path is not UTF-8.
+    The fingerprints are those of reconstruction and depth. Raises InputError if the capture's path is not UTF-8.
     """
     folder = str(capture.folder.resolve())
     try:
@@ -82,6 +82,7 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
     of_capture = images, capture.mount, capture.base_from_gripper, capture.intrinsics
     facts = *of_capture, candidates(own), weights, FORMAT, options.method
     made = {"reconstruct": fingerprint(facts, own, __version__)}
+    made["densify"] = fingerprint(made["reconstruct"], options.depth, DEPTH_FORMAT)
     state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
     with suppress(InputError):
         before = RunResult(out).state
@@ -216,14 +217,14 @@ def _select(result: RunResult, progress: Progress) -> RunResult:
     capture, out, options = result.capture, result.out, result.state.options
     seen = with_moving_parts(capture, out / MOVING) if capture.mount == "base" else capture
 
-    def is_same(folder: Path) -> bool:
-        """Test whether a folder has a reconstruction of the same inputs; False if its run.json cannot be read."""
+    def is_same(folder: Path, key: str = "reconstruct", file: str = RECONSTRUCTION) -> bool:
+        """Test whether a folder has a file of the same inputs; False if its run.json cannot be read."""
         with suppress(InputError):
-            made = RunResult(folder).state.made.get("reconstruct")
-            return made == result.state.made["reconstruct"] and (folder / RECONSTRUCTION).is_file()
+            made = RunResult(folder).state.made.get(key)
+            return made == result.state.made[key] and (folder / file).is_file()
         return False
 
-    if is_same(out) and not is_made_from(out / DEPTH, _depth_made_from(result)):
+    if not is_same(out, "densify", DEPTH):  # so that the fingerprints of run.json are those of its files
         (out / DEPTH).unlink(missing_ok=True)
     same = next(filter(is_same, (out, capture.folder / LIVE)), None)
     before = None if same is None else RunResult(same, capture=seen)
@@ -310,17 +311,11 @@ def _cameras(result: RunResult, progress: Progress) -> RunResult:
     return result.with_parts(cameras=found)
 
 
-def _depth_made_from(result: RunResult) -> str:
-    """Return the fingerprint of the reconstruction's inputs and the depth options, which depth.npz stores."""
-    return fingerprint(result.state.made["reconstruct"], result.state.options.depth, DEPTH_FORMAT)
-
-
 def _densify(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with dense depth in its reconstruction, estimated unless it is there, and write depth.npz."""
     made = densify(result.capture, result.reconstruction, result.state.options.depth, progress)
-    file, made_from = result.out / DEPTH, _depth_made_from(result)
-    if not made.dense.is_predicted and not is_made_from(file, made_from):
-        write_depth(file, made, made_from)
+    if not made.dense.is_predicted and not (result.out / DEPTH).is_file():
+        write_depth(result.out / DEPTH, made)
     return result.with_parts(reconstruction=made)
 
 

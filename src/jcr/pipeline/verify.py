@@ -22,13 +22,13 @@ from jcr.findings import Verdict
 from jcr.geometry import Transform, retract, step_between
 from jcr.pipeline.calibrated_scene import (
     NewImages,
-    calibration_digest,
     name_of,
     new_images,
     old_scene,
     require_new,
 )
 from jcr.pipeline.options import TOLERANCE
+from jcr.pipeline.stages import fingerprint
 from jcr.pipeline.verify_history import (
     History,
     Verified,
@@ -200,7 +200,7 @@ def verify_run(
             f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
         )
     with locked(run.out):
-        digest = calibration_digest(run)
+        digest = fingerprint(run.found.gripper_from_camera, capture.base_from_gripper, capture.images)
         scene, history, row = old_scene(run.out, digest), read_history(run.out, digest), 0
         for k, (name, one) in enumerate(captures.items()):
             report("find the old scene", k / len(captures))

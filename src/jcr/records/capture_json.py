@@ -184,19 +184,6 @@ def _one_own(cameras: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
 CameraEntries = Annotated[dict[Name, CameraEntry], AfterValidator(_one_own)]
 
 
-def _read_reading(value: Any) -> Reading:
-    """Return a reading from a JSON object; a Reading is returned unchanged."""
-    return _READING.validate_python(value)
-
-
-def _read_frame_names(value: Any) -> FrameNames:
-    """Return names of frames from a JSON object; FrameNames are returned unchanged."""
-    return _FRAME_NAMES.validate_python(value)
-
-
-_READING, _FRAME_NAMES = TypeAdapter(Reading), TypeAdapter(FrameNames)
-
-
 class CaptureFile(Entry, extra="allow"):
     """Content of a capture.json; unknown keys are kept."""
 
@@ -207,9 +194,11 @@ class CaptureFile(Entry, extra="allow"):
     robot: Any = None
     urdf: str | None = None
     cameras: CameraEntries | None = None
-    reading: Annotated[Reading, BeforeValidator(_read_reading)] | None = None
+    reading: Annotated[Reading, BeforeValidator(TypeAdapter(Reading).validate_python)] | None = None
     """Reading of the poses from a file; absent where they were written as base_from_gripper."""
-    frame_names: Annotated[FrameNames, BeforeValidator(_read_frame_names)] = FrameNames()
+    frame_names: Annotated[FrameNames, BeforeValidator(TypeAdapter(FrameNames).validate_python)] = (
+        FrameNames()
+    )
     """Names of the frames of base, gripper and camera in the robot's software."""
 
     def as_text(self) -> str:

@@ -78,7 +78,10 @@ def _checked_fields(kind: type) -> tuple[type[BaseModel] | None, Mapping[str, tu
         hint = hints[field.name]
         if _is_plain(hint):
             plain[field.name] = (hint, ...)
-        elif all(one is NoneType or _is_array(one) for one in _alternatives(hint)):
+        elif all(
+            one is NoneType or (isinstance(one, type) and issubclass(one, AbstractArray))
+            for one in _alternatives(hint)
+        ):
             arrays[field.name] = _alternatives(hint)
     config = ConfigDict(allow_inf_nan=False, protected_namespaces=())
     return create_model(kind.__name__, __config__=config, **plain) if plain else None, arrays
@@ -89,11 +92,6 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
     while get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-
-
-def _is_array(kind: Any) -> bool:
-    """Test whether a type is an array of jaxtyping."""
-    return isinstance(kind, type) and issubclass(kind, AbstractArray)
 
 
 def _is_plain(hint: Any) -> bool:

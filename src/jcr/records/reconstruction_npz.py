@@ -78,7 +78,9 @@ def read_reconstruction(path: Path) -> Reconstruction:
     """Read a reconstruction.npz; raise InputError if it is missing, damaged or of another format."""
     with read_npz(path, FORMAT) as (text, file), jaxtyped("context"):
         found = ReconstructionContent.model_validate(_filled(json.loads(text), file)).reconstruction
-        _require_rigid(found)
+        evidence = () if found.evidence is None else found.evidence.recon_from_camera
+        for row, camera in enumerate((*found.recon_from_camera, *evidence)):
+            require_rigid(camera, f"camera {row % len(found.image_index)}")
         return found
 
 
@@ -134,12 +136,3 @@ def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> 
             raise ValueError(f"{name} has shape {array.shape}, not {shape}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{name} holds NaN or infinity")
-
-
-def _require_rigid(found: Reconstruction) -> None:
-    """Raise ValueError for a reconstruction with camera poses that are not rigid."""
-    cameras, m = [*found.recon_from_camera], len(found.image_index)
-    if found.evidence is not None:
-        cameras += [*found.evidence.recon_from_camera]
-    for row, camera in enumerate(cameras):
-        require_rigid(camera, f"camera {row % m}")

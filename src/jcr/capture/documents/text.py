@@ -67,7 +67,8 @@ def _bracket_tables(file: Path, lines: list[str], comments: dict[int, str]) -> l
             lines[k] = ""
         value = one.entries[0][1]
         found = nested_tables(file, value, one.words) if len(one.entries) == 1 and has_tables(value) else []
-        if one.key and (found or _is_texts(value)):
+        is_texts = isinstance(value, list) and len(value) > 2 and all(isinstance(part, str) for part in value)
+        if one.key and (found or is_texts):
             lists[one.key] = value
         elif found:
             inner += found
@@ -84,11 +85,6 @@ def _bracket_tables(file: Path, lines: list[str], comments: dict[int, str]) -> l
         if table := table_of(file, [one.row(header) for one in group], keys=keys, words=words):
             tables.append(table)
     return tables
-
-
-def _is_texts(value: Any) -> bool:
-    """Test whether a value is a list of texts, such as names of images."""
-    return isinstance(value, list) and len(value) > 2 and all(isinstance(part, str) for part in value)
 
 
 def _without_counts(table: Table) -> Table:
