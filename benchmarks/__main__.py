@@ -28,26 +28,28 @@ ROBOTS, HONEST, MAPPED, TIME, OTHERS = PARTS = (
     "Time and memory",
     "Beside other methods",
 )
-BENCHES = {
-    "real": (ROBOTS, "Real captures"),
-    "features": (ROBOTS, "Features on real captures"),
-    "cameras": (ROBOTS, "Several cameras"),
-    "inputs": (ROBOTS, "Files as people hold them"),
-    "verified": (ROBOTS, "Real captures verified"),
-    "coverage": (HONEST, "Is ± true?"),
-    "faults": (HONEST, "Faults"),
-    "shuffled": (HONEST, "Effects of the order, in random orders"),
-    "live": (HONEST, "Live calibration"),
-    "month": (HONEST, "A simulated month"),
-    "spheres": (HONEST, "Spheres at a confidence"),
-    "map": (MAPPED, "The map"),
-    "speed": (TIME, "Speed"),
-    "peers": (OTHERS, "Peers"),
-    "kinhec": (OTHERS, "KinHEC"),
-    "pointmaps": (OTHERS, "Pointmaps"),
-    "published": (OTHERS, "Tables of the paper"),
+PAGES = {
+    "real": (
+        ROBOTS,
+        {
+            "real": "Real captures",
+            "features": "Features on real captures",
+            "shuffled": "Effects of the order, in random orders",
+        },
+    ),
+    "cameras": (ROBOTS, {"cameras": "Several cameras"}),
+    "inputs": (ROBOTS, {"inputs": "Files as people hold them"}),
+    "verified": (ROBOTS, {"verified": "Real captures verified", "month": "A simulated month"}),
+    "coverage": (HONEST, {"coverage": "Is ± true?", "spheres": "Spheres at a confidence"}),
+    "faults": (HONEST, {"faults": "Faults"}),
+    "live": (HONEST, {"live": "Live calibration"}),
+    "map": (MAPPED, {"map": "The map"}),
+    "speed": (TIME, {"speed": "Speed"}),
+    "peers": (OTHERS, {"peers": "Peers", "kinhec": "KinHEC"}),
+    "published": (OTHERS, {"published": "Tables of the paper", "pointmaps": "Pointmaps"}),
 }
-"""Part of the index and title of each bench, a module of this package with a function `run`, in the index's order."""
+"""Part of the index and benches of each page, in the index's order. A bench is a module of this package with a function
+`run`, here with its title; the first one names the page."""
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SHARE = 4
 """`all` takes one case in SHARE of the benches with many."""
@@ -58,7 +60,7 @@ CLAIM = "> "
 if TYPE_CHECKING:
     BenchName = str
 else:
-    BenchName = Literal[("all", *sorted(BENCHES))]
+    BenchName = Literal[("all", *sorted(name for _, benches in PAGES.values() for name in benches))]
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,9 @@ class Arguments:
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
-    """Bench to run; `all`: all benches, with every fourth case of those that have many."""
+    """Bench to run, with the others of its page if it names one; `all`: all, one case in four of those with many."""
     out: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OUT]")] = None
-    """Folder into which NAME.md and the index README.md are written, too (unset: of `all` docs/results)."""
+    """Folder into which the page NAME.md and the index README.md are written, too (unset: of `all` docs/results)."""
     captures: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("data")
     """Folder that holds capture folders, for benches of real captures."""
     boards: tuple[str, ...] = ()
@@ -95,11 +97,20 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"--every {arguments.every}: give 1 or more")
     if arguments.name == "all":
         return run_all(arguments)
-    run = import_module(f"benchmarks.{arguments.name}").run
-    taken = signature(run).parameters
-    if excess := options_of(arguments).keys() - taken.keys():
+    if arguments.out is not None and arguments.name not in PAGES:
+        (page,) = (page for page, (_, benches) in PAGES.items() if arguments.name in benches)
+        raise InputError(f"bench {arguments.name}: it is a part of the page {page}; name that to write it")
+    titles = PAGES[arguments.name][1] if arguments.name in PAGES else {arguments.name: arguments.name}
+    runs = {name: import_module(f"benchmarks.{name}").run for name in titles}
+    taken = {option for run in runs.values() for option in signature(run).parameters}
+    if excess := options_of(arguments).keys() - taken:
         raise InputError(f"bench {arguments.name}: does not use {', '.join(sorted(excess))}; leave it out")
-    page = heading(arguments) + run(**{name: getattr(arguments, name) for name in taken})
+    page = heading(arguments)
+    for name, run in runs.items():
+        found = run(**{option: getattr(arguments, option) for option in signature(run).parameters})
+        if name != arguments.name:
+            found = f"\n## {titles[name]}\n\n{subject_of(name)}\n\n" + found.replace("\n##", "\n###")
+        page += found
     sys.stdout.write(page)
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", page)
@@ -126,7 +137,11 @@ def run_all(arguments: Arguments) -> int:
 
     def is_done(name: str) -> bool:
         """Run one bench and report it on stderr."""
-        taken, begun = signature(import_module(f"benchmarks.{name}").run).parameters, time.perf_counter()
+        begun, modules = (
+            time.perf_counter(),
+            [import_module(f"benchmarks.{bench}") for bench in PAGES[name][1]],
+        )
+        taken = {option for module in modules for option in signature(module.run).parameters}
         if "captures" in taken and not arguments.captures.is_dir():
             sys.stderr.write(f"{name}: left out, there is no folder {arguments.captures}\n")
             return True
@@ -140,7 +155,7 @@ def run_all(arguments: Arguments) -> int:
         return done.returncode == 0
 
     with ThreadPoolExecutor(2) as two:
-        passed = [*two.map(is_done, (name for name in BENCHES if name != "speed"))]
+        passed = [*two.map(is_done, (name for name in PAGES if name != "speed"))]
     return int(not all([*passed, is_done("speed")]))
 
 
@@ -158,17 +173,22 @@ def write_index(out: Path) -> None:
         "Written by `python -m benchmarks`; each page has its command, commit and machine. `python -m benchmarks all` "
         f"takes 20 minutes of two cores, with one case in {SHARE} where the command has `--every {SHARE}`. "
         "`python -m benchmarks NAME docs/results` takes all of "
-        "one bench.",
+        "one page.",
     ]
     for part in PARTS:
         rows = [
-            f"| [{title}]({name}.md) | {claims(out / f'{name}.md').replace('|', chr(92) + '|')} |"
-            for name, (own, title) in BENCHES.items()
+            f"| [{titles[name]}]({name}.md) | {claims(out / f'{name}.md').replace('|', chr(92) + '|')} |"
+            for name, (own, titles) in PAGES.items()
             if own == part and (out / f"{name}.md").is_file()
         ]
         lines += ["", f"## {part}", "", "| bench | result |", "|---|---|", *rows] if rows else []
     lines += ["", "```{toctree}", ":hidden:", ":glob:", "", "*", "```", ""]
     write_text(out / "README.md", "\n".join(lines))
+
+
+def subject_of(name: str) -> str:
+    """Return what a bench measures, in a sentence: the first line of its module."""
+    return (import_module(f"benchmarks.{name}").__doc__ or "").partition("\n")[0]
 
 
 def heading(arguments: Arguments) -> str:
@@ -183,7 +203,6 @@ def heading(arguments: Arguments) -> str:
         *(word for pair in options.values() for word in pair),
     ]
     share = f" One case in {arguments.every}; without `--every` all." if arguments.every > 1 else ""
-    subject = (import_module(f"benchmarks.{arguments.name}").__doc__ or "").partition("\n")[0]
     git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     done = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True)
     names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
@@ -192,8 +211,9 @@ def heading(arguments: Arguments) -> str:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     processor = [*models, platform.machine()][0]
+    title = next(titles[arguments.name] for _, titles in PAGES.values() if arguments.name in titles)
     return (
-        f"# {BENCHES[arguments.name][1]}\n\n{subject}{share}\n\n    {shlex.join(command)}\n\n"
+        f"# {title}\n\n{subject_of(arguments.name)}{share}\n\n    {shlex.join(command)}\n\n"
         f"{date.today().isoformat()}, commit `{done.stdout.strip() or 'unknown'}`. {processor}, {os.cpu_count()} "
         f"cores, Python {platform.python_version()}, {', '.join(versions)}.\n\n"
     )
