@@ -1,15 +1,18 @@
-"""Hostile bytes, values and numbers: a right reading, an InputError or an honest doubt, soon, and nothing else.
+"""Hostile bytes, values, names and numbers: a right reading, an InputError or an honest doubt, soon, and nothing else.
 
 JCR_TEST_FUZZ=20 looks twenty times as long, and exchanges every value of the structured files.
 """
 
+import io
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -19,9 +22,17 @@ from PIL import Image
 
 import jcr
 from corpus import SIZE, STRUCTURES, Target, corpus
+from jcr.capture.images import read_image, read_one_channel
+from jcr.capture.pairing import natural
 from jcr.capture.read import read_source
+from jcr.capture.ros_messages import image_of, read_ros_depth, read_ros_image
 from jcr.errors import InputError, RejectedError
+from jcr.export.nerfstudio_colmap import _file_names
+from jcr.files import path_inside
 from jcr.geometry import rotation_exp, transform
+from jcr.live.page import PACKAGE
+from jcr.records.reconstruction_npz import read_reconstruction
+from jcr.report.render import render
 from simulation.poses import Pattern
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
@@ -44,6 +55,7 @@ bounded = settings(
     database=None,
     suppress_health_check=list(HealthCheck),
 )
+many = settings(bounded, max_examples=300 * LONGER)
 
 
 @st.composite
@@ -223,6 +235,33 @@ def test_no_value_of_another_kind_makes_a_traceback_or_takes_long(targets: dict[
     assert 0.1 < ended.count("read") / len(ended) < 0.4
 
 
+def test_a_reconstruction_of_other_numbers_is_refused_or_has_its_points(targets: dict[str, Target]):
+    """The archive's check sums find no number that was changed before it was written."""
+    with np.load(targets["reconstruction.npz"].file) as stored:
+        arrays, ended = dict(stored), list[bool]()
+    for name, array in ((name, array) for name, array in arrays.items() if array.dtype.kind in "if"):
+        whole = array.astype(np.int64)
+        for other in (
+            array[:0],
+            array[:-1],
+            -array - 1,
+            array * np.nan,
+            array.astype(str),
+            whole + 10**6,
+            array[None],
+        ):
+            file = targets["reconstruction.npz"].file.with_name("other.npz")
+            np.savez(file, allow_pickle=False, **arrays | {name: other})
+            try:
+                tracks = (found := read_reconstruction(file)).tracks
+                assert found.recon_from_camera[tracks.image].shape[1:] == (4, 4)
+                assert tracks.points_in_recon[tracks.point].shape[1:] == (3,)
+                ended.append(True)
+            except InputError:
+                ended.append(False)
+    assert len(ended) > 40 and np.mean(ended) < 0.5
+
+
 FRAME = {"image": "0.png", "base_from_gripper": np.eye(4).tolist()}
 MANY = {
     "missing images": (
@@ -277,3 +316,138 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
 )
 def test_what_values_found_stays_closed(targets: dict[str, Target], name: str, place: Place, value: object):
     assert tried(targets[name], place, value)[0] == "refused"
+
+
+PIECES = [
+    " ", ".", "..", "/", "\\", "'", '"', "<b>", "</script>", "&amp;", "{{x}}", "${x}", "**", "[a](b)", "²", "٣", "௧",
+    "½", "⑦", "é", "e\u0301", "\u202e", "\u200b", "\u2028", "\x85", "\n", "\t", "\0", "%20", "%", "?", "#", ":", "*",
+    "|", "~", "-", "--help", "CON", "end_header", "a" * 100, "🤖", "\ud800", "0", "10", "2",
+]  # fmt: skip
+NAMES = st.lists(st.one_of(st.sampled_from(PIECES), st.text(max_size=3)), min_size=1, max_size=6).map("".join)
+"""Names of all of Unicode, with what paths, pages and terminals read in their own way."""
+NUMBERS = [0, -1, 1, 3, 2**31, 2**63, 2**70, 0.0, -0.5, float("nan"), float("inf"), -1e300, True, None]
+ANYTHING = st.one_of(
+    st.sampled_from(
+        [*NUMBERS, "", "2", b"", b"\xff\xd8\xff", [], [1], ["rgb8"], {}, {"a": []}, (), "x" * 1000]
+    ),
+    st.text(max_size=3),
+    st.binary(max_size=8),
+)
+
+
+def read_or_refused(read: Callable[[], object]) -> bool:
+    """Return whether something was read; fail if it takes long, or ends otherwise than by an InputError of one line."""
+    start = time.process_time()
+    try:
+        read()
+        ended = True
+    except InputError as error:
+        ended = False
+        assert "\n" not in str(error) and "\0" not in str(error)
+        assert len(str(error)) < 2000
+    assert time.process_time() - start < TOO_LONG_S
+    return ended
+
+
+@pytest.mark.long
+def test_names_lead_nowhere_else(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("names") / "inside"
+    (folder / "images").mkdir(parents=True)
+    found = []
+
+    @many
+    @given(NAMES)
+    def feed(name: str) -> None:
+        natural(name)
+
+        def inside() -> None:
+            path = path_inside(folder, name, "x")
+            assert path.resolve().is_relative_to(folder.resolve()) and ".." not in path.parts
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(b"x")
+            assert folder in path.parents and path.read_bytes() == b"x"
+            path.unlink()
+
+        try:
+            found.append(read_or_refused(inside))
+        except (IsADirectoryError, NotADirectoryError, FileExistsError):
+            found.append(True)
+
+    feed()
+    assert not [one for one in folder.parent.iterdir() if one != folder]
+    assert 0.3 < np.mean(found) < 0.98
+
+
+@pytest.mark.long
+@many
+@given(st.lists(NAMES.filter(lambda name: name.isprintable() and "\\" not in name), max_size=4, unique=True))
+def test_names_stay_themselves_on_pages_and_in_exports(names: list[str]):
+    try:
+        "".join(names).encode()
+    except UnicodeEncodeError:
+        return
+    cards = [{"number": k, "name": name, "fault": "", "state": "new"} for k, name in enumerate(names, 1)]
+    state = SimpleNamespace(is_over=True, names=names, images=names)
+    content = {"state": state, "cards": cards, "has_report": False, "kind": "", "headline": "", "lines": []}
+    html = render("images.html", content | {"tiles": []}, PACKAGE)
+    assert [unquote(part.split('"')[0]) for part in html.split('src="image/')[1:]] == names
+    assert "<b>" not in html and "</script>" not in html
+    for suffix in (None, ".png"):
+        files = _file_names([f"images/{name}" for name in names], suffix)
+        assert len({file.casefold() for file in files}) == len(names) and "/" not in "".join(files)
+
+
+MODES = [
+    "1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "LAB", "HSV", "I", "F", "I;16", "I;16B",
+]  # fmt: skip
+FORMATS = [
+    "PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "TGA", "ICO", "EPS", "PDF", "PCX", "SGI", "JPEG2000",
+]  # fmt: skip
+
+
+@pytest.mark.long
+@bounded
+@given(
+    st.sampled_from(MODES),
+    st.sampled_from(FORMATS),
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.integers(-1, 400),
+)
+def test_images_of_every_mode_and_format(mode: str, kind: str, width: int, height: int, cut: int):
+    file = io.BytesIO()
+    try:
+        Image.new(mode, (width, height)).save(file, format=kind)
+    except Exception:  # Pillow writes not every mode in every format
+        return
+    data = file.getvalue() if cut < 0 else file.getvalue()[:cut]
+    pixels = []
+    for read in (read_image, read_one_channel):
+        if read_or_refused(lambda read=read: pixels.append(read(data, "image"))):
+            assert pixels[-1].shape[:2] == (height, width)
+    read_or_refused(lambda: read_ros_image(SimpleNamespace(format="jpeg", data=data)))
+    read_or_refused(
+        lambda: read_ros_depth(SimpleNamespace(format="16UC1; compressedDepth", data=b"12" + data))
+    )
+
+
+ENCODINGS = ["rgb8", "mono8", "bayer_rggb8", "yuv422", "16UC1", "32FC1", "8UC3", "bgra8"]
+FIELDS = st.fixed_dictionaries(
+    {},
+    optional={
+        **dict.fromkeys(("width", "height", "step", "is_bigendian"), st.one_of(st.integers(-2, 9), ANYTHING)),
+        "encoding": st.one_of(st.sampled_from(ENCODINGS), ANYTHING),
+        "data": st.one_of(st.binary(max_size=200), ANYTHING),
+        "format": st.one_of(st.sampled_from(["jpeg", "png", "16UC1; compressedDepth"]), ANYTHING),
+    },
+)
+
+
+@pytest.mark.long
+@many
+@given(FIELDS)
+def test_fields_of_messages_are_of_any_type(fields: dict[str, Any]):
+    usual = {"width": 2, "height": 2, "step": 6, "is_bigendian": 0, "encoding": "rgb8", "data": bytes(12)}
+    for message in (SimpleNamespace(**usual | fields), SimpleNamespace(**fields)):
+        for read in (read_ros_image, read_ros_depth, lambda one: image_of(one, "x")):
+            read_or_refused(lambda read=read, message=message: read(message))
