@@ -283,6 +283,15 @@ def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
         solve_hand_eye(gripper, camera)
 
 
+def test_equal_poses_are_rejected_without_a_warning_of_numpy():
+    for seed in range(6):
+        problem = hand_eye_problem(np.random.default_rng(seed), 2)
+        gripper, camera = (
+            np.stack([poses[0]] * 4) for poses in (problem.base_from_gripper, problem.recon_from_camera)
+        )
+        assert solve_hand_eye(gripper, camera).verdict == "rejected"
+
+
 GROWTH = (3e-3, 3e-3)
 """m, rad per image."""
 

@@ -232,7 +232,8 @@ class Equations:
         first = OF_ARM * arm
         metres, radians, systematic = np.sqrt(self.variances(log_sizes)[first : first + OF_ARM]).tolist()
         own = self.size_of[1] == first + 2
-        left = systematic * np.sqrt(np.diag(self.systematic)[own].reshape(-1, 2, 3).mean((0, 2)))
+        # Of equal poses nothing is left, which rounding makes negative.
+        left = systematic * np.sqrt(np.diag(self.systematic)[own].clip(0).reshape(-1, 2, 3).mean((0, 2)))
         shown = SHOWN * np.array(self.given or (0.0, 0.0))
         return RobotNoise(
             translation=metres,
