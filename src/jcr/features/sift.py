@@ -47,7 +47,7 @@ def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[
 
     The arrays are empty if nothing is found. They are not writable, because the last KEPT results are remembered.
     """
-    key = blake2b(np.ascontiguousarray(grey), key=repr(grey.shape).encode()).digest()
+    key = blake2b(grey.tobytes(), key=repr(grey.shape).encode()).digest()
     found = _kept.get(key)
     if found is None:
         found = _detected(grey)

@@ -123,8 +123,8 @@ def advice(state: LiveProgress) -> str:
     """Return the next action: to finish, to add the images that a missed accuracy needs, or to rotate the wrist."""
     if state.requirement_met:
         return REQUIREMENT_MET
-    missed = (one for one in state.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH)
-    return next(map(remedy, missed), FIRST_ADVICE)
+    missed = (one.remedy for one in state.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH)
+    return next(missed, FIRST_ADVICE)
 
 
 def progress_lines(state: LiveProgress) -> list[str]:
