@@ -73,11 +73,7 @@ def best_frames(
 
     views = different_views() if moments else np.zeros(0, int)
     if len(views) < min(count, ENOUGH):
-        # The slowest frame of each of about 4 × count equal pieces of the motion is tried, too.
-        moving = _runs(usable & (speed >= STILL))
-        piece = max(sum(map(len, moving)) // (4 * count), 1)
-        parts = [part for run in moving for part in np.array_split(run, max(len(run) // piece, 1))]
-        moments += [part[[speed[part].argmin()]] for part in parts]
+        moments += _slowest(_runs(usable & (speed >= STILL)), speed, 4 * count)
         views = different_views()
     if len(views) < MIN_FRAMES:
         raise InputError(
@@ -95,6 +91,13 @@ def best_frames(
             f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
         )
     return np.sort(frames), tuple(notes)
+
+
+def _slowest(moving: list[Rows], speed: Float[ndarray, " n"], count: int) -> list[Rows]:
+    """Return the row of the slowest frame of each of about `count` equal pieces of the runs `moving`."""
+    piece = max(sum(map(len, moving)) // count, 1)
+    parts = [part for run in moving for part in np.array_split(run, max(len(run) // piece, 1))]
+    return [part[[speed[part].argmin()]] for part in parts]
 
 
 def _frames_of_views(views: Rows, base_from_gripper: Poses, at_rest: Bool[ndarray, " n"], count: int) -> Rows:

@@ -1,6 +1,6 @@
 """Quick check of a capture before a run: files, motion, features, and the pose convention."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -97,10 +97,10 @@ class _Comparison:
     """Calibration; None if no camera poses were found."""
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
-    tried: Int[ndarray, " t"] | None = None
-    """Rows of the images that were compared; None if none were."""
-    registered: Int[ndarray, " c"] | None = None
-    """Rows of the images that the calibration uses; None if none were compared."""
+    tried: Int[ndarray, " t"] = field(default_factory=lambda: np.zeros(0, int))
+    """Rows of the images that were compared."""
+    registered: Int[ndarray, " c"] = field(default_factory=lambda: np.zeros(0, int))
+    """Rows of the images that the calibration uses."""
     assumptions: Assumptions | None = None
     """Camera and robot as the calibration estimates them; None if it is rejected, or of a fixed camera."""
 
@@ -121,45 +121,36 @@ def check_capture(
     is the required accuracy (mm, degrees); a finding states if the one that is expected from the images misses it.
     Raises InputError if gripper poses and joint angles contradict each other.
     """
-    capture = _read(capture, look, progress)
-    given = capture.base_from_gripper
-    move_m, rotation_rad = largest_motion(given)
-    notes = [*capture.notes, *_unit_doubt(move_m, rotation_rad)]
+    if isinstance(capture, str | Path):
+        capture = read_source(capture, progress=progress)
+    if isinstance(capture, Capture) and capture.candidates:
+        capture = decided_by_images(capture, progress=progress)[0] if look else first_reading(capture)
+    move_m, rotation_rad = largest_motion(given := capture.base_from_gripper)
     noise = robot_noise and (1e3 * robot_noise[0], np.degrees(robot_noise[1]))
     options = CalibrateOptions(robot_noise=noise, require=require)
-    camera, views, shown, expected = None, (), _Comparison(), None
-    if isinstance(capture, PosePairs):
-        robot, clear = errors_of(given), np.arange(len(capture))
-        shown = _compare(capture, robot, options, progress, thorough)
-    else:
+    views, remarks, shown, expected = (), [], _Comparison(), None
+    robot, clear = errors_of(given), np.arange(len(capture))
+    if isinstance(capture, Capture):
         robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
         clear, remarks = _look(capture, views)
-        notes += remarks
-        camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-        if look and verdict_of(views) != "rejected":
-            shown = _compare(capture, robot, options, progress, thorough)
-    counted = clear
-    if shown.tried is not None and shown.registered is not None:
-        counted = np.union1d(np.setdiff1d(clear, shown.tried), shown.registered)
+    if isinstance(capture, PosePairs) or (look and verdict_of(views) != "rejected"):
+        shown = _compare(capture, robot, options, progress, thorough)
+    counted = np.union1d(np.setdiff1d(clear, shown.tried), shown.registered)
     rows = counted if len(counted) >= MIN_PREDICTED_IMAGES else np.arange(len(capture))
     gripper, hand_eye, assumptions = given[rows], shown.hand_eye, shown.assumptions
     seen = observability(gripper, assumptions and assumptions.gripper_from_camera)
-    if hand_eye is not None and shown.tried is not None and len(shown.tried) == len(capture):
+    if hand_eye is not None and len(shown.tried) == len(capture):
         seen = hand_eye.observability
-    found = [*shown.findings, *(() if hand_eye is not None else seen.findings), *filter(None, [robot.unused])]
+    found = [*shown.findings, *(seen.findings if hand_eye is None else ()), *filter(None, [robot.unused])]
     found += as_causes(views) if verdict_of(found) == "rejected" else views
     if isinstance(capture, PosePairs) or capture.mount == "base":
-        # Camera poses are given, or the camera is fixed, for which `predict` does not simulate images: the expected
-        # uncertainty is that of the calibration.
+        # Nothing is predicted for given camera poses, nor for a fixed camera, whose images `predict` does not simulate.
         expected = hand_eye and hand_eye.uncertainty
     elif len(counted) >= MIN_PREDICTED_IMAGES:
+        camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
-        if assumptions is not None and hand_eye is not None:
-            # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
-            of_images = replace(expected, budget=hand_eye.uncertainty.budget)
-            x, arm_known = assumptions.gripper_from_camera, hand_eye.joint_offsets is not None
-            found += requirement_of(x, of_images, found, len(counted), options, arm_known)[1]
+        found += _missed(shown, expected, found, len(counted), options)
     if look and isinstance(capture, Capture) and verdict_of(found) != "accepted":
         found += proposed(capture, None)
     return Examination(
@@ -169,22 +160,26 @@ def check_capture(
         observability=seen,
         expected=expected,
         counted=counted,
-        compared=shown.tried,
+        compared=shown.tried if len(shown.tried) else None,
         hand_eye=hand_eye,
         findings=strongest_first({sentence(one): one for one in found}.values()),
-        notes=(*notes, *shown.notes),
+        notes=(*capture.notes, *_unit_doubt(move_m, rotation_rad), *remarks, *shown.notes),
     )
 
 
-def _read(
-    capture: Capture | PosePairs | str | Path, look: bool, progress: Progress | None
-) -> Capture | PosePairs:
-    """Return a capture, read if it is a path, with one reading of its poses: decided by the images if `look`."""
-    if isinstance(capture, str | Path):
-        capture = read_source(capture, progress=progress)
-    if isinstance(capture, PosePairs) or not capture.candidates:
-        return capture
-    return decided_by_images(capture, progress=progress)[0] if look else first_reading(capture)
+def _missed(
+    shown: _Comparison, expected: Uncertainty, found: list[Finding], images: int, options: CalibrateOptions
+) -> tuple[Finding, ...]:
+    """Return the finding that the expected accuracy misses the required one; empty without assumptions from images.
+
+    `found` are the other findings, `images` is the number of images that are expected to register.
+    """
+    if (assumptions := shown.assumptions) is None or (hand_eye := shown.hand_eye) is None:
+        return ()
+    # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
+    of_images = replace(expected, budget=hand_eye.uncertainty.budget)
+    x, arm_known = assumptions.gripper_from_camera, hand_eye.joint_offsets is not None
+    return requirement_of(x, of_images, found, images, options, arm_known)[1]
 
 
 def _unit_doubt(move_m: float, rotation_rad: float) -> list[str]:

@@ -38,8 +38,7 @@ FLANGE_M = 0.0315
 def transform_section(hand_eye: Calibration | PublishedCalibration) -> Content:
     """Return the section on the result: the transform in all notations, with covariance and a sketch of the camera.
 
-    The transform is gripper_from_camera or, for a fixed camera, base_from_camera. The published method has no
-    covariance.
+    The transform is gripper_from_camera or, for a fixed camera, base_from_camera. A published result has no covariance.
     """
     x, mount, covariance, pair = hand_eye.parent_from_camera, hand_eye.mount, None, list[str]()
     if isinstance(hand_eye, Calibration):

@@ -94,21 +94,15 @@ def reconstruct_colmap(
     The gripper poses check the matches (features/pair_search.py). The images are reduced to a long side of
     `working_size_px`. Known intrinsics are held, unknown ones are estimated. Known ones with which fewer than half of
     the images register, or points are more than POOR_PX off, are estimated too, if more images register then, or
-    points are half as far off. Raises RejectedError when fewer than three
-    images register, with their number, the likely reason and a remedy.
+    points are half as far off. Raises RejectedError when fewer than three images register, with their number, the
+    likely reason and a remedy.
     """
     report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     all_intrinsics, known, warnings = starting_intrinsics(capture)
     with quiet_colmap():
-        matcher = matcher_of(
-            images,
-            working_cameras(all_intrinsics, known, working_size_px)[0],
-            known,
-            features,
-            seed,
-            report,
-        )
+        camera = working_cameras(all_intrinsics, known, working_size_px)[0]
+        matcher = matcher_of(images, camera, known, features, seed, report)
 
         def mapped(
             start: list[Intrinsics], matcher: Matcher
