@@ -61,14 +61,15 @@ SLOW_FIXTURES = {"done", "small_done", "simulated", "real_captures", "tiny_sam"}
 
 
 FIRST = (
-    "live/test_calibration.py", "calibration/test_faults.py", "scene/test_map.py", "test_verify.py",
-    "ros2/test_jcr_ros.py", "cell/test_cell.py", "estimation/test_solve.py", "faults/test_faults.py",
-    "test_real_captures.py", "faults/test_wrong_poses.py", "cli/test_cli.py", "boards/test_marker.py",
-    "test_batch.py", "test_examples.py", "scene/test_map_update.py", "report/test_report.py",
-    "pointmaps/test_any_view.py", "features/test_gate.py", "calibration/test_conventions.py",
+    "live/test_calibration.py", "calibration/test_faults.py", "test_verify.py", "estimation/test_solve.py",
+    "cell/test_cell.py", "calibration/test_conventions.py", "boards/test_marker.py", "scene/test_map_update.py",
+    "scene/test_map.py", "cli/test_cli.py", "capture/test_discovery.py", "export/test_export.py",
+    "calibration/test_lengths.py", "faults/test_wrong_poses.py", "estimation/test_prediction.py",
+    "estimation/test_wrist.py", "sfm/test_colmap.py", "simulation/test_simulate.py", "paper/test_paper.py",
+    "estimation/test_components.py", "test_batch.py", "test_check.py", "photometric/test_direct.py",
+    "test_real_captures.py", "faults/test_faults.py", "faults/test_strangers.py",
 )  # fmt: skip
-"""Files by their processor seconds, longest first, after the two that the workers begin with: one makes the run of
-`done`, the other does without it."""
+"""Files by their processor seconds, longest first, after the one that makes the run `small_done`."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -142,10 +142,6 @@ MISTAKES: dict[str, tuple[Change, str]] = {
         rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [3, 0, 1, 2]])),
         "quaternion w, x, y, z that were taken as quaternion x, y, z, w",
     ),
-    "w last": (
-        rotated(lambda r: Rotation.from_quat(r.as_quat()[:, [1, 2, 3, 0]])),
-        "quaternion x, y, z, w that were taken as quaternion w, x, y, z",
-    ),
     "Euler order": (
         rotated(lambda r: Rotation.from_euler("xyz", r.as_euler("ZYX"))),
         "angles ZYX, R = Rz·Ry·Rx that were taken as angles xyz",

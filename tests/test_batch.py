@@ -46,7 +46,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
 
 def test_a_bad_capture_fails_alone(captures: list[Path], tmp_path: Path, capsys):
     out, names = tmp_path / "all", [str(path) for path in captures]
-    command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
+    command = ["batch", *names, str(out), "--calibrate-only", "--processes", "1", "--quiet"]
     assert dispatch([*command, "--json"]) == 3
     printed = capsys.readouterr()
     rows = {Path(row["capture"]).name: BatchRow(**row) for row in json.loads(printed.out)["captures"]}

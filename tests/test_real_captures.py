@@ -33,6 +33,7 @@ def test_near_the_marker_reference(real_captures: Path, name: str, max_mm: float
     assert np.median(off_m) < 3e-3 and off_m.max() < 0.01
 
 
+@pytest.mark.long
 def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path):
     """The reference of this capture was made with them, and belongs to them."""
     capture = jcr.read_capture(real_captures / "franka_tabletop")

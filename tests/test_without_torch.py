@@ -19,7 +19,7 @@ MAY_NEED_TORCH = (
     "pointmaps/dust3r/",
     "pointmaps/", "pointmaps/predictions", "scene/", "segments/sam",
     "paper/alignment", "paper/fields", "paper/run",
-    "export/rrd", "export/volume", "viewer/",
+    "export/rrd", "export/planner_maps", "viewer/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""
 NEED_NONE = {"scene/cloud", "scene/map_file", "scene/options"}

@@ -84,9 +84,9 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
         (["--board", "chessbord:9x6:0.02"], "no such board; write it as charuco:"),
         (["--board", "chessboard:9x6:-1"], "-1 is no length of a square in metres"),
         (["--backend", "colmap", "--board", "chessboard:9:0.02"], "9 is no size such as 7x5"),
-        (["--require", "-1", "2"], "--require -1 2: give two positive numbers"),
-        (["--robot-noise", "0.5", "nan"], "--robot-noise 0.5 nan: give two positive numbers"),
-        (["--scale", "0"], "--scale 0: give a positive number"),
+        (["--require", "-1", "2"], "require -1 2: give two positive numbers"),
+        (["--robot-noise", "0.5", "nan"], "robot_noise 0.5 nan: give two positive numbers"),
+        (["--scale", "0"], "scale 0: give a positive number"),
         (["--robot", "ur99"], "robot ur99: not known"),
     ],
 )
@@ -155,7 +155,7 @@ def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture: Path, smal
     capture, stages = jcr.read_capture(small_capture), list[str]()
     shutil.copytree(small_done, tmp_path / "whole")
     jcr.calibrate(capture, tmp_path / "out")
-    options = MapOptions(max_seconds=1.0)
+    options = MapOptions(max_seconds=1.0, cell=0.03)
     mapped = jcr.build_map(tmp_path / "out", map=options, progress=lambda stage, share: stages.append(stage))
     assert "dense depth" in stages and "matching" not in stages
     assert jcr.measure(tmp_path / "out").objects

@@ -308,7 +308,7 @@ def placed(x: np.ndarray, camera: Intrinsics, log_scale: float = 0.0) -> np.ndar
 
 def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
     x, uncertainty, camera, _ = estimated()
-    steps = np.random.default_rng(0).multivariate_normal(np.zeros(16), uncertainty.whole, 4000, method="eigh")
+    steps = np.random.default_rng(0).multivariate_normal(np.zeros(16), uncertainty.whole, 2000, method="eigh")
     drawn = np.array(
         [
             placed(retract(x, step[:6]), with_parameters(camera, parameters(camera) + step[7:]), step[6])

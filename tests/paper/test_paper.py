@@ -103,7 +103,7 @@ def test_the_alignment_is_as_accurate_as_the_published_one(tmp_path: Path):
 def predicted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A simulated capture and predictions of its pairs."""
     folder = tmp_path_factory.mktemp("published")
-    made = simulate(folder / "capture", SimulateOptions(images=5))
+    made = simulate(folder / "capture", SimulateOptions(images=4))
     write_pairs(folder / "pairs.npz", pairs_of_capture(made, errors=PairErrors(warp=0.003), seed=0)[0])
     return made, folder / "pairs.npz"
 
