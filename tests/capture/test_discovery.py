@@ -157,6 +157,13 @@ def test_images_without_a_camera_pose_do_not_change_the_reading():
     assert got.reading is not None and got.reading.notation == "euler:ZYZ" and len(got) == 12
 
 
+def test_some_images_of_an_undecided_capture_keep_their_own_poses():
+    rows = np.arange(0, 12, 2)
+    some = undecided(PROBLEM.base_from_gripper, "euler:ZYX").of_rows(rows)
+    got = decide(some, PROBLEM.recon_from_camera[rows], np.arange(len(rows)))
+    np.testing.assert_allclose(got.base_from_gripper, PROBLEM.base_from_gripper[rows], atol=1e-9)
+
+
 def test_two_wrong_poses_of_twelve_do_not_change_the_reading():
     poses = PROBLEM.base_from_gripper.copy()
     poses[[2, 7]] = poses[[7, 2]]

@@ -256,6 +256,11 @@ class Capture:
             joints=None if self.joints is None else self.joints[chosen],
             depths=None if self.depths is None else tuple(self.depths[row] for row in chosen),
             untaken=tuple((reading, poses[chosen]) for reading, poses in self.untaken),
+            candidates=tuple(
+                # Where rows and images differ in number, nothing says which rows are those of the images.
+                (reading, poses[chosen] if len(poses) == len(self) else poses)
+                for reading, poses in self.candidates
+            ),
             others=(),
         )
 
