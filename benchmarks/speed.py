@@ -166,8 +166,8 @@ def run_by_stage(place: str) -> None:
     for function, name in (("reconstruct", "reconstruct"), ("calibrate_reconstruction", "calibrate")):
         setattr(backend_selection, function, _timed(getattr(backend_selection, function), spent, name))
     for name in STAGES[2:]:
-        files, function = FUNCTIONS[name]
-        FUNCTIONS[name] = files, _timed(function, spent, name)
+        stage = FUNCTIONS[name]
+        FUNCTIONS[name] = stage._replace(function=_timed(stage.function, spent, name))
     jcr.run(CAPTURE, Path(place) / "run")
     (Path(place) / "stages.json").write_text(json.dumps(spent))
 

@@ -127,5 +127,5 @@ def test_edited_input_is_read_and_run_again(
 def test_a_corrected_mount_is_reconstructed_anew(capture: Capture, tmp_path: Path):
     """The images of a fixed camera are reconstructed without their background: the old reconstruction was kept."""
     mounts = (replace(capture, mount=mount) for mount in ("gripper", "base"))
-    made = {begun(tmp_path, one, RunOptions()).state.made["reconstruct"] for one in mounts}
+    made = {begun(tmp_path, one, RunOptions()).state.made["select"] for one in mounts}
     assert len(made) == 2

@@ -83,8 +83,8 @@ class RunState(BaseModel):
     attempts: tuple[Attempt, ...] = ()
     """Attempts with different back ends, from which the reconstruction was selected."""
     made: dict[str, str] = {}
-    """Fingerprints of inputs: keys "reconstruct" and "densify" for those of reconstruction and depth, key "run" (only
-    for a finished run) for all inputs."""
+    """Fingerprints of the inputs of stages by their names: "select" (reconstruction), "densify" (depth), and "report"
+    for all inputs, which only a finished run has."""
     files: dict[str, str] = {}
     """Fingerprints of calibration.json and added images, by file name, and an empty text for each other file of a
     finished run; empty for an unfinished run."""

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -75,20 +75,21 @@ def begun(out: Path, capture: Capture, options: RunOptions) -> RunResult:
         raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
     own = options.reconstruct
     paths = {name: path.resolve() for name, path in vars(own).items() if isinstance(path, Path)}
-    own = replace(own, **paths)
-    weights = Path(own.weights) if own.weights and Path(own.weights).exists() else None
-    images = [(name, capture.folder / name) for name in capture.images]
-    # The mount decides which pixels are reconstructed, and which poses guide it.
-    of_capture = images, capture.mount, capture.base_from_gripper, capture.intrinsics
-    facts = *of_capture, candidates(own), weights, FORMAT, options.method
-    made = {"reconstruct": fingerprint(facts, own, __version__)}
-    made["densify"] = fingerprint(made["reconstruct"], options.depth, DEPTH_FORMAT)
-    state = RunState(capture=folder, options=replace(options, reconstruct=own), made=made)
+    state = RunState(capture=folder, options=replace(options, reconstruct=replace(own, **paths)))
     with suppress(InputError):
         before = RunResult(out).state
         if before.capture == folder:
             state = state.model_copy(update={"version": before.version, "predecessor": before.predecessor})
-    return RunResult(out, capture=capture, state=state)
+    return with_fingerprints(RunResult(out, capture=capture, state=state), "select", "densify")
+
+
+def with_fingerprints(result: RunResult, *stages: str) -> RunResult:
+    """Return the result with a fingerprint of the inputs of the named stages; it covers those of the stages before."""
+    made = dict(result.state.made)
+    for name in stages:
+        inputs = STAGES[name].inputs
+        made[name] = fingerprint([*made.values()], inputs and inputs(result), __version__)
+    return result.with_parts(state=result.state.model_copy(update={"made": made}))
 
 
 def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunResult:
@@ -100,7 +101,7 @@ def make(result: RunResult, stages: Sequence[str], progress: Progress) -> RunRes
     unneeded |= {"densify", "map"} if result.state.options.map is None else set()
     for name in (name for name in stages if name not in unneeded):
         start = time.perf_counter()
-        result = STAGES[name][1](result, progress)
+        result = STAGES[name].function(result, progress)
         give_back()
         if name not in FIRST:  # `timings_of` gives the times of these, summed over all back ends
             timings = result.calibration.timings_s | {name: round(time.perf_counter() - start, 3)}
@@ -143,18 +144,33 @@ def finished_state(result: RunResult) -> RunState:
 
     Fingerprints of calibration.json and of images added later are hashes; that of another file is an empty text.
     """
-    capture, folder, out = result.capture, result.capture.folder, result.out
+    out = result.out
+    names = [name for stage in STAGES.values() for name in stage.files if (out / name).exists()]
+    hashed = [name for name in (CALIBRATION, ADDED) if (out / name).exists()]
+    files = dict.fromkeys(names, "") | {name: fingerprint(out / name) for name in hashed}
+    return with_fingerprints(result, "report").state.model_copy(update={"files": files})
+
+
+def _reconstruction_inputs(result: RunResult) -> Any:
+    """Return the inputs of the reconstruction: images, poses, intrinsics, mount and the options of its back ends."""
+    capture, own = result.capture, result.state.options.reconstruct
+    weights = Path(own.weights) if own.weights and Path(own.weights).exists() else None
+    images = [(name, capture.folder / name) for name in capture.images]
+    # The mount decides which pixels are reconstructed, and which poses guide it.
+    of_capture = images, capture.mount, capture.base_from_gripper, capture.intrinsics
+    return *of_capture, candidates(own), weights, FORMAT, result.state.options.method, own
+
+
+def _run_inputs(result: RunResult) -> Any:
+    """Return all inputs of a run: everything of the capture and of the other cameras, and all options."""
+    capture, folder = result.capture, result.capture.folder
     depths = [folder / name for name in capture.depths or () if name is not None]
     others = [
         vars(one) | {"folder": [(one.folder or folder) / name for name in one.images]}
         for one in result.others
     ]
     facts = vars(capture) | {"folder": depths, "source": str(capture.source), "others": others}
-    made = result.state.made | {"run": fingerprint(facts, result.state.options, __version__)}
-    names = [name for files, _ in STAGES.values() for name in files if (out / name).exists()]
-    hashed = [name for name in (CALIBRATION, ADDED) if (out / name).exists()]
-    files = dict.fromkeys(names, "") | {name: fingerprint(out / name) for name in hashed}
-    return result.state.model_copy(update={"made": made, "files": files})
+    return facts, result.state.options
 
 
 def fingerprint(*values: Any) -> str:
@@ -217,11 +233,11 @@ def _select(result: RunResult, progress: Progress) -> RunResult:
     capture, out, options = result.capture, result.out, result.state.options
     seen = with_moving_parts(capture, out / MOVING) if capture.mount == "base" else capture
 
-    def is_same(folder: Path, key: str = "reconstruct", file: str = RECONSTRUCTION) -> bool:
+    def is_same(folder: Path, stage: str = "select", file: str = RECONSTRUCTION) -> bool:
         """Test whether a folder has a file of the same inputs; False if its run.json cannot be read."""
         with suppress(InputError):
-            made = RunResult(folder).state.made.get(key)
-            return made == result.state.made[key] and (folder / file).is_file()
+            made = RunResult(folder).state.made.get(stage)
+            return made == result.state.made[stage] and (folder / file).is_file()
         return False
 
     if not is_same(out, "densify", DEPTH):  # so that the fingerprints of run.json are those of its files
@@ -387,14 +403,26 @@ def _report(result: RunResult, progress: Progress = silent) -> RunResult:
     return result
 
 
-STAGES: dict[str, tuple[tuple[str, ...], Callable[[RunResult, Progress], RunResult]]] = {
-    "select": ((RECONSTRUCTION,), _select),
-    "record": ((CALIBRATION,), _record),
-    "cameras": ((CAMERAS,), _cameras),
-    "densify": ((DEPTH,), _densify),
-    "map": ((CLOUD, MAP), _map),
-    "report": ((REPORT,), _report),
+class Stage(NamedTuple):
+    """Stage of a run: its files, its function, and its inputs."""
+
+    files: tuple[str, ...]
+    """Files in the run folder."""
+    function: Callable[[RunResult, Progress], RunResult]
+    """Function that writes the files and adds records to the result."""
+    inputs: Callable[[RunResult], Any] | None = None
+    """Function that returns what the files are made from beside the inputs of the stages before. They are valid if
+    run.json has the fingerprint of these inputs. None: the files are valid if those of the last stage are."""
+
+
+STAGES: dict[str, Stage] = {
+    "select": Stage((RECONSTRUCTION,), _select, _reconstruction_inputs),
+    "record": Stage((CALIBRATION,), _record),
+    "cameras": Stage((CAMERAS,), _cameras),
+    "densify": Stage((DEPTH,), _densify, lambda result: (result.state.options.depth, DEPTH_FORMAT)),
+    "map": Stage((CLOUD, MAP), _map),
+    "report": Stage((REPORT,), _report, _run_inputs),
 }
-"""Stages in order: name, files in the run folder, and function that writes the files and adds records to the result."""
+"""Stages by name, in order."""
 FIRST, REST = tuple(STAGES)[:2], tuple(STAGES)[2:]
 """Names of the stages until the calibration, and of those after the calibration."""
