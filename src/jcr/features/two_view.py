@@ -16,6 +16,8 @@ from jcr.least_squares import minimise
 
 NOISE_ROUNDS, ENOUGH = 2, 1e-4
 """Number of estimates of the noise, and relative change of the cost that ends the optimisation after each."""
+ABOUT_AXES = skew(np.eye(3))
+"""Derivatives of a rotation matrix by angles about the three axes, at the identity."""
 LEAST_SIGMA_PX = 0.3
 """Least standard deviation of a match, px; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
@@ -93,36 +95,37 @@ def starting_motions(
             if np.mean(_homogeneous(ray_i) @ normals[k][:, 0] > 0) > 0.9
             and np.linalg.norm(translations[k]) > 1e-6
         ]
-    return [(rotation.T, _unit(-rotation.T @ translation[:, 0])) for rotation, translation in found]
+    return [(r.T, -r.T @ translation[:, 0] / np.linalg.norm(translation)) for r, translation in found]
 
 
 def _sampson_px(
     rotation: Float[ndarray, "3 3"],
-    direction: Float[ndarray, "3"],
-    ray_i: Float[ndarray, "m 2"],
-    ray_j: Float[ndarray, "m 2"],
+    across: Float[ndarray, "3 3"],
+    x_i: Float[ndarray, "m 3"],
+    x_j: Float[ndarray, "m 3"],
     focal_px: float,
 ) -> tuple[Float[ndarray, "m 1"], Float[ndarray, "m 1 5"]]:
     """Return the signed Sampson distance (px) of each match from a camera motion, and its derivatives by a step.
 
-    `rotation` is i_from_j, and `direction` points from camera i to camera j in the frame of i. Rays are x/z, y/z; the
-    distance in rays is multiplied by `focal_px`. Derivatives 0 to 2 are by a rotation vector w in axes of camera i,
-    which changes the rotation R to exp(w) R. Derivatives 3 and 4 are by components of the direction along the two
-    vectors of `_sideways`.
+    `rotation` is i_from_j. The first column of the rotation matrix `across` is the direction from camera i to camera j
+    in the frame of i. `x_i` and `x_j` are homogeneous rays; the distance in rays is multiplied by `focal_px`. The step
+    is that of `_retracted`.
     """
-    of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
-    essential = of_direction @ rotation  # x_i · E x_j = 0
-    by_step = np.concatenate(
-        [of_direction @ skew(np.eye(3)) @ rotation, skew(np.stack(_sideways(direction))) @ rotation]
-    )
-    line_i, line_j = h_j @ essential.T, h_i @ essential
-    line_i_by, line_j_by = h_j @ np.swapaxes(by_step, 1, 2), h_i @ by_step
-    # Norm of the gradient of x_i · E x_j by x and y of both rays.
-    norm = np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
-    distance = (h_i * line_i).sum(1) / norm
-    norm_by = (line_i_by[..., :2] * line_i[:, :2] + line_j_by[..., :2] * line_j[:, :2]).sum(2) / norm
-    by_motion = focal_px * (((h_i * line_i_by).sum(2) - distance * norm_by) / norm).T
-    return focal_px * distance[:, None], by_motion[:, None]
+    direction, one, other = across.T
+    of_direction = skew(direction)
+    # The essential matrix, x_i · E x_j = 0, and its five derivatives.
+    by_rotation, by_direction = of_direction @ ABOUT_AXES @ rotation, skew(np.stack([-other, one])) @ rotation
+    every = np.concatenate([(of_direction @ rotation)[None], by_rotation, by_direction])
+    # Lines E x_j, and the first two components of Eᵀ x_i.
+    of_j = (every.reshape(18, 3) @ x_j.T).reshape(6, 3, -1)
+    of_i = (np.swapaxes(every[:, :, :2], 1, 2).reshape(12, 3) @ x_i.T).reshape(6, 2, -1)
+    value = (of_j * x_i.T).sum(1)
+    # Norm of the gradient of x_i · E x_j by x and y of both rays, and its derivatives times the norm.
+    by_norm = (of_j[:, :2] * of_j[0, :2]).sum(1) + (of_i * of_i[0]).sum(1)
+    norm = np.maximum(np.sqrt(by_norm[0]), 1e-12)
+    distance = value[0] / norm
+    by_step = (value[1:] - distance / norm * by_norm[1:]) / norm
+    return focal_px * distance[:, None], focal_px * by_step.T[:, None]
 
 
 def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
@@ -143,37 +146,36 @@ def _least_squares_motion(
     """
     if len(ray_i) < 8:
         return None
-    at, sigma, normal = (rotation, direction), LEAST_SIGMA_PX, np.eye(5)
+    one = skew(direction)[:, int(np.argmin(np.abs(direction)))]
+    one = one / np.linalg.norm(one)
+    across = np.stack([direction, one, skew(direction) @ one], axis=1)
+    x_i, x_j = _homogeneous(ray_i), _homogeneous(ray_j)
+    sigma, normal = LEAST_SIGMA_PX, np.eye(5)
     for _ in range(NOISE_ROUNDS):
-        residual, _ = _sampson_px(*at, ray_i, ray_j, focal_px)
+        residual, _ = _sampson_px(rotation, across, x_i, x_j, focal_px)
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
         scaled = focal_px / (2 * sigma)
         found = minimise(
-            lambda at, scaled=scaled: _sampson_px(*at, ray_i, ray_j, scaled),
-            at,
+            lambda at, scaled=scaled: _sampson_px(*at, x_i, x_j, scaled),
+            (rotation, across),
             lambda at, step: _retracted(*at, step),
             "cauchy",
             tolerance=ENOUGH,
         )
-        at, normal = found.unknowns, found.normal
+        (rotation, across), normal = found.unknowns, found.normal
     # Errors of neighbouring matches are correlated: at most a hundred matches count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)
-    return CameraMotion(*at, np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5)), sigma)
+    covariance = np.linalg.inv(4 * independent * normal + 1e-6 / sigma**2 * np.eye(5))
+    return CameraMotion(rotation, across[:, 0], covariance, sigma)
 
 
 def _retracted(
-    rotation: Float[ndarray, "3 3"], direction: Float[ndarray, "3"], step: Float[ndarray, "5"]
-) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]:
-    one, other = _sideways(direction)
-    return rotation_exp(step[:3]) @ rotation, _unit(direction + step[3] * one + step[4] * other)
+    rotation: Float[ndarray, "3 3"], across: Float[ndarray, "3 3"], step: Float[ndarray, "5"]
+) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3 3"]]:
+    """Return `rotation` and `across` of `_sampson_px` after a step of five angles (rad).
 
-
-def _sideways(direction: Float[ndarray, "3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return two unit vectors that, together with the unit vector `direction`, are orthogonal to each other."""
-    across_with = skew(direction)
-    one = _unit(across_with[:, int(np.argmin(np.abs(direction)))])
-    return one, across_with @ one
-
-
-def _unit(v: Float[ndarray, "3"]) -> Float[ndarray, "3"]:
-    return v / max(float(np.linalg.norm(v)), 1e-12)
+    The first three are a rotation vector in axes of camera i. The last two turn the direction about the second and the
+    third column of `across`.
+    """
+    first, second = rotation_exp(np.array([step[:3], [0.0, step[3], step[4]]]))
+    return first @ rotation, across @ second
