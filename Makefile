@@ -36,7 +36,7 @@ test-long: .venv/ready
 test-lowest: .venv-lowest/ready
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(TWO_WORKERS) -o addopts='--import-mode=importlib -ra' \
 		tests/test_without_torch.py tests/test_api.py tests/test_geometry.py tests/test_camera.py \
-		tests/estimation tests/calibration tests/capture tests/boards/test_marker.py tests/pointmaps/test_grid.py
+		tests/estimation tests/calibration tests/capture tests/boards/test_marker.py tests/pointmaps/test_image_grid.py
 
 .venv-lowest/ready: pyproject.toml constraints-lowest.txt
 	$(PYTHON) -m venv .venv-lowest
