@@ -93,7 +93,7 @@ def test_each_pose_of_a_usual_capture_is_compared(half_capture: Path):
 
 @pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="the real captures are not here")
 @pytest.mark.long
-def test_check_names_the_remedy_and_the_board_that_a_run_names():
+def test_check_names_the_remedy_the_board_and_the_images_that_a_run_names():
     """The systematic robot error was named, which is the main part for a simulated scene; for the images it is not."""
     found = check_capture(SHARED / "data/realman_carpet")
     (missed,) = [one for one in found.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
@@ -102,6 +102,9 @@ def test_check_names_the_remedy_and_the_board_that_a_run_names():
     )
     (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
     assert "--board chessboard:11x8:SIDE" in board.remedy
+    found = check_capture(SHARED / "data/ur_snack_table")
+    assert found.hand_eye is not None, "at 800 px image_8 seemed to be wrong"
+    assert [one.image for one in found.hand_eye.images if not one.used] == ["images/image_7.jpg"]
 
 
 @pytest.mark.slow

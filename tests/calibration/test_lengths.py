@@ -13,14 +13,14 @@ from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.checks.lengths import depth_check
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration, validated
-from jcr.calibration.summary import details
+from jcr.calibration.summary import details, summary
 from jcr.camera import rays
 from jcr.capture.images import encode_png, read_depth_images
 from jcr.capture.read import read_capture
 from jcr.depth.depth_camera import with_measured_depth
 from jcr.errors import InputError
 from jcr.files import write_bytes
-from jcr.findings import Finding, FindingKind
+from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, step_between, transform
 from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
 from scenes import capture_of, maps_of, no_depth, reconstruction_of
@@ -115,6 +115,7 @@ def test_the_side_of_a_board_of_unknown_size_is_stated_by_the_robot():
     assert side.value is not None and side.std is not None
     assert side.value == pytest.approx(1.016 * 0.025, abs=3 * side.std) and side.std < 1e-4
     assert hand_eye.converged and hand_eye.lengths == ()
+    assert f"\nNote        {sentence(side)}\n" in summary(hand_eye)
 
 
 INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)

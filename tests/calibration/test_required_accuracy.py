@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,8 @@ def test_the_images_that_are_missing_are_counted():
     assert f"add {required.more_images} more" in show
     remedy = f"add {required.more_images} more, rotated by 20° or more about different axes"
     assert f"\nRemedy      {remedy}\n" in summary(content)
+    later = replace(content, timings_s={"reconstruct": 10.0, "calibrate": 2.0, "map": 30.0})
+    assert ", 12 s\n" in summary(later), "the map comes after the first line of the terminal"
     assert 'class="verdict fair"' in html and f"{NOT_EXACT.capitalize()}:" in html
     few = calibrate_pose_pairs(pairs(12, 3)[0], asked)
     assert few.requirement is not None and few.requirement.more_images == 5

@@ -224,6 +224,10 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
         (["export", "a", "octomapp"], "did you mean octomap?"),
         (["run", "a", "b", "--require", "2"], "--require takes MM DEG|none, not '2' (jcr run --help)"),
         (["run", "a", "-o", "b"], "jcr run has no option -o"),
+        (
+            ["check", "a", "--board", "b"],
+            "it is an option of jcr run, jcr calibrate and jcr batch (jcr check",
+        ),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),

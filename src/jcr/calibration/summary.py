@@ -67,7 +67,8 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
         limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {counted(len(content.images), 'image')}"
-    seconds = sum(content.timings_s.values())
+    # The times of depth and map follow in log.txt; the first line is the same before and after these stages.
+    seconds = sum(content.timings_s.get(stage, 0.0) for stage in ("reconstruct", "calibrate"))
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
@@ -183,6 +184,8 @@ def actions(findings: Sequence[Finding], most: int) -> list[str]:
             lines += labelled("Remedy", one.remedy)
         elif one.severity != "informs":
             lines += labelled("WARNING", sentence(one))
+        elif one.kind is FindingKind.BOARD_SIDE:  # the answer to a SIDE in --board
+            lines += labelled("Note", sentence(one))
     if len(lines) <= most:
         return lines
     hidden = f"{len(lines) - most + 1} more with --verbose and in the report"

@@ -16,7 +16,9 @@ from typing import Any, get_type_hints
 import tyro
 from tyro import _errors
 
+from jcr.cli import COMMANDS, command
 from jcr.errors import InputError, did_you_mean
+from jcr.findings.finding import joined
 
 CONFIGURATION = (
     tyro.conf.OmitArgPrefixes,
@@ -42,7 +44,9 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
         options = (word.replace("_", "-") for word in words if word.lstrip("-")[:1].isalpha())
         match event:
             case _ if unknown := next((word for word in options if word not in known), None):
-                why = f"{program} has no option {unknown}{did_you_mean(unknown, known)}"
+                owners = [f"jcr {name}" for name in COMMANDS if unknown in _flags(command(name))]
+                where = f"; it is an option of {joined(owners)}" if owners else did_you_mean(unknown, known)
+                why = f"{program} has no option {unknown}{where}"
             case _errors.MissingArgs(missing_arguments=missing):
                 why = f"{', '.join(str(one.arg.lowered.metavar) for one in missing)}: required, and not given"
             case _errors.UnrecognizedArgs(tokens=[first, *_]):
@@ -87,8 +91,10 @@ def _wrapped_paragraphs() -> Iterator[None]:
 def _flags(record: Any) -> Iterator[str]:
     """Yield the names (--NAME) of all options of a command's class, also those of nested classes of options."""
     if is_dataclass(record):
-        hints = get_type_hints(record)
+        hints, extra = get_type_hints(record), get_type_hints(record, include_extras=True)
         for field in fields(record):
+            if tyro.conf.Positional in getattr(extra[field.name], "__metadata__", ()):
+                continue
             if is_dataclass(hints[field.name]):
                 yield from _flags(hints[field.name])
             else:

@@ -116,9 +116,10 @@ def check_capture(
     """Examine a capture, or the capture at a path: its motion, images, and expected uncertainty.
 
     `look`: reconstruct the images from sparse features and compare the camera poses with the gripper poses. A few images
-    of reduced size are used first, and all images if the first result is rejected or `thorough` is set. PosePairs have
-    given camera poses, which are compared instead. `robot_noise` is the standard deviation per axis (m, rad). `require`
-    is the required accuracy (mm, degrees); a finding states if the one that is expected from the images misses it.
+    of reduced size are used first, and all images if the first result is rejected or leaves an image out, or if
+    `thorough` is set. PosePairs have given camera poses, which are compared instead. `robot_noise` is the standard
+    deviation per axis (m, rad). `require` is the required accuracy (mm, degrees); a finding states if the one that is
+    expected from the images misses it.
     Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
@@ -216,7 +217,7 @@ def _compare(
 
     `robot` is the prior of the robot errors of all images. The camera poses of
     PosePairs are given, others are reconstructed from features: first those of QUICK images of reduced size; then those
-    of all images if `thorough` is set, or if the first comparison fails or is rejected.
+    of all images if `thorough` is set, or if the first comparison fails, is rejected or leaves an image out.
     """
     rows = np.arange(len(capture))
     if isinstance(capture, PosePairs):
@@ -241,7 +242,8 @@ def _compare(
         else:
             hand_eye = calibration_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
-    if not thorough and verdict_of(hand_eye.findings) == "rejected":
+    # At reduced size the images may not tell which of two contradicting images is wrong.
+    if not thorough and (verdict_of(hand_eye.findings) == "rejected" or not hand_eye.inliers.all()):
         return _compare(capture, robot, options, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
