@@ -114,9 +114,10 @@ def test_pages_are_installed_printed_listed_and_named_by_messages(capsys: pytest
     assert capsys.readouterr().out == (ROOT / "docs" / "reference" / "captures.md").read_text()
     assert dispatch(["docs"]) == 0
     listed = capsys.readouterr().out
-    assert all(f"\n{name} " in listed for name in ("results/speed", "api", "cli", "findings", "formats"))
+    assert all(f"\n  {name} " in listed for name in ("results/speed", "api", "cli", "findings", "formats"))
     for name, said in (
-        ("nonsense", "there are: .*captures"),
+        ("board", "pages that contain this word: .*markers"),
+        ("xyzzy", "`jcr docs` lists the pages"),
         ("troubleshoot", "did you mean troubleshooting?"),
     ):
         with pytest.raises(InputError, match=said):

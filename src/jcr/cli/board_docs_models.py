@@ -18,6 +18,8 @@ from jcr.hub import HUB_ID, download
 CHECKOUT = Path(__file__).parents[3] / "docs"
 SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
 """Folders of the manual's pages; pages in `results`, whose names others have, are named with their folder."""
+MOST_NAMED = 4
+"""Largest number of pages that are named for a word."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,14 @@ class DocsCommand:
             text = page(self.name)
             self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
             return 0
-        headings = ((name, path.read_text("utf-8").partition("\n")[0]) for name, path in pages().items())
-        titles = {name: heading.removeprefix("# ").strip() for name, heading in headings}
-        self.output.result((f"{name:<22} {heading}" for name, heading in titles.items()), {"pages": titles})
+        titles, lines, section = dict[str, str](), list[str](), ""
+        for name, path in pages().items():
+            titles[name] = path.read_text("utf-8").partition("\n")[0].removeprefix("# ").strip()
+            if path.parent.name != section:
+                section = path.parent.name
+                lines += [*([""] if lines else []), f"{section}:"]
+            lines.append(f"  {name:<20} {titles[name]}")
+        self.output.result(lines, {"pages": titles})
         return 0
 
 
@@ -95,8 +102,12 @@ def page(name: str) -> str:
     """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError if no page has it."""
     found = pages()
     if name not in found:
-        there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
-        raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; there are: {there}")
+        count = {other: path.read_text("utf-8").lower().count(name.lower()) for other, path in found.items()}
+        speak = sorted((other for other in found if count[other]), key=lambda other: -count[other])[
+            :MOST_NAMED
+        ]
+        there = f"pages that contain this word: {', '.join(speak)}" if speak else "`jcr docs` lists the pages"
+        raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; {there}")
     return found[name].read_text(encoding="utf-8")
 
 

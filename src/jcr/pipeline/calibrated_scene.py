@@ -192,7 +192,8 @@ class OldScene:
         if places:
             at = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in places)
             lost.append(
-                f"the scene has changed near {at} m (base frame); {100 * (left or 0):.0f} % of it is left"
+                f"the scene has changed near {at} m (base frame), so that the map is wrong there; "
+                f"{100 * (left or 0):.0f} % of the scene is as before, and this part tests the calibration"
             )
         located = Located(
             base_from_gripper=tuple(new.base_from_gripper[rows]),
