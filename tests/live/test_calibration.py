@@ -15,7 +15,7 @@ from jcr.capture.images import read_image
 from jcr.findings import FindingKind
 from jcr.geometry import rotation_exp, scale_translation, step_between, transform
 from jcr.live.calibration import LiveCalibration
-from jcr.live.progress import LiveProgress
+from jcr.live.progress import FIRST_ADVICE, LiveProgress
 from jcr.records import Capture
 from scripted_capture import REQUIRED, still
 
@@ -51,6 +51,15 @@ def resumed(
     live.update()
     yield live
     live.close()
+
+
+def test_the_first_three_images_are_printed_with_the_next_action(capture: Capture, tmp_path: Path):
+    with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
+        states = [live.add(image_of(capture, k), capture.base_from_gripper[k]) for k in range(3)]
+    missed = [one.remedy for one in states[2].findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
+    printed = [str(state).splitlines() for state in states]
+    assert [lines[1] for lines in printed] == [FIRST_ADVICE, FIRST_ADVICE, *missed]
+    assert "no calibration yet" in printed[1][0] and "3 of 3 images registered: ±" in printed[2][0]
 
 
 @pytest.mark.slow

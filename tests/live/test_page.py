@@ -359,6 +359,18 @@ def test_a_program_reads_the_state_and_removes_replaces_and_undoes(tmp_path: Pat
         assert posted(server, "", "/state", Authorization=None)[0] == 403
 
 
+def test_an_unexpected_error_of_the_calibration_answers_500(tmp_path: Path, tabletop: Path):
+    image = read_image(tabletop / "images" / "00.jpg")
+    session, scripted = a_capture(tmp_path / "c", still_frames(lambda: image))
+    with LiveServer(session, takes_samples=True) as server:
+        scripted.fault = NameError("name 'remedy' is not defined")
+        status, answer = posted(server, POSE)
+    assert status == 500 and "NameError: name 'remedy'" in answer["reason"]
+    assert not answer["accepted"] and "done" not in answer
+    with pytest.raises(NameError):
+        session.run()
+
+
 def test_a_run_is_verified_when_a_program_asks(serving: Callable[..., Any]):
     outcomes: list[Any] = [
         {"moved": True, "drift_mm": np.arange(3.0)},

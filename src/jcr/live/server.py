@@ -171,7 +171,12 @@ class _Handler(BaseHTTPRequestHandler):
             if (refused := self._refused()) is not None:
                 answer, status = {"accepted": False, "reason": refused}, 403
             else:
-                answer, status = answered()
+                try:
+                    answer, status = answered()
+                except Exception as error:  # a fault of jcr, which the terminal prints in full
+                    why = " ".join(f"{type(error).__name__}: {error}".split())
+                    reason = f"unexpected error, {why}; the capture keeps its images"
+                    answer, status = {"accepted": False, "reason": reason}, 500
             self._send_json(answer, status)
         elif (path := self._path()) is not None:
             is_json = self.headers.get("Content-Type", "") == "application/json"

@@ -5,7 +5,7 @@ Requests and commands may come from any thread (HTTP server, terminal, arm) and 
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -148,7 +148,8 @@ class LiveSession:
             # Wait until all images are calibrated; after an interruption or error, for the running calibration only.
             self.end()
             self._worker.shutdown(wait=False, cancel_futures=abandon)
-            wait([self._following], longest_s)
+            with suppress(Exception):  # `end` has the error of a calibration
+                self._following.result(longest_s)
         if self._error is not None:
             raise self._error
 
@@ -172,7 +173,7 @@ class LiveSession:
 
         `state` is written with the image: gripper pose and joint angles. The answer has "accepted", and "image" (name)
         or "reason". An image that the new one replaces is removed with its addition. `waits`: wait for the calibration,
-        and add its state to the answer.
+        add its state to the answer, and raise the unexpected error that ended it.
         """
         with self._lock:
             if self.state.is_over:
@@ -197,7 +198,8 @@ class LiveSession:
             following = self._following
         if not waits:
             return answer
-        wait([following])
+        with suppress(CancelledError):
+            following.result()
         return self.state.progress.as_json() | answer | {"done": self.state.is_over}
 
     def press(self, action: Action, number: int | None = None) -> None:
@@ -309,6 +311,7 @@ class LiveSession:
             self._refuse(f"no calibration: {error.filename or self.folder.folder}: {error.strerror}")
         except Exception as error:
             self.end(error)
+            raise
 
     def _report(self, progress: LiveProgress) -> None:
         """Publish a new state of the calibration, on the page and through `tell`."""
