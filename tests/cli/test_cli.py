@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -240,6 +241,18 @@ def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list
     assert words in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_the_help_breaks_no_line_within_a_sentence(columns: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    printed = run_jcr("run", "--help").stdout
+    assert "(default: None)" not in printed and "(default: )" not in printed
+    text = printed.partition("--require ")[2].partition("--robot-noise ")[0].splitlines()[1:-1]
+    assert len(text) > 2
+    # No word that begins a line would have had room in the line before it.
+    for line, following in pairwise(text):
+        assert len(f"{line.rstrip()} {following.split()[0]}") > columns, line
 
 
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):

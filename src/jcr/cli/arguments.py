@@ -1,6 +1,6 @@
 """Parse the arguments of a command with tyro; a wrong one is an InputError of one line.
 
-The hook of tyro for parse errors is in its module `_errors`, which pyproject.toml bounds by the minor version.
+The hooks of tyro are in its modules `_errors` and `_fields`; pyproject.toml bounds its minor version.
 """
 
 import io
@@ -9,12 +9,12 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from itertools import takewhile
 from typing import Any, get_type_hints
 
 import tyro
-from tyro import _errors
+from tyro import _errors, _fields
 
 from jcr.cli import COMMANDS, command
 from jcr.errors import InputError, did_you_mean
@@ -67,8 +67,37 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
                 why = message
         raise InputError(f"{why} ({program} --help)")
 
-    with _errors.on_parse_error(refuse), _wrapped_paragraphs():
+    with _errors.on_parse_error(refuse), _plain_descriptions(), _wrapped_paragraphs():
         return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
+
+
+@contextmanager
+def _plain_descriptions() -> Iterator[None]:
+    """Join the lines of an option's docstring in the help, and omit a default without information, while active.
+
+    tyro would keep line breaks before a line that is indented.
+    """
+    made = _fields.FieldDefinition.make
+
+    def make(*arguments: Any, **named: Any) -> _fields.FieldDefinition:
+        """Return tyro's definition of an option with a description of one line."""
+        field = made(*arguments, **named)
+        given = field.helptext
+        field.helptext = lambda: " ".join(((given() if callable(given) else given) or "").split()) or None
+        if tyro.conf.UseAppendAction not in field.markers:  # tyro shows "(repeatable)" for those
+            field.argconf = replace(field.argconf, help_behavior_hint=_default_hint)
+        return field
+
+    _fields.FieldDefinition.make = make
+    try:
+        yield
+    finally:
+        _fields.FieldDefinition.make = made
+
+
+def _default_hint(label: str) -> str:
+    """Return the default of an option for the help; empty if the default is None or empty."""
+    return "" if label in ("", "None") else f"(default: {label})"
 
 
 @contextmanager
