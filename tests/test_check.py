@@ -16,7 +16,7 @@ from jcr.calibration.checks.unused_images import left_out_poses
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, edge_width, encode_png, read_image
 from jcr.cli import dispatch
-from jcr.findings import FindingKind
+from jcr.findings import FindingKind, warnings_of
 from jcr.geometry import inverse, step_between
 from jcr.pipeline.check import check_capture
 from jcr.records import Intrinsics
@@ -102,7 +102,10 @@ def test_check_names_the_remedy_the_board_and_the_images_that_a_run_names():
     )
     (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
     assert "--board chessboard:11x8:SIDE" in board.remedy
+    belt = check_capture(SHARED / "attacks/scene_belt")
+    assert any("objects seem to have moved" in one for one in warnings_of(belt.findings))
     found = check_capture(SHARED / "data/ur_snack_table")
+    assert not any("moved" in one for one in warnings_of(found.findings))
     assert found.hand_eye is not None, "at 800 px image_8 seemed to be wrong"
     assert [one.image for one in found.hand_eye.images if not one.used] == ["images/image_7.jpg"]
 
@@ -116,6 +119,6 @@ def test_a_fixed_camera_is_checked_by_what_moves_with_the_gripper(half_capture: 
     assert found.verdict == "accepted" and found.hand_eye is not None and of_wrist.hand_eye is not None
     apart = step_between(found.hand_eye.base_from_camera, of_wrist.hand_eye.gripper_from_camera)
     assert np.abs(apart[:3]).max() < 1e-3 and found.expected is found.hand_eye.uncertainty
-    assert found.expected.seen is not None
+    assert found.expected is not None and found.expected.seen is not None
     still = replace(fixed, images=fixed.images[:1] * 3, base_from_gripper=fixed.base_from_gripper[:3])
     assert not view_findings(still)

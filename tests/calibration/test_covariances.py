@@ -10,11 +10,12 @@ import pytest
 
 from jcr.calibration.difference import StatedTransform, compare
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.summary import mixed_pair_mm, summary
+from jcr.calibration.summary import corner_in_words, mixed_pair_mm, summary
 from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
 from jcr.geometry import ROOT_FROM_OPTICAL, inverse, retract, rotation_exp, transform
 from jcr.number_format import significant
+from jcr.report.verdict import head
 from places import ROOT
 
 ACCEPTED = ROOT / "tests" / "calibrations" / "accepted.json"
@@ -63,6 +64,21 @@ def test_the_error_of_a_mixed_pair_is_that_of_the_rays():
     assert mixed_pair_mm(found) == pytest.approx(expected)
     assert f"a point is up to {significant(expected)} mm off" in summary(found)
     assert mixed_pair_mm(replace(found, with_given_intrinsics=None)) is None
+
+
+def test_a_corner_that_misses_the_requirement_is_named_with_reason_and_remedy():
+    found = read_calibration(ACCEPTED)
+    assert isinstance(found, Calibration) and found.requirement is not None
+    assert (seen := found.uncertainty.seen) is not None and not corner_in_words(found)
+    for centre_mm in (6.5, 3.0):
+        required = replace(found.requirement, reached_mm=centre_mm)
+        corners = replace(seen.corners, within_95_mm=125.0)
+        of_centre = replace(seen, within_95_mm=centre_mm, corners=corners)
+        missed = replace(found, requirement=required, uncertainty=replace(found.uncertainty, seen=of_centre))
+        assert "\n            in the corners the distortion is extrapolated" in summary(missed)
+        assert ("not met in the corners" in summary(missed)) == required.met
+        (tile,) = [tile for tile in head(missed)["tiles"]["tiles"] if "corner" in tile[0]]
+        assert tile[3] == "first missed"
 
 
 HAND_EYE = transform(rotation_exp(np.array([0.1, -0.05, 0.8])), np.array([0.05, 0.02, 0.06]))

@@ -17,7 +17,7 @@ from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind, sentence
-from jcr.findings.finding import verdict_of
+from jcr.findings.finding import verdict_of, without_consequences
 from jcr.findings.messages import GROUPS
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Intrinsics
@@ -97,6 +97,13 @@ def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences():
     uncertain = replace(example(FindingKind.UNCERTAIN), severity="rejects")
     found = with_faults(solved, uncertain, fault)
     assert [one.kind for one in found.findings] == [FindingKind.DELAY, FindingKind.UNCERTAIN]
+
+
+def test_a_repetitive_scene_is_named_without_warnings_of_the_reconstruction():
+    cause = replace(example(FindingKind.REPETITIVE), severity="rejects")
+    others = FindingKind.HALF_UNUSED, FindingKind.FEW_IMAGES, FindingKind.RECONSTRUCTION
+    found = (cause, *(replace(example(kind), severity="warns") for kind in others))
+    assert without_consequences(found) == (cause,) and without_consequences(found[1:]) == found[1:]
 
 
 @pytest.mark.slow

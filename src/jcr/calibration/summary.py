@@ -24,6 +24,9 @@ NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
 MOST_LINES = 14
 """Largest number of lines of the terminal's summary, including two that the caller adds: report and next command."""
+EXTRAPOLATED = 2.0
+"""Ratio of the errors in the corner and at the centre from which three quarters or more of the corner's variance are
+due to the intrinsics; with 1.5 it is more than half, with 3 eight ninths."""
 MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
 """Kinds with the remedy "more images"; not printed if a finding of another kind rejects the calibration."""
 BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
@@ -48,12 +51,32 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     return f"{verdict.upper()}, with {counted(warnings, 'warning')}"
 
 
-def only_centre_meets(content: AnyCalibration) -> bool:
-    """Test whether the required accuracy is met at the image centre and not in the corners."""
+def corner_is_missed(content: AnyCalibration) -> bool:
+    """Test whether the accuracy of a point in the worst corner of the image misses the required one."""
     required, uncertainty = content.requirement, content.uncertainty
-    if required is None or not required.met or uncertainty is None or uncertainty.corner is None:
+    if required is None or uncertainty is None or uncertainty.corner is None:
         return False
     return uncertainty.corner.within_95_mm > required.translation_mm
+
+
+def corner_in_words(content: AnyCalibration) -> str:
+    """Return why the corners of the image miss the required accuracy, and the remedy; empty if it is not the distortion.
+
+    Errors of the transform move points at one distance alike; a corner that is less exact by EXTRAPOLATED or more has
+    its error from the intrinsics.
+    """
+    if (
+        not corner_is_missed(content)
+        or content.uncertainty is None
+        or (seen := content.uncertainty.seen) is None
+    ):
+        return ""
+    if seen.corners.within_95_mm < EXTRAPOLATED * seen.within_95_mm:
+        return ""
+    return (
+        "in the corners the distortion is extrapolated, because no or few features are near them; move textured objects "
+        "into the corners of the images"
+    )
 
 
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
@@ -63,7 +86,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """
     limit = ""
     if (required := content.requirement) is not None:
-        unmet = ", not met in the corners" if only_centre_meets(content) else ""
+        unmet = ", not met in the corners" if required.met and corner_is_missed(content) else ""
         limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {counted(len(content.images), 'image')}"
@@ -99,7 +122,7 @@ def _result(content: Calibration) -> list[str]:
     lines = [
         *_transform(content),
         f"  1σ: {offset} mm, {rotation}°",
-        *labelled("Accuracy", accuracy, "; ".join(tested)),
+        *labelled("Accuracy", accuracy, *filter(None, [corner_in_words(content)]), "; ".join(tested)),
     ]
     return [*lines, *(labelled("Intrinsics", *pair) if (pair := pair_in_words(content)) else ())]
 

@@ -19,6 +19,8 @@ TOO_FEW = (
     "gripper poses early or late",
 )
 """Kinds that are consequences in addition to MISFIT if too few of the images can be used."""
+UNMATCHED = (*MISFIT, *TOO_FEW, "few images", "most images left out", "reconstruction")
+"""Kinds that are consequences of images that cannot be matched with each other."""
 ONE_PART = (
     "calibrate the {count:.0f} images {longer:before=up to {images[0]}|after=from {images[1]} on} alone; use the other "
     "images only if "
@@ -320,15 +322,15 @@ class FindingKind(StrEnum):
         "all images show the same view, while the gripper moves by {mm:.0f} mm and rotates "
         "by {rotation_deg:.0f}°",
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose",
-        explains=(*MISFIT, *TOO_FEW))
+        explains=UNMATCHED)
     BLURRED = "images blurred", KindRow("images", "{images} {images:is|are} blurred (edges {value:.0f} px wide)",
-        "take them again at rest, in focus and with more light", explains=(*MISFIT, *TOO_FEW),
+        "take them again at rest, in focus and with more light", explains=UNMATCHED,
         means="the strongest edges of these `images` climb over more than 1/80 of the long side; rejects "
         "where a quarter of all are and the calibration is rejected")
     REPETITIVE = "repetitive scene", KindRow("images",
         "the scene repeats itself: {percent:.0f} % of the features look like others of the same image, so that images "
         "may be matched in the wrong places",
-        "put different, textured objects on the table", explains=(*MISFIT, *TOO_FEW),
+        "put different, textured objects on the table", explains=UNMATCHED,
         means="regular tiles or patterns; rejects where the calibration is rejected")
     HALF_UNUSED = "most images left out", KindRow("images",
         "only {value:.0f} of {of:.0f} images are used: {lost:.0f} were not registered, {wrong:.0f} contradict the "

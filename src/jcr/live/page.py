@@ -133,13 +133,13 @@ def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     without = [f"without {', '.join(missing[:3])}{' …' * (len(missing) > 3)}"] if missing else []
     for k, ((name, unit), value) in enumerate(zip(names, reached, strict=False)):
         limits = [] if required == "none" else [f"required {required[k]:g}{unit}"]
-        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", "; ".join(limits + without), True))
+        tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", "; ".join(limits + without), "first"))
     count = f"{len(state.progress.registered)} of {len(state.images)}"
-    tiles.append(("Images registered", count, "", False))
+    tiles.append(("Images registered", count, "", ""))
     if error is not None:
         size = f"{significant(error.translation_mm)} mm, {significant(error.rotation_deg)}°"
         px = "" if error.reprojection_px is None else f"{significant(error.reprojection_px)} px"
-        tiles.append(("Leave-one-out error", size, px, False))
+        tiles.append(("Leave-one-out error", size, px, ""))
     return tiles
 
 

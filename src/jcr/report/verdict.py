@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
-from jcr.calibration.summary import leave_one_out_text, only_centre_meets, worst_direction
+from jcr.calibration.summary import corner_in_words, corner_is_missed, leave_one_out_text, worst_direction
 from jcr.findings import FindingKind, reached_in_words, sentence
 from jcr.number_format import significant
 from jcr.report.render import Content
 
-Tile = tuple[str, str, str, bool]
-"""Number in a box: its name, the number as text, a remark, and whether it is one of the main numbers."""
+Tile = tuple[str, str, str, str]
+"""Number in a box: its name, the number as text, a remark, and its classes in CSS: "first" for one of the main numbers,
+"missed" for one that misses the required accuracy."""
 
 
 def head(calibration: AnyCalibration) -> dict[str, Content]:
@@ -46,11 +47,11 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     if calibration.doubt is not None:
         reason = calibration.doubt
     elif short is not None:
-        reason = sentence(short)
+        reason = "; ".join(filter(None, (sentence(short), corner_in_words(calibration))))
     else:
         reason = "no check contradicts it" if required is None else reached_in_words(required)
-        if only_centre_meets(calibration):
-            reason += "; the corners of the image do not reach this"
+        if corner_is_missed(calibration):
+            reason += "; " + (corner_in_words(calibration) or "the corners of the image do not reach this")
     evidence = _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
         reason, evidence = (
@@ -81,37 +82,42 @@ def _leave_one_out(calibration: AnyCalibration) -> str:
 def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     """Yield tiles (a number in a box) of the accuracy of a point at the image centre and corner, used images, and scale.
 
-    A tile is (name, number as text, remark, whether it is a main number). Tiles whose numbers the calibration does not
-    have are left out; without the corner, the rotation uncertainty of the camera is given.
+    Tiles whose numbers the calibration does not have are left out; without the corner, the rotation uncertainty of the
+    camera is given.
     """
     uncertainty = calibration.uncertainty
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
         far, turned = significant(1e-3 * seen.distance_mm), significant(seen.rotation_95_deg)
-        bound = f"{significant(seen.within_95_mm)} mm"
-        yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", True
+        bound, is_met = f"{significant(seen.within_95_mm)} mm", calibration.short is None
+        yield (
+            "Point at the image centre",
+            bound,
+            f"at {far} m, {turned}°; 95 %",
+            "first" if is_met else "first missed",
+        )
         degrees = significant(seen.corners.rotation_95_deg)
         yield (
             "Point in the image corner",
             f"{significant(seen.corners.within_95_mm)} mm",
             f"{degrees}°; 95 %",
-            True,
+            "first missed" if corner_is_missed(calibration) else "first",
         )
     elif uncertainty is not None:
         degrees = significant(max(uncertainty.rotation_std_deg))
-        yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", True
+        yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", "first"
     if isinstance(calibration, PublishedCalibration):
         found = calibration.residuals
-        yield "Residual δt", f"{significant(1e3 * found.translation)} mm", "paper, eq. 16", True
-        yield "Residual δR", significant(found.rotation), "paper, eq. 16; Frobenius norm", True
+        yield "Residual δt", f"{significant(1e3 * found.translation)} mm", "paper, eq. 16", "first"
+        yield "Residual δR", significant(found.rotation), "paper, eq. 16; Frobenius norm", "first"
     used, count = calibration.images_used, len(calibration.images)
-    yield "Images used", f"{used} of {count}", f"{count - used} left out" if used < count else "", True
+    yield "Images used", f"{used} of {count}", f"{count - used} left out" if used < count else "", "first"
     if isinstance(calibration, PublishedCalibration):
-        yield "Scale", f"{calibration.scale:.4g}", "m per unit of the reconstruction", True
+        yield "Scale", f"{calibration.scale:.4g}", "m per unit of the reconstruction", "first"
     elif uncertainty is not None and calibration.scale is not None:
         percent = significant(uncertainty.scale_std_percent)
         yield (
             "Scale",
             f"±{percent}\u00a0%",
             f"{significant(calibration.scale, 4)} m per unit of the reconstruction",
-            True,
+            "first",
         )

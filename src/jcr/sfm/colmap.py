@@ -58,10 +58,11 @@ _START_FOCALS = (USUAL_FOCAL, 0.5, 1.2)
 real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
 _MADE_AGAIN = (
-    "the first map contradicted the gripper poses, as where objects move while the images are taken: the map was made "
-    "again without the matches that contradict them"
+    "objects seem to have moved while the images were taken: the first map contradicted the gripper poses, and the map "
+    "was made again without the matches that contradict them; keep everything in view at rest and take the images again, "
+    "or do not use the map near these objects"
 )
-"""Note on a map that was replaced by one near the cameras that the gripper poses predict."""
+"""Warning about a map that was replaced by one near the cameras that the gripper poses predict."""
 _MANY, _GROWN = 40, 1.3
 """Number of images above which COLMAP adjusts the whole map only after growth by a factor _GROWN (its default: 1.1)."""
 _MOST_OBSERVATIONS = 60_000
@@ -295,7 +296,7 @@ def map_images(
         if model is not None and matched.x is not None:
             nearer = nearer_to_robot(database, model, base_from_gripper, matched.x, matcher)
             if nearer is not model:
-                model, matched = nearer, replace(matched, notes=(*matched.notes, _MADE_AGAIN))
+                model, matched = nearer, replace(matched, warnings=(*matched.warnings, _MADE_AGAIN))
     return matched, model
 
 
