@@ -265,13 +265,14 @@ class ExportedRun:
         if camera is None:
             return None
         words, given = f"belongs to {intrinsics_in_words(camera)}", found.with_given_intrinsics
+        command = "" if contents == "camera_frame" else f"jcr export {self.run.out} camera_info"
         if self.camera is not None or given is None:
-            return f"{words}; jcr export {self.run.out} camera_info writes them"
+            return f"{words}; {command} writes them" if command else words
         if self.options.intrinsics == "given":
             return f"{words}, the given ones; without --intrinsics given: for the refined ones"
         return (
-            f"{words}, the refined ones (jcr export {self.run.out} camera_info); for the given ones, fx "
-            f"{given.intrinsics.fx:.1f}: --intrinsics given"
+            f"{words}, the refined ones{command and f' ({command})'}; for the given ones, fx {given.intrinsics.fx:.1f}: "
+            "--intrinsics given"
         )
 
     @property
