@@ -15,6 +15,7 @@ import pytest
 from numpy import ndarray
 
 import jcr
+from in_process import run_jcr
 from jcr.capture.images import read_image
 from jcr.live import robot
 from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
@@ -233,6 +234,16 @@ def test_each_pose_gets_the_image_still_there_and_a_stopped_capture_resumes(tmp_
     for k, name in enumerate(capture.images):
         assert close_to(read_image(capture.folder / name), still(tabletop, k))
         assert np.allclose(capture.base_from_gripper[k], pose[k])
+
+
+def test_a_capture_without_an_image_ends_with_the_reason(
+    tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    swings = video(tmp_path / "a.avi", tabletop, range(5), rest_s=0)
+    monkeypatch.setattr(LiveSession, "run", lambda self: self.take(RobotState(0.0, np.eye(4))))
+    ended = run_jcr("capture", tmp_path / "c", "--camera", swings)
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert "no image was kept: the video has ended; an image needs two" in ended.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

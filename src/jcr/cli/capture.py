@@ -115,6 +115,9 @@ class CaptureCommand:
                     result = session.finish(calibrates=run is None)
             finally:
                 calibration.close()
+        if not calibration.live.names:
+            why = session.state.event.removeprefix("refused: ") or "none was asked for"
+            raise InputError(f"{out}: no image was kept: {why}; the same command begins again")
         facts = {"capture": str(out), "images": calibration.live.names, "answers": answers}
         if run is not None:
             found = verify_run(run, out)

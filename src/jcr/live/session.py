@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import GRASPING, RequiredAccuracy
 from jcr.errors import InputError, RejectedError
-from jcr.live.cameras import Camera, Frame, frame_at_rest
+from jcr.live.cameras import REST_S, Camera, Frame, frame_at_rest
 from jcr.live.progress import LiveProgress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_json import FrameEntry
@@ -268,7 +268,9 @@ class LiveSession:
             found = frame_at_rest(self._frames, kept, self.options.patience)
         except StopIteration:
             self.end()
-            raise InputError("the video has ended") from None
+            raise InputError(
+                f"the video has ended; an image needs two equal frames {REST_S:g} s apart (jcr docs capture)"
+            ) from None
         except InputError as error:
             self.end(error)
             raise
