@@ -82,10 +82,15 @@ def test_the_page_shows_each_state(capture: tuple[LiveSession, Scripted], tablet
         add(live, scripted, tabletop, 4)
         wrong = parts(page)["parts"]
         assert "verdict fair" in wrong["head"] and "The gripper pose of images/004.png" in wrong["head"]
-        assert wrong["images"].count('class="rejected"') == 1
+        assert wrong["images"].count('class="warned"') == 1
         assert "(retake 4, or remove 4)" in wrong["head"]
         assert any("(retake 4, or remove 4)" in line for line in progress_lines(live.state.progress))
 
+        # A contradiction is a warning also if the requirement is met.
+        add(live, scripted, tabletop, 5)
+        warned = parts(page)["parts"]["head"]
+        assert "verdict fair" in warned and "<h2>The gripper pose of images/004.png" in warned
+        assert "requirement met" in warned.lower()
         scripted.contradicted = None
         add(live, scripted, tabletop, 5)
         assert "verdict good" in parts(page)["parts"]["head"]

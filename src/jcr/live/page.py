@@ -71,17 +71,20 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
 def _cards(state: SessionState) -> list[dict[str, Any]]:
     """Return a card for each image: its number in commands, file name, the finding about it, and registration state.
 
-    Keys: "number" (from 1), "name", "fault" (empty without one) and "state" ("registered", "not registered" or "new").
+    Keys: "number" (from 1), "name", "fault" (empty without one), "kind" (CSS class: used, warned or rejected) and
+    "state" ("registered", "not registered" or "new").
     """
-    progress, against = state.progress, dict[str, str]()
+    progress, against, kinds = state.progress, dict[str, str](), dict[str, str]()
     for one in progress.findings[::-1]:
         if len(one.images) == 1 and one.severity != "informs":
             against[one.images[0]] = sentence(one)
+            kinds[one.images[0]] = "warned" if one.severity == "warns" else "rejected"
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
     registered |= dict.fromkeys(filter(None, [state.replaces]), "the next image replaces this one")
     return [
-        {"number": number, "name": name, "fault": against.get(name, ""), "state": registered.get(name, "new")}
+        {"number": number, "name": name, "fault": against.get(name, ""), "kind": kinds.get(name, "used")}
+        | {"state": registered.get(name, "new")}
         for number, name in enumerate(state.names, 1)
     ]
 
@@ -109,10 +112,10 @@ def verdict_lines(state: SessionState) -> list[str]:
     lines = finding_lines(progress)
     if any(one.severity == "rejects" for one in wrong):
         return ["bad", *lines]
-    if progress.requirement_met:
-        return ["good", "Requirement met, press Finish", *lines]
     if wrong:
         return ["fair", *lines, advice(progress)]
+    if progress.requirement_met:
+        return ["good", "Requirement met, press Finish"]
     return ["", f"{count} images", accuracy_line(progress), advice(progress)]
 
 
