@@ -55,6 +55,20 @@ def test_blur_is_measured_by_the_image_itself(tabletop: Path):
     assert edge_width(cv2.GaussianBlur(few, (0, 0), 5)) > BLURRED_EDGE
 
 
+def test_nothing_is_stated_of_an_undecided_reading(small_capture: Path, tmp_path: Path, capsys):
+    poses = jcr.read_capture(small_capture).base_from_gripper
+    shutil.copytree(small_capture / "images", tmp_path / "images")
+    turned = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    np.savetxt(tmp_path / "p.csv", np.hstack([1e3 * poses[:, :3, 3], turned]), delimiter=",")
+    assert dispatch(["check", str(tmp_path), "--poses-only"]) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("NOT DECIDED") and "leave out --poses-only, or name the reading" in said
+    assert not any(word in said for word in ("Motion", "Expected", "1σ"))
+    assert dispatch(["check", str(tmp_path), "--poses-only", "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "not checked" and found["expected_std"] is None and found["undecided"]
+
+
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     problem = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4))
     right = problem.base_from_gripper

@@ -144,7 +144,6 @@ def adjusted_numbers(case: Case) -> Calibration:
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(gripper), np.nan)
     reprojection[used] = median_reprojection_px(found.problem, found.images.view)
-    reasons = [image.reason for image in fit.images]
     # Each gripper pose is predicted without its own image. The reprojection error refers to cameras that are displaced
     # by the leave-one-out residuals of their gripper poses.
     left_out, likely = found.leave_one_out[0], found.most_likely
@@ -162,7 +161,7 @@ def adjusted_numbers(case: Case) -> Calibration:
         source="images",
         uncertainty=uncertainty,
         intrinsics=intrinsics.with_std(uncertainty.intrinsics_std),
-        images=image_verdicts(case.names, fit.inliers, reasons, metres, radians, reprojection),
+        images=image_verdicts(case.names, fit.inliers, metres, radians, reprojection),
         residuals=PaperResiduals(*paper_residuals(of_arm(gripper), camera, x, scale, fit.inliers)),
         robot_noise=found.noise,
         held_out=leave_one_out(left_out, how, reprojection_px),

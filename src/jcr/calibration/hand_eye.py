@@ -25,6 +25,7 @@ from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
 from jcr.geometry import Poses, Transform, require_rigid, step_between, transform
 from jcr.least_squares import one_blas_thread
+from jcr.number_format import significant
 from jcr.records import ImageVerdict, LeaveOneOut, Mount, PaperResiduals, Uncertainty
 
 SCALE_STD = 0.002
@@ -138,17 +139,13 @@ def fit_poses(
     used = fit.problem.used[distinct]
     predicted = model.moving(predicted_gripper_poses(x, scale, z, camera))
     metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
-    reasons = [
-        f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other images put it"
-        for m, rad in zip(metres, radians, strict=True)
-    ]
     left_out, moving = fit.leave_one_out[0][fit.problem.used], model.moving(gripper)
     return Calibration(
         **transforms("base" if model.carries == "scene" else "gripper", x, z),
         scale=scale,
         uncertainty=Uncertainty(covariance=fit.covariance[:7, :7], budget=fit.budget),
         backend="poses given",
-        images=image_verdicts(names, used, reasons, metres, radians),
+        images=image_verdicts(names, used, metres, radians),
         residuals=PaperResiduals(*paper_residuals(moving, camera, x, scale, used)),
         robot_noise=fit.noise,
         held_out=leave_one_out(left_out, "each image predicted by the others"),
@@ -217,28 +214,31 @@ def _fitted(
 def image_verdicts(
     names: Sequence[str],
     used: Bool[ndarray, " n"],
-    reasons: Sequence[str | None],
     metres: Float[ndarray, " n"],
     radians: Float[ndarray, " n"],
     reprojection_px: Float[ndarray, " n"] | None = None,
 ) -> tuple[ImageVerdict, ...]:
     """Return a record of each registered image: whether it is used, its residuals, and the reason if it is rejected.
 
-    All arguments have one entry per image; `reasons` of used images are ignored. `metres` (m) and `radians` (rad) are
-    the sizes of each image's residual: reported against predicted gripper pose. `reprojection_px` is the median
-    reprojection error, NaN for an image without one; None: the images were not adjusted.
+    All arguments have one entry per image. `metres` (m) and `radians` (rad) are the sizes of each image's residual:
+    reported against predicted gripper pose. `reprojection_px` is the median reprojection error, NaN for an image
+    without one; None: the images were not adjusted.
     """
     px = np.full(len(names), np.nan) if reprojection_px is None else reprojection_px
     return tuple(
         ImageVerdict(
             image=name,
             used=bool(used[k]),
-            reason=None if used[k] else reasons[k],
-            translation_residual_mm=1e3 * float(metres[k]),
-            rotation_residual_deg=float(np.degrees(radians[k])),
+            reason=None
+            if used[k]
+            else f"its gripper pose is {significant(mm)} mm and {significant(deg)}° from where the other images put it",
+            translation_residual_mm=mm,
+            rotation_residual_deg=deg,
             reprojection_px=None if np.isnan(px[k]) else float(px[k]),
         )
-        for k, name in enumerate(names)
+        for k, (name, mm, deg) in enumerate(
+            zip(names, (1e3 * metres).tolist(), np.degrees(radians).tolist(), strict=True)
+        )
     )
 
 

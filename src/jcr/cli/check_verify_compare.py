@@ -34,8 +34,8 @@ MOST_POSES = 5
 class CheckCommand:
     """Check a capture: files, units, motion, observability, and pose convention.
 
-    The exit status is 3 if its calibration would be rejected or not as exact as needed; the message has the reason and
-    the remedy.
+    The exit status is 3 if its calibration would be rejected or not as exact as needed, or if --poses-only leaves the
+    reading of the poses undecided; the message has the reason and the remedy.
 
     for example:
       jcr check captures/table
@@ -117,7 +117,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     lines = [f"{verdict}: {outcome}. {about}"]
     if isinstance(capture, Capture) and capture.candidates:
         readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
-        lines += labelled("Poses", f"{readings} (jcr check without --poses-only, or jcr run)")
+        lines += labelled(
+            "Poses", readings, "leave out --poses-only, or name the reading (--pose-convention)"
+        )
     elif isinstance(capture, Capture) and capture.reading is not None:
         lines += labelled("Poses", decision_in_words(capture.reading))
     if isinstance(capture, Capture) and capture.others:
@@ -129,7 +131,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
             "none was looked for; if the gripper holds one: jcr calibrate … --board (jcr docs cameras)",
         )
     if not is_rejected:
-        lines += _motion_lines(found)
+        lines += [] if undecided else _motion_lines(found)
         run = [
             "jcr",
             "run",

@@ -78,8 +78,12 @@ class Examination:
 
     @property
     def verdict(self) -> Verdict:
-        """Expected verdict on a calibration of the capture."""
-        return verdict_of(self.findings)
+        """Expected verdict on a calibration of the capture; "not checked" if the reading of its poses is undecided."""
+        verdict, undecided = (
+            verdict_of(self.findings),
+            isinstance(self.capture, Capture) and self.capture.candidates,
+        )
+        return "not checked" if undecided and verdict != "rejected" else verdict
 
     def __repr__(self) -> str:
         """Return the expected verdict, the expected accuracy of a point, and the first finding, on one line."""
@@ -147,7 +151,7 @@ def check_capture(
     if isinstance(capture, PosePairs) or capture.mount == "base":
         # Nothing is predicted for given camera poses, nor for a fixed camera, whose images `predict` does not simulate.
         expected = hand_eye and hand_eye.uncertainty
-    elif len(counted) >= MIN_PREDICTED_IMAGES:
+    elif len(counted) >= MIN_PREDICTED_IMAGES and not capture.candidates:
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)

@@ -59,8 +59,8 @@ real wrist cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 _MIN_REGISTERED = 3
 _MADE_AGAIN = (
     "objects seem to have moved while the images were taken: the first map contradicted the gripper poses, and the map "
-    "was made again without the matches that contradict them; keep everything in view at rest and take the images again, "
-    "or do not use the map near these objects"
+    "was made again without the matches that contradict them; keep everything in view at rest and take the images "
+    "again, or do not use the map near these objects"
 )
 """Warning about a map that was replaced by one near the cameras that the gripper poses predict."""
 _MANY, _GROWN = 40, 1.3
