@@ -27,8 +27,8 @@ def test_the_api_is_listed_and_every_name_of_it_is_there():
     assert set(jcr.__all__) <= set(dir(jcr)) and "__version__" in dir(jcr)
     assert all(hasattr(jcr, name) for name in dir(jcr))
     assert len(set(jcr.__all__)) == len(jcr.__all__)
-    with pytest.raises(AttributeError, match="No jcr attribute calibrated"):
-        _ = jcr.calibrated  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(AttributeError, match="No jcr attribute check; did you mean check_capture?"):
+        _ = jcr.check  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _types_of(hint: object) -> set[type]:
@@ -102,6 +102,8 @@ def test_options_take_text_for_paths_lists_for_tuples_and_name_what_they_are(tab
     assert jcr.read_capture(str(tabletop), {"frames": 12}).images
     with pytest.raises(jcr.InputError, match="--pose-convention 'kukka': not one of .*did you mean kuka"):
         jcr.read_capture(tabletop, {"pose_convention": "kukka"})
+    with pytest.raises(jcr.InputError, match=r"RunOptions: map: False: give jcr.MapOptions.*None for no map"):
+        checked_options({"map": False}, RunOptions)
     with pytest.raises(jcr.InputError, match="give jcr.RunOptions"):
         checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]
 

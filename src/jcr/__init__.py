@@ -53,7 +53,16 @@ def __getattr__(name: str) -> Any:
         from jcr.extras import DISTRIBUTION
 
         return version(DISTRIBUTION)
-    return _attribute(name)
+    try:
+        return _attribute(name)
+    except AttributeError as error:
+        if name in __all__ or name.startswith("_"):
+            raise
+        from jcr.errors import did_you_mean
+
+        raise AttributeError(
+            f"{error}{did_you_mean(name, __all__)}", name=name, obj=sys.modules[__name__]
+        ) from None
 
 
 def __dir__() -> list[str]:

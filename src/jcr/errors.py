@@ -22,9 +22,11 @@ def printable(text: str) -> str:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean …?" with the known word most similar to `word`; empty if none is similar.
 
-    Words are similar if their ratio of matching characters is 0.6 or more (difflib.get_close_matches).
+    Words are similar if their ratio of matching characters is 0.6 or more (difflib.get_close_matches), or if one is the
+    other with an underscore and more at its end.
     """
-    like = get_close_matches(word.lower(), known, n=1)
+    known = list(known)
+    like = get_close_matches(word.lower(), known, n=1) or [one for one in known if one.startswith(f"{word}_")]
     return f"; did you mean {like[0]}?" if like else ""
 
 
@@ -105,7 +107,9 @@ def first_fault(error: "ValidationError") -> str:
     if first["type"] == "missing":
         name = str(first["loc"][-1])
         like = get_close_matches(name, map(str, first["input"]), n=1)
-        what = "is missing" + "".join(f"; rename {shown(key)} to {name}" for key in like)
+        what = "is missing" + "".join(f", but there is {shown(key)}" for key in like)
+    elif isinstance(first["input"], str | int | float) and first["type"] != "value_error":
+        what = f"{shown(first['input'])}: {what}"
     return f"{place}: {what}" if place else what
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from types import NoneType
 from typing import TypeVar, get_args, get_type_hints
 
 from jcr.errors import InputError, did_you_mean
@@ -9,15 +10,16 @@ from jcr.errors import InputError, did_you_mean
 Options = TypeVar("Options")
 
 
-def checked_options(options: object, kind: type[Options]) -> Options:
+def checked_options(options: object, kind: type[Options], where: str = "", none: str = "") -> Options:
     """Return validated options of the class `kind`, from an object of it, a dict of its fields, or None (defaults).
 
-    Text is converted to paths, and lists to tuples. Raises InputError that names the field for invalid values.
+    In messages, `where` is the place of the options, and `none` states what None does there. Text is converted to paths,
+    and lists to tuples. Raises InputError that names the field for invalid values.
     """
     if options is None:
         return kind()
     if not isinstance(options, kind | Mapping):
-        raise InputError(f"{options!r:.80}: give jcr.{kind.__name__}(...), not {type(options).__name__}")
+        raise InputError(f"{where}{options!r:.80}: give jcr.{kind.__name__}(...) or a dict{none}")
     known = {field.name for field in fields(kind)}  # pyright: ignore[reportArgumentType]
     content, hints = dict(options if isinstance(options, Mapping) else vars(options)), get_type_hints(kind)
     for name, value in content.items():
@@ -27,7 +29,8 @@ def checked_options(options: object, kind: type[Options]) -> Options:
             )
         record = next(filter(is_dataclass, (hints[name], *get_args(hints[name]))), None)
         if isinstance(record, type) and value is not None:
-            content[name] = checked_options(value, record)
+            without = f", or None for no {name}" if NoneType in get_args(hints[name]) else ""
+            content[name] = checked_options(value, record, f"{kind.__name__}: {name}: ", without)
     from pydantic import TypeAdapter, ValidationError  # takes 0.5 s, which the help avoids
 
     try:

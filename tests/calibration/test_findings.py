@@ -67,6 +67,7 @@ def test_every_kind_has_words_of_one_line(kind: FindingKind):
     finding = example(kind)
     for words in (finding.text, sentence(finding)):
         assert words and "\n" not in words and "nan" not in words and not words.endswith(".")
+    assert repr(finding) == f"<Finding {kind.name}, warns: {finding.text}>"
     assert sentence(finding).startswith(finding.text) and sentence(finding).endswith(finding.remedy)
 
 

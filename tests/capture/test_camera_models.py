@@ -106,7 +106,8 @@ def test_a_capture_names_the_models_that_there_are():
     intrinsics = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
     entry = IntrinsicsEntry
     with pytest.raises(
-        jcr.InputError, match="model: Input should be 'pinhole', 'rational', 'thin_prism' or 'fisheye'"
+        jcr.InputError,
+        match="model: 'omni': Input should be 'pinhole', 'rational', 'thin_prism' or 'fisheye'",
     ):
         validated_content(entry, intrinsics | {"model": "omni"}, "capture.json")
     fisheye = validated_content(

@@ -50,6 +50,11 @@ def change_poses(folder: Path, change, rows=(1,)) -> None:
     edit(folder, changed)
 
 
+def test_a_folder_of_captures_is_refused(capture: Path):
+    with pytest.raises(jcr.InputError, match=f"holds captures, not images; did you mean {capture}"):
+        jcr.read_capture(capture.parent)
+
+
 def test_a_sound_capture_is_read_as_it_is(capture: Path):
     content = json.loads((capture / "capture.json").read_text())
     read = jcr.read_capture(capture)
@@ -118,11 +123,18 @@ def turn(file: Path, orientation: int = 6) -> None:
     Image.open(file).save(file, exif=exif)
 
 
+def misspell(content: dict) -> None:
+    frame = content["frames"][1]
+    frame["base_from_griper"] = frame.pop("base_from_gripper")
+
+
 truncate = second(lambda file: file.write_bytes(file.read_bytes()[:2000]))
 
 
 FAULTS = {
     "no capture.json": (lambda c: (c / "capture.json").unlink(), "no gripper poses for its 4 images"),
+    "text for a number": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx="608 px")),
+        "intrinsics.fx: '608 px': Input should be a valid number"),
     "not JSON": (lambda c: (c / "capture.json").write_text("{'frames': []"), "not JSON at line 1.*correct it there"),
     "deeply nested": (lambda c: (c / "capture.json").write_text("[" * 100_000), "nested too deeply"),
     "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),
@@ -166,6 +178,8 @@ FRAME_FAULTS = {
         r"01\.jpg: image of 320x240 pixels, images/00\.jpg of 640x480"),
     "same image": (lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
         r"01\.jpg: the same image as images/00\.jpg"),
+    "misspelt key": (lambda c: edit(c, misspell),
+        "base_from_gripper: is missing, but there is 'base_from_griper'; correct it there"),
     "pose missing": (lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
         r"frame 1 \(images/01\.jpg\): base_from_gripper: is missing"),
     "pose of NaN": (lambda c: change_poses(c, lambda pose: np.nan * pose), "frame 1 .*NaN"),
@@ -256,8 +270,8 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     [
         (None, r"frame 3 .*: no joint angles, others have 6; give them for all"),
         (JOINTS[3][:5], r"frame 3 .*: 5 joint angles, others have 6"),
-        ([float("nan")] * 6, r"frame 3 .*: joints.0: Input should be a finite number"),
-        ("0 1 2", r"frame 3 .*: joints: Input should be a valid list"),
+        ([float("nan")] * 6, r"frame 3 .*: joints.0: nan: Input should be a finite number"),
+        ("0 1 2", r"frame 3 .*: joints: .0 1 2.: Input should be a valid list"),
     ],
 )
 def test_a_frame_with_unusable_joints_is_left_out(capture: Path, row, words: str):

@@ -376,7 +376,10 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
 @pytest.mark.parametrize(
     ("camera", "message"),
     [
-        ({"mount": "table", "images": ["3.png"]}, "overhead.mount: Input should be 'gripper' or 'base'"),
+        (
+            {"mount": "table", "images": ["3.png"]},
+            "overhead.mount: 'table': Input should be 'gripper' or 'base'",
+        ),
         ({"mount": "base", "images": []}, "no images"),
         ({"mount": "base", "images": ["3.png", "7.png"]}, "take all with one camera"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),

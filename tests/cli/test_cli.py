@@ -22,7 +22,7 @@ from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.cli.map_query_export_view import PRINTED, read_points
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import scale_translation
+from jcr.geometry import scale_translation, transform
 from jcr.live.session import SessionOptions
 from jcr.pipeline import run
 from jcr.records import Requirement
@@ -253,6 +253,18 @@ def test_the_help_breaks_no_line_within_a_sentence(columns: int, monkeypatch: py
     # No word that begins a line would have had room in the line before it.
     for line, following in pairwise(text):
         assert len(f"{line.rstrip()} {following.split()[0]}") > columns, line
+
+
+def test_compared_calibrations_agree_or_differ(tmp_path: Path):
+    for name, x_m in (("a", 0.0), ("b", 0.0003), ("c", 0.17)):
+        pose = transform(np.eye(3), np.array([x_m, 0.05, 0.1]))
+        errors = {"std_mm": [0.5] * 3, "std_deg": [0.1] * 3}
+        content = {"gripper_from_camera": pose.tolist()} | errors
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    close, far = (run_jcr("compare", "a.json", f"{name}.json", cwd=tmp_path) for name in "bc")
+    assert close.returncode == 0 and close.stdout.startswith("AGREE: 0.300 mm")
+    assert far.returncode == 3 and far.stdout.startswith("DIFFER: 170.000 mm")
+    assert "of the same camera and gripper frame" in far.stdout
 
 
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):

@@ -10,10 +10,11 @@ from typing import Any
 from jcr.capture import folder as folders
 from jcr.capture import marker_samples
 from jcr.capture.checks import require_frames, require_motion
+from jcr.capture.discovery import IMAGE_SUFFIXES
 from jcr.capture.formats import bag, capture_json, lerobot
 from jcr.capture.notations import notation_of
 from jcr.capture.options import MIN_FRAMES, ReadOptions
-from jcr.errors import InputError
+from jcr.errors import InputError, first_few
 from jcr.geometry import inverse
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
@@ -103,12 +104,18 @@ def read_source(
 
 
 def format_of(path: Path) -> str:
-    """Return the name of the capture format at a path, such as "table"; raise InputError for a folder of bags."""
+    """Return the name of the capture format at a path, such as "table".
+
+    Raises InputError for a folder of bags, and for a folder of captures without images of its own.
+    """
     for name in ("capture", "bag", "lerobot", "samples"):
         if FORMATS[name].recognises(path):
             return name
     if path.is_dir() and any(bag.recognises(file) for file in path.iterdir()):
         raise InputError(f"{path}: holds bags; name one of them")
+    inside = sorted(str(file.parent) for file in path.glob(f"*/{capture_json.FILE}"))
+    if inside and not any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
+        raise InputError(f"{path}: holds captures, not images; did you mean {first_few(inside)}?")
     return "table"
 
 

@@ -257,11 +257,12 @@ class CompareCommand:
         if is_contradiction:
             explained = "; more than the reported errors explain"
             remedy = [
-                "look for an error that one of the two does not state; if there is none, something moved"
+                "check that both are transforms of the same camera and gripper frame",
+                "then look for an error that one of the two does not state; if there is none, the camera moved",
             ]
         if found.likely_cause is not None:
-            remedy = [f"compare first {found.likely_cause}", *(f"otherwise {one}" for one in remedy)]
-        verdict = "REJECTED" if is_contradiction or rejected else "ACCEPTED"
+            remedy = [f"compare first {found.likely_cause}", *remedy]
+        verdict = "DIFFER" if is_contradiction else "NOT DECIDED" if found.p_value is None else "AGREE"
         apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
         lines = [f"{verdict}: {apart}{explained}", *labelled("Remedy", *remedy)]
         lines += labelled("Difference", offset)
@@ -274,7 +275,7 @@ class CompareCommand:
             lines.append(f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}")
         lines += [line for path, why in rejected.items() for line in labelled("Rejected", f"{path}: {why}")]
         self.output.result(lines, facts)
-        return 3 if verdict == "REJECTED" else 0
+        return 3 if is_contradiction or rejected else 0
 
 
 @dataclass(frozen=True, kw_only=True)

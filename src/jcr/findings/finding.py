@@ -96,6 +96,10 @@ class Finding:
             raise TypeError(f"finding {kind.value!r} without {', '.join(sorted(missing))}")
         return made
 
+    def __repr__(self) -> str:
+        """Return kind, severity and text on one line."""
+        return f"<Finding {self.kind.name}, {self.severity}: {self.text}>"
+
     @property
     def text(self) -> str:
         """Message of the finding: the fault in one sentence."""
