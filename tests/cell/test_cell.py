@@ -383,7 +383,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
         ({"mount": "base", "images": []}, "no images"),
         ({"mount": "base", "images": ["3.png", "7.png"]}, "take all with one camera"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
-        ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
+        ({"mount": "gripper", "images": ["3.png"]}, "1 image for 3 frames"),
         (
             {"mount": "base", "images": ["3.png"], "intrinsics": INTRINSICS | {"width": 640}},
             "intrinsics of 640x",
