@@ -164,6 +164,8 @@ def test_rejected_images_are_reported_with_why(run: RunResult, page: str):
     text = Elements(page).text
     for k in (WRONG, UNREGISTERED):
         assert f"Left out: {images[k].reason}" in text
+    (row,) = re.findall(r'class="rejected"><th>.*?<span>(.*?)</span>', page)
+    assert f"its gripper pose is {row} and" in str(images[WRONG].reason), "one number in card and table"
 
 
 def test_text_from_files_stays_text(page: str):
@@ -352,6 +354,8 @@ def test_in_a_browser(chromium: Chromium, file: Path):
 @pytest.mark.long
 def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.open(file.as_uri(), 400, phone=True)
+    top = "document.querySelector('{}').getBoundingClientRect().top"
+    assert chromium.js(f"{top.format('.verdict')} < {top.format('header .soft')}")
     # The remedy may hold a word that is longer than the window.
     chromium.js("document.querySelector('#verdict p').append('charuco:'.repeat(30))")
     assert chromium.js("document.documentElement.scrollWidth") <= 400

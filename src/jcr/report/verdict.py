@@ -47,12 +47,13 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     if calibration.doubt is not None:
         reason = calibration.doubt
     elif short is not None:
-        reason = "; ".join(filter(None, (sentence(short), corner_in_words(calibration))))
+        reason = sentence(short)
     else:
         reason = "no check contradicts it" if required is None else reached_in_words(required)
         if corner_is_missed(calibration):
-            reason += "; " + (corner_in_words(calibration) or "the corners of the image do not reach this")
-    evidence = _leave_one_out(calibration)
+            reason += "; the corners of the image do not reach this"
+    corner = corner_in_words(calibration)
+    evidence = (f"{corner[0].upper()}{corner[1:]}. " if corner else "") + _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
         reason, evidence = (
             calibration.findings[0].text,
