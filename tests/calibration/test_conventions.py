@@ -90,7 +90,9 @@ def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
         untaken=untaken,
     )
     assert (
-        found.details["remedy"] == "give --pose-convention euler:ZYZ" and misfit(found.details["fits"]) < 1.0
+        found.details["remedy"] == "give --pose-convention euler:ZYZ"
+        and found.details["pose_convention"] == "euler:ZYZ"
+        and misfit(found.details["fits"]) < 1.0
     )
 
 

@@ -19,6 +19,7 @@ from in_process import run_jcr
 from jcr.calibration.record import Calibration, read_calibration
 from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
+from jcr.cli.check_verify_compare import CheckCommand, _command_of_remedy
 from jcr.cli.map_query_export_view import PRINTED, read_points
 from jcr.errors import InputError
 from jcr.findings import Finding, FindingKind
@@ -253,6 +254,16 @@ def test_the_help_breaks_no_line_within_a_sentence(columns: int, monkeypatch: py
     # No word that begins a line would have had room in the line before it.
     for line, following in pairwise(text):
         assert len(f"{line.rstrip()} {following.split()[0]}") > columns, line
+
+
+def test_a_rejected_check_prints_the_command_with_the_option_that_reads_the_poses():
+    details = {"reading": "angles", "remedy": "give it", "fits": "1 mm", "given": "9 mm"}
+    read = {"pose_convention": "euler:xyz", "pose_inverted": 1.0}
+    cause = Finding.of(FindingKind.POSE_CONVENTION, "rejects", "poses", value=0.0, **details, **read)
+    command: Any = CheckCommand(capture=Path("c"))
+    found: Any = SimpleNamespace(findings=(cause,))
+    expected = "jcr check c --pose-convention euler:xyz --pose-inverted"
+    assert _command_of_remedy(command, found) == expected
 
 
 def test_compared_calibrations_agree_or_differ(tmp_path: Path):

@@ -130,6 +130,8 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
             "Board",
             "none was looked for; if the gripper holds one: jcr calibrate … --board (jcr docs cameras)",
         )
+    if is_rejected and isinstance(capture, Capture) and capture.reading is not None:
+        closing = _command_of_remedy(command, found) or closing
     if not is_rejected:
         lines += [] if undecided else _motion_lines(found)
         run = [
@@ -147,6 +149,15 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         notes = notes[: MOST_LINES - len(lines) - len(acting) - 1]
     lines += [*acting, *notes]
     return [*lines, *labelled("Next", closing)]
+
+
+def _command_of_remedy(command: CheckCommand, found: "Examination") -> str:
+    """Return the command that checks a file with the options that its cause names; empty if it names none."""
+    cause = found.findings[0].details
+    changes: dict[str, Any] = {"pose_inverted": True} if "pose_inverted" in cause else {}
+    changes |= {name: cause[name] for name in cause.keys() & {"pose_convention"}}
+    options = read_arguments(replace(command.read, **changes))
+    return shlex.join(["jcr", "check", str(command.capture), *options]) if changes else ""
 
 
 def _motion_lines(found: "Examination") -> list[str]:

@@ -3,7 +3,7 @@
 A reading or an order that fits is reported, and never applied.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -39,8 +39,9 @@ millimetres, and a scale that is observed badly, move the camera by 7 to 23 mm i
 MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
 INVERSES = "their inverses (gripper_from_base was given)"
 AT_SOURCE = "correct them at their source"
-_Alternative = tuple[str, str, Poses, Int[ndarray, " k"]]
-"""Words, remedy, poses in the other reading or order, and the index of the camera pose of each."""
+_Alternative = tuple[str, str, Poses, Int[ndarray, " k"], Mapping[str, str | float]]
+"""Words, remedy, poses in the other reading or order, the index of the camera pose of each, and the fields of
+ReadOptions that read a file so."""
 
 
 def check_convention(case: Case) -> Case:
@@ -116,7 +117,7 @@ def better_reading(
     if not fits:
         return ()
     least = min(fit.mm for fit, _ in fits)
-    fit, (words, remedy, poses, _) = next(pair for pair in fits if pair[0].mm < 1.05 * least + 0.01)
+    fit, (words, remedy, poses, _, read) = next(pair for pair in fits if pair[0].mm < 1.05 * least + 0.01)
     if not fit.is_of_robot or fit.mm * BETTER >= given.mm:
         return ()
     texts = [
@@ -130,7 +131,7 @@ def better_reading(
     is_inverse = words == INVERSES or any(one.inverted and text_of(one) == words for one, _ in untaken)
     if found := of_camera(fit.x, is_inverse):
         return (found,)
-    details = {"reading": words, "remedy": remedy, "fits": texts[0], "given": texts[1]}
+    details = {"reading": words, "remedy": remedy, "fits": texts[0], "given": texts[1], **read}
     severity = "rejects" if observable else "warns"
     return (Finding.of(FindingKind.POSE_CONVENTION, severity, "poses", value=fit.metres, **details),)
 
@@ -144,17 +145,19 @@ def _alternatives(
     """Yield other readings and orders of all gripper poses `every`, usual mistakes first; other arguments as above."""
     own, each = every[rows], np.arange(len(rows))
     if not untaken:
-        yield (INVERSES, "add --pose-inverted", inverse(own), each)
+        yield (INVERSES, "add --pose-inverted", inverse(own), each, {"pose_inverted": 1.0})
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     flip = "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses"
-    yield (MIRRORED, flip, mirror @ own @ mirror, each)
+    yield (MIRRORED, flip, mirror @ own @ mirror, each, {})
     for reading, poses in untaken:
         known = np.flatnonzero(np.isfinite(poses[rows]).all((1, 2)))
-        yield (text_of(reading), f"give {options_of(reading)}", poses[rows][known], known)
+        options: dict[str, str | float] = {"pose_convention": reading.notation}
+        options |= {"pose_inverted": 1.0} if reading.inverted else {}
+        yield (text_of(reading), f"give {options_of(reading)}", poses[rows][known], known, options)
     for how, order in other_orders(names or [f"{k:04d}" for k in range(len(every))]):
         inside = order[rows] >= 0
         remedy = "add a column image with the images' names" if how in (AS_TEXT, AS_NUMBERS) else AT_SOURCE
-        yield (how, remedy, every[order[rows][inside]], each[inside])
+        yield (how, remedy, every[order[rows][inside]], each[inside], {})
     for taken, meant, in_degrees in () if untaken else _mistakes():
         numbers = written_in(own[:, :3, :3], taken)
         read = rotations_of(np.degrees(numbers) if in_degrees else numbers, meant)
@@ -164,7 +167,8 @@ def _alternatives(
         remedy = (
             AT_SOURCE if in_degrees else f"{AT_SOURCE}; from a file, --pose-convention {meant} reads them"
         )
-        yield (f"{in_words(meant)} {were}", remedy, transform(read, own[:, :3, 3]), each)
+        options = {} if in_degrees else {"pose_convention": meant}
+        yield (f"{in_words(meant)} {were}", remedy, transform(read, own[:, :3, 3]), each, options)
 
 
 def _mistakes() -> Iterator[tuple[str, str, bool]]:
