@@ -216,7 +216,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
     depth, colors = draw.uniform(0.5, 1.0, shape).astype(np.float32), np.zeros((*shape, 3), np.uint8)
     dense = pointmaps_of(depth, *layers, colors, cameras, capture.intrinsics)
-    write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense), "y")
+    write_depth(folder / "depth.npz", replace(reconstruction, pointmaps=dense))
     labels = {"label": np.ones(200, int), "label_names": ("none", "cup")}
     cloud = cloud_of(draw.random((200, 3)), camera_centers_in_base=inverse(cameras)[:, :3, 3], **labels)
     write_cloud(folder / "cloud.ply", cloud)

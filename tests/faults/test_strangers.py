@@ -633,7 +633,7 @@ def test_depth_of_a_run_folder_is_checked(tmp_path: Path):
     layers = [np.full(shape, 0.01, np.float16), np.ones(shape, np.float16), np.ones(shape, np.uint8)]
     colors = np.zeros((*shape, 3), np.uint8)
     dense = pointmaps_of(np.ones(shape, np.float32), *layers, colors, made.recon_from_camera, CAMERA)
-    write_depth(tmp_path / "depth.npz", replace(made, pointmaps=dense), "x")
+    write_depth(tmp_path / "depth.npz", replace(made, pointmaps=dense))
     with np.load(tmp_path / "depth.npz") as file:
         arrays = dict(file)
     for name, value in (("confidence", -1.0), ("relative_std", -1.0), ("depth", -1.0)):

@@ -150,7 +150,7 @@ def test_a_robot_without_joint_values_or_joints_is_refused(capture: Capture, gan
     assert configurations.shape == (12, len(robot.actuated_joint_names)) and configurations[:, 4:].max() == 0
     with pytest.raises(InputError, match="no joint values"):
         read_robot(gantry, replace(capture, joints=None))
-    with pytest.raises(InputError, match="moves 6 joints, but the capture has 7"):
+    with pytest.raises(InputError, match="moves 6 joints, the capture has 7 values"):
         read_robot(gantry, replace(capture, joints=np.zeros((12, 7))))
     with pytest.raises(InputError, match="cannot be read"):
         read_robot(tmp_path / "none.urdf", capture)
@@ -185,7 +185,7 @@ def test_command_serves_this_machine_alone_until_interrupted(done: Path, monkeyp
     assert printed.getvalue().count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_panel_is_closed_on_a_phone_and_open_on_a_desktop(viewer: "Viewer", tmp_path: Path):
     gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     chromium = Chromium(tmp_path, *gpu)
