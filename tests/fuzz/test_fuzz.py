@@ -386,7 +386,10 @@ def test_names_stay_themselves_on_pages_and_in_exports(names: list[str]):
         "".join(names).encode()
     except UnicodeEncodeError:
         return
-    cards = [{"number": k, "name": name, "fault": "", "kind": "used", "state": "new"} for k, name in enumerate(names, 1)]
+    cards = [
+        {"number": k, "name": name, "fault": "", "kind": "used", "state": "new"}
+        for k, name in enumerate(names, 1)
+    ]
     state = SimpleNamespace(is_over=True, names=names, images=names)
     content = {"state": state, "cards": cards, "has_report": False, "kind": "", "headline": "", "lines": []}
     html = render("images.html", content | {"tiles": []}, PACKAGE)
