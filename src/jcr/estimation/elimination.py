@@ -22,10 +22,9 @@ _solve_triangular, _invert, _invert_triangle = get_lapack_funcs(("trtrs", "potri
 def cholesky(matrix: Matrices) -> Matrices:
     """Return the lower Cholesky factors L (...,n,n) of positive semidefinite matrices (...,n,n): L Lᵀ = `matrix`.
 
-    The diagonal of a matrix that is singular up to rounding, as of degenerate motions, is increased slightly. Far from
-    a solution a matrix may be negative along a direction, which then counts as undetermined.
+    The diagonal of a matrix that is singular up to rounding, as of degenerate motions, is increased slightly.
     """
-    size = np.sqrt(np.maximum(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)), 1e-300))
+    size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     scaled = matrix / size[..., :, None]
     scaled /= size[..., None, :]
     each = np.arange(matrix.shape[-1])

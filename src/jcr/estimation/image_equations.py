@@ -134,7 +134,7 @@ def adjusted_images(problem: Problem, state: State, guide: RigInformation) -> St
     """Return the state after bundle adjustment with constant weights, those of the observations at the initial `state`.
 
     The arms' X, scale and Z stay. `guide` is information about the rigs in addition to that of the images and
-    `problem.known_rigs`.
+    `problem.known_rigs`. Raises LinAlgError if a step is not finite.
     """
     view = view_of(problem, state)
     weight, known = weights_of(problem, state, view), [*_known_rigs(problem), guide]
@@ -146,7 +146,11 @@ def adjusted_images(problem: Problem, state: State, guide: RigInformation) -> St
         scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
         # Along the similarity of the world the step is the smallest one.
         scaled = scale[:, None] * normal.hessian * scale + 1e-12 * np.eye(len(scale))
-        along = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            along = scale * over(cholesky(scaled), (scale * normal.right)[:, None])[:, 0]
+        # Far from a solution the equations may be negative along a direction.
+        if not np.isfinite(along).all():
+            raise np.linalg.LinAlgError("the equations of the images have no solution")
         points = normal.stepped(now[0].points_in_world, along)
         tried = replace(stepped(problem, now[0], None, along), points_in_world=points)
         return tried, view_of(problem, tried)
