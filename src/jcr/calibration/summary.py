@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
 from jcr.camera import unproject
-from jcr.errors import counted
+from jcr.errors import count_of
 from jcr.findings import (
     LENGTHS,
     Finding,
@@ -48,7 +48,7 @@ def verdict_in_words(findings: Iterable[Finding]) -> str:
     warnings = sum(one.severity == "warns" and one.kind not in told for one in findings)
     if verdict == "rejected" or not warnings:
         return verdict.upper()
-    return f"{verdict.upper()}, with {counted(warnings, 'warning')}"
+    return f"{verdict.upper()}, with {count_of(warnings, 'warning')}"
 
 
 def corner_is_missed(content: AnyCalibration) -> bool:
@@ -89,7 +89,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
         unmet = ", not met in the corners" if required.met and corner_is_missed(content) else ""
         limit = f" ({required.translation_mm:g} mm and {required.rotation_deg:g}° required{unmet})"
     backend = BACKEND_NAMES.get(content.backend, content.backend)
-    used = f"{content.images_used} of {counted(len(content.images), 'image')}"
+    used = f"{content.images_used} of {count_of(len(content.images), 'image')}"
     # The times of depth and map follow in log.txt; the first line is the same before and after these stages.
     seconds = sum(content.timings_s.get(stage, 0.0) for stage in ("reconstruct", "calibrate"))
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]

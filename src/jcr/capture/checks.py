@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.capture.images import read_image
 from jcr.capture.notations import FAR_FRAME, METRES_LIMIT
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES, tolerated
-from jcr.errors import InputError, counted, first_few, other_size
+from jcr.errors import InputError, count_of, first_few, other_size
 from jcr.files import capture_file
 from jcr.geometry import step_between
 from jcr.records import Capture
@@ -75,10 +75,12 @@ def checked_capture(
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
     """Raise InputError, begun with `where`, if `count` frames are fewer than `at_least` or more than 1000."""
     if count > MAX_FRAMES:
-        raise InputError(f"{where}: {counted(count, 'frame')}; choose {MAX_FRAMES} at most, 8 to 15 are good")
+        raise InputError(
+            f"{where}: {count_of(count, 'frame')}; choose {MAX_FRAMES} at most, 8 to 15 are good"
+        )
     if count < at_least:
         raise InputError(
-            f"{where}: {counted(count, 'frame')}; at least {at_least} are needed, 8 to 12 are good"
+            f"{where}: {count_of(count, 'frame')}; at least {at_least} are needed, 8 to 12 are good"
         )
 
 

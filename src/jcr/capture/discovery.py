@@ -12,7 +12,7 @@ from jcr.capture.documents import Table, read_record_tables, read_tables
 from jcr.capture.images import FORMATS
 from jcr.capture.pairing import NEARLY, Pairing, natural, pair, plain_name
 from jcr.capture.readings import pose_columns, words_of
-from jcr.errors import InputError, counted, first_few
+from jcr.errors import InputError, count_of, first_few
 from jcr.files import IMAGES, capture_file, path_inside
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -131,7 +131,7 @@ def find_images(folder: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     if odd and len(odd) < len(taken) / 2:
         names = first_few([str(file.relative_to(folder)) for file in odd])
         notes.append(
-            f"left out: {counted(len(odd), 'image')} of another size than {usual[0][0][0]}x{usual[0][0][1]}: {names}"
+            f"left out: {count_of(len(odd), 'image')} of another size than {usual[0][0][0]}x{usual[0][0][1]}: {names}"
         )
         taken = [file for file in taken if file not in odd]
     return tuple(sorted((str(file.relative_to(folder)) for file in taken), key=natural)), tuple(notes)
@@ -202,8 +202,8 @@ def _tables_of(
             if paired.is_paired or off <= max(2, len(images) // 4):
                 found.append((table, paired))
             elif pose_columns(table, paired.skipped):
-                poses, of = counted(len(table.rows), "pose"), f"({images[0]} … {images[-1]})"
-                what = f"{poses} for {counted(len(images), 'image')} {of}"
+                poses, of = count_of(len(table.rows), "pose"), f"({images[0]} … {images[-1]})"
+                what = f"{poses} for {count_of(len(images), 'image')} {of}"
                 remedy = "give one for each image, or add a column with the images' names"
                 others.append((table.file, InputError(f"{table.file}: {what}; {remedy}")))
 

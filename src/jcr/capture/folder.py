@@ -22,7 +22,7 @@ from jcr.capture.readings import (
     undecided,
     untaken_readings,
 )
-from jcr.errors import LONGEST_NAME, InputError, counted, first_few, printable, shown
+from jcr.errors import LONGEST_NAME, InputError, count_of, first_few, printable, shown
 from jcr.records import Capture, Reading
 
 POSE_WORDS = re.compile(r"pos|tcp|robot|ee|arm|hand|flange|matri|end|gripper", re.IGNORECASE)
@@ -154,12 +154,12 @@ def _pairing_notes(folder: Path, chosen: list[_Source], unlisted: list[str]) -> 
     if paired.row is not None and (alone := np.setdiff1d(np.arange(len(table.rows)), paired.row)).size:
         numbers = first_few([str(1 + r) for r in alone.tolist()])
         notes.append(
-            f"left out: {counted(len(alone), 'pose')} of {table.file.name} without an image in {folder}: "
+            f"left out: {count_of(len(alone), 'pose')} of {table.file.name} without an image in {folder}: "
             f"row {numbers} of its table, counted from 1 without a header"
         )
     if unlisted:
         notes.append(
-            f"left out: {counted(len(unlisted), 'image')} without a pose in {table.file.name}: {first_few(unlisted)}"
+            f"left out: {count_of(len(unlisted), 'image')} without a pose in {table.file.name}: {first_few(unlisted)}"
         )
     return notes
 
@@ -211,7 +211,7 @@ def _no_poses(folder: Path, found: Discovery, errors: list[tuple[Path, InputErro
     listed += _why_no_pose(tables[0]) if tables else ""
     images = found.images
     return InputError(
-        f"{folder}: no gripper poses for its {counted(len(images), 'image')} ({images[0]} … {images[-1]})"
+        f"{folder}: no gripper poses for its {count_of(len(images), 'image')} ({images[0]} … {images[-1]})"
         f"{f' in {listed}' if listed else ''}; add a file with a row for each image (image,x,y,z,qx,qy,qz,qw in m, or "
         "as the robot writes it), or name one with --poses"
     )
@@ -221,7 +221,7 @@ def count_differs(capture: Capture) -> InputError:
     """Return the error that a file has another number of poses than there are images; it is not raised."""
     rows = len(capture.candidates[0][1])
     return InputError(
-        f"{capture.source}: {counted(rows, 'pose')} for {counted(len(capture), 'image')} "
+        f"{capture.source}: {count_of(rows, 'pose')} for {count_of(len(capture), 'image')} "
         f"({capture.images[0]} … {capture.images[-1]}), and nothing says which belongs to which; "
         "add a column with the images' names, or remove what is too much"
     )

@@ -15,7 +15,7 @@ from jcr.capture.images import encode_png, read_image, sharpness
 from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.files import path_inside, write_bytes
 from jcr.progress import Progress
 from jcr.records import Capture, FrameNames, Intrinsics
@@ -93,7 +93,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     if faults:
         notes = (
             *notes,
-            f"left out: {counted(len(faults), 'image')} that cannot be read: {faults[min(faults)]}",
+            f"left out: {count_of(len(faults), 'image')} that cannot be read: {faults[min(faults)]}",
         )
     return replace(
         capture,

@@ -16,7 +16,7 @@ from numpy import ndarray
 from jcr.capture.documents import Table
 from jcr.capture.frame_choice import STILL
 from jcr.capture.pose_track import NEVER, interpolated_poses
-from jcr.errors import InputError, counted, shown
+from jcr.errors import InputError, count_of, shown
 from jcr.files import LONGEST
 from jcr.geometry import inverse, motion_length
 
@@ -92,7 +92,9 @@ def pair(table: Table, images: Sequence[str]) -> Pairing:
     if len(table.rows) == len(images):
         how = f"in order of the images' names: {images[0]} … {images[-1]}"
         return Pairing(how=how, row=np.arange(len(images)), skipped=skipped)
-    return Pairing(how=f"{counted(len(table.rows), 'row')}, {counted(len(images), 'image')}", skipped=skipped)
+    return Pairing(
+        how=f"{count_of(len(table.rows), 'row')}, {count_of(len(images), 'image')}", skipped=skipped
+    )
 
 
 def _texts(table: Table, k: int) -> list[str]:

@@ -13,7 +13,7 @@ from jcr.capture.documents.table import decode_text, read_limited
 from jcr.capture.notations import RADIANS_LIMIT
 from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import Stamps, bracket
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.estimation.kinematics import Arm, forward_kinematics
 from jcr.geometry import require_rigid
 
@@ -76,7 +76,7 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
     if len(chains) != 1:
         found = f"chains to {', '.join(chain[-1].child for chain in chains)}" if chains else "no chain"
         raise InputError(
-            f"{where}: {found} with {counted(dof, 'joint')}; give as many joints per frame as the arm has"
+            f"{where}: {found} with {count_of(dof, 'joint')}; give as many joints per frame as the arm has"
         )
     return _arm_of(chains[0], where)
 

@@ -12,7 +12,7 @@ import tyro
 
 from jcr.capture.intrinsics import read_intrinsics
 from jcr.cli.output import Output
-from jcr.errors import InputError, counted, printable
+from jcr.errors import InputError, count_of, printable
 from jcr.estimation.arms import CHOICES, RobotName
 from jcr.files import locked
 from jcr.live.cameras import open_camera
@@ -103,7 +103,7 @@ class CaptureCommand:
                 check = None if run is None else lambda: verify_run(run, out).as_json()
                 with LiveServer(session, self.page_port, token, self.poses == "http", check) as server:
                     _print(
-                        f"{counted(len(calibration.live.names), 'image')} in {out}; open {server.address} in a browser"
+                        f"{count_of(len(calibration.live.names), 'image')} in {out}; open {server.address} in a browser"
                     )
                     if states is None:
                         _print(f"waiting for POST http://{server.hosts[0]}/sample with the key {server.key}")
@@ -147,7 +147,7 @@ def _conclude(
     command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_sound else f"jcr check {out}"
     if images < LEAST_IMAGES:
         command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
-    lines += [*labelled("Capture", f"{counted(images, 'image')} in {out}"), *labelled("Next", command)]
+    lines += [*labelled("Capture", f"{count_of(images, 'image')} in {out}"), *labelled("Next", command)]
     arguments.output.result(lines, facts)
     if arguments.session.until_accurate:
         return 0 if verdict == "accepted" and requirement_met else 3

@@ -13,7 +13,7 @@ import tyro
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy, check_options
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.findings import sentence, warnings_of
 from jcr.findings.finding import joined
 from jcr.number_format import labelled, significant
@@ -97,11 +97,11 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     from jcr.capture.readings import decision_in_words
 
     capture = found.capture
-    about = f"{counted(len(capture), 'sample')} with the poses of gripper and camera, no images"
+    about = f"{count_of(len(capture), 'sample')} with the poses of gripper and camera, no images"
     if not isinstance(capture, PosePairs):
         size = "x".join(map(str, capture.image_size))
         intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
-        about = f"{counted(len(capture), 'image')} of {size}, intrinsics {intrinsics}"
+        about = f"{count_of(len(capture), 'image')} of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     undecided = isinstance(capture, Capture) and bool(capture.candidates)
     outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
@@ -177,7 +177,7 @@ def _motion_lines(found: "Examination") -> list[str]:
             "Expected",
             f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
             f"{significant(seen.rotation_95_deg)}° (95 %) at the image centre; jcr run states the corner, too",
-            f"from {counted(len(found.counted), 'image')}, with "
+            f"from {count_of(len(found.counted), 'image')}, with "
             f"{'usual errors' if fitted is None else 'the errors found in these images'}",
             f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
         )
@@ -434,7 +434,7 @@ def verification_lines(found: "Verification", verbose: bool) -> list[str]:
     moved = f"{numbers(mm, 2)} ± {numbers(mm_std, 2)} mm, {numbers(deg, 3)} ± {numbers(deg_std, 3)}°"
     verdict, warnings = "REJECTED" if found.moved else "ACCEPTED", len(found.notes)
     if warnings and not found.moved:
-        verdict += f" with {counted(warnings, 'warning')}"
+        verdict += f" with {count_of(warnings, 'warning')}"
     noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
     lines = [
         f"{verdict}: {found.finding}" + ("" if found.moves else f", {drift}"),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import RejectedError, counted
+from jcr.errors import RejectedError, count_of
 from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, rotation_log, transform
 
 Poses = Float[ndarray, "n 4 4"]
@@ -64,7 +64,7 @@ def solve(
     """
     if len(base_from_gripper) < LEAST_IMAGES:
         raise RejectedError(
-            f"{counted(len(base_from_gripper), 'image')} have a camera pose, the published solver needs {LEAST_IMAGES}",
+            f"{count_of(len(base_from_gripper), 'image')} have a camera pose, the published solver needs {LEAST_IMAGES}",
             "overlap the views more",
         )
     a, b = motions(base_from_gripper), motions(recon_from_camera)

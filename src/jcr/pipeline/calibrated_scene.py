@@ -20,7 +20,7 @@ from jcr.capture.folder import require_decided
 from jcr.capture.formats import bag
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.images import read_image
-from jcr.errors import InputError, RejectedError, counted
+from jcr.errors import InputError, RejectedError, count_of
 from jcr.geometry import apply, inverse, motion_length, require_rigid
 from jcr.pipeline.stages import fingerprint
 from jcr.pipeline.verify_history import NewCapture
@@ -78,7 +78,7 @@ class NewImages:
             or (angles is not None and len(angles) != len(pixels))
         ):
             raise InputError(
-                f"{counted(len(pixels), 'image')} with poses of shape {poses.shape}; give (n, 4, 4) for n images"
+                f"{count_of(len(pixels), 'image')} with poses of shape {poses.shape}; give (n, 4, 4) for n images"
             )
         for name, pose in zip(names, poses, strict=True):
             require_rigid(pose, f"base_from_gripper of {name}")
@@ -178,7 +178,7 @@ class OldScene:
             found = list(threads.map(lambda image: registrations(self.known, image, camera)[0], new.pixels))
         rows = [row for row, (one, _) in enumerate(found) if one is not None]
         lost = [
-            f"{image} shares {counted(count, 'point')} with the calibrated scene"
+            f"{image} shares {count_of(count, 'point')} with the calibrated scene"
             for image, (one, count) in zip(new.images, found, strict=True)
             if one is None
         ]

@@ -18,7 +18,7 @@ from jcr.calibration.required_accuracy import requirement_of
 from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
-from jcr.errors import RejectedError, counted
+from jcr.errors import RejectedError, count_of
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import (
     MIN_PREDICTED_IMAGES,
@@ -90,7 +90,7 @@ class Examination:
         seen = self.expected and self.expected.seen
         point = f", a point within {significant(seen.within_95_mm)} mm (95 %)" if seen else ""
         first = "".join(f"; {one.text}" for one in self.findings[:1])
-        return f"<Examination: {self.verdict}, {counted(len(self.capture), 'image')}{point}{first}>"
+        return f"<Examination: {self.verdict}, {count_of(len(self.capture), 'image')}{point}{first}>"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +123,7 @@ def check_capture(
     of reduced size are used first, and all images if the first result is rejected or leaves an image out, or if
     `thorough` is set. PosePairs have given camera poses, which are compared instead. `robot_noise` is the standard
     deviation per axis (m, rad). `require` is the required accuracy (mm, degrees); a finding states if the one that is
-    expected from the images misses it.
-    Raises InputError if gripper poses and joint angles contradict each other.
+    expected from the images misses it. Raises InputError if gripper poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture, progress=progress)

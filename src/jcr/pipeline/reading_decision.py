@@ -17,7 +17,7 @@ from jcr.capture.folder import count_differs
 from jcr.capture.options import tolerated
 from jcr.capture.pairing import FARTHEST, other_orders
 from jcr.capture.readings import text_of, undecided
-from jcr.errors import InputError, RejectedError, counted, first_few
+from jcr.errors import InputError, RejectedError, count_of, first_few
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_misfit import (
     MAX_NOISE,
@@ -139,7 +139,7 @@ def _taken(
     known = int(np.isfinite(best.poses[image_index]).all((1, 2)).sum())
     if known < FEWEST_TO_DECIDE:
         raise InputError(
-            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {counted(known, 'image')}: too few to decide, "
+            f"{undecided(where, [fit.reading for fit in fits[:6]])}; {count_of(known, 'image')}: too few to decide, "
             f"{FEWEST_TO_DECIDE} are needed"
         )
     observed = observability(best.poses[np.isfinite(best.poses).all((1, 2))], best.misfit.x)

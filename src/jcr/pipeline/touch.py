@@ -14,7 +14,7 @@ from jcr.camera import project, unproject
 from jcr.capture.documents import read_tables
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.distributions import chi2
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.geometry import Poses, apply, by_similarity, inverse, scale_translation
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunResult
@@ -188,6 +188,6 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
         numbers.append(own)
     if len(images) < LEAST_TOUCHES:
         raise InputError(
-            f"{path}: {counted(len(images), 'point')}; touch {LEAST_TOUCHES} or more, spread over the scene"
+            f"{path}: {count_of(len(images), 'point')}; touch {LEAST_TOUCHES} or more, spread over the scene"
         )
     return images, numbers

@@ -8,7 +8,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.camera import is_distorted, usable_intrinsics
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.geometry import apply, inverse, require_rigid
 from jcr.pointmaps.image_grid import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.pointmaps.pair_predictions import (
@@ -115,12 +115,12 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
     if not names:
         if count != len(capture):
             raise InputError(
-                f"{source}: {counted(count, 'image')}, the capture has {len(capture)}; add their names as array 'images'"
+                f"{source}: {count_of(count, 'image')}, the capture has {len(capture)}; add the names as array 'images'"
             )
         return np.arange(count)
     if len(names) != count or len(set(names)) != count:
         raise InputError(
-            f"{source}: 'images' has {counted(len(names), 'name')} for {counted(count, 'image')}; give one each"
+            f"{source}: 'images' has {count_of(len(names), 'name')} for {count_of(count, 'image')}; give one each"
         )
     unknown = [name for name in names if name not in capture.images]
     if unknown:

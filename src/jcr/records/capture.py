@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from pydantic import ConfigDict, Field, StringConstraints
 
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.records.field_checks import require_counts, require_fields, require_finite, require_rows
 from jcr.records.json_fields import Positive, Spread
 
@@ -244,7 +244,7 @@ class Capture:
     def __repr__(self) -> str:
         """Return the folder, the number and size of the images, and whether intrinsics are given."""
         size, given = "x".join(map(str, self.image_size)), "unknown" if self.intrinsics is None else "given"
-        return f"<Capture {self.source or self.folder}: {counted(len(self), 'image')} of {size}, intrinsics {given}>"
+        return f"<Capture {self.source or self.folder}: {count_of(len(self), 'image')} of {size}, intrinsics {given}>"
 
     def of_rows(self, rows: Sequence[int] | Int[ndarray, " k"]) -> "Capture":
         """Return the capture with the images at the indices `rows` only, in their order, without further cameras."""

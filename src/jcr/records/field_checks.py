@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from pydantic.fields import FieldInfo
 
-from jcr.errors import InputError, counted, first_fault
+from jcr.errors import InputError, count_of, first_fault
 
 
 def require_fields(record: Any) -> None:
@@ -57,7 +57,7 @@ def require_counts(kind: str, count: int, **parts: Any) -> None:
     for name, part in parts.items():
         if part is not None and len(part) != count:
             raise InputError(
-                f"{kind}: {counted(len(part), 'row')} of {name} for {counted(count, 'image')}; give one each"
+                f"{kind}: {count_of(len(part), 'row')} of {name} for {count_of(count, 'image')}; give one each"
             )
 
 

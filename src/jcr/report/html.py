@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from jcr.calibration.record import FailedCalibration, PublishedCalibration
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.readings import decision_in_words
-from jcr.errors import InputError, counted, printable
+from jcr.errors import InputError, count_of, printable
 from jcr.number_format import significant
 from jcr.records import Capture
 from jcr.report.details import StageOptions, cameras_section, details_section, objects_section
@@ -80,7 +80,7 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     # Files with a usual name, such as capture.json, do not name the capture; their folder does.
     named = source.parent if source.stem in UNNAMED else source
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    images = counted(len(calibration.images), "image")
+    images = count_of(len(calibration.images), "image")
     run = f"{images} · back end {calibration.backend} · {made} · jcr {calibration.version}"
     content = {
         "name": printable(named.resolve().name),

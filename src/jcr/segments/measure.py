@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from jcr.errors import counted
+from jcr.errors import count_of
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
 from jcr.segments.tabletop import FEWEST_POINTS, Support, fit_support
@@ -62,7 +62,7 @@ class Measurement:
         sizes = ((one.name, "x".join(f"{1e3 * m:.0f}" for m in one.box_size)) for one in self.objects)
         named = ", ".join(f"{name} {size} mm" for name, size in sizes)
         return (
-            f"<Measurement: {counted(len(self.objects), 'object')} on the support plane: {named or 'none'}>"
+            f"<Measurement: {count_of(len(self.objects), 'object')} on the support plane: {named or 'none'}>"
         )
 
 

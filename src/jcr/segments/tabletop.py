@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from jcr.depth.support_plane import robust_std, support_plane
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.geometry import apply, inverse, transform
 from jcr.records import PRIOR, PointCloud
 from jcr.segments.options import TabletopOptions
@@ -59,7 +59,7 @@ def fit_support(cloud: PointCloud) -> Support:
         filled[:] = False
     x, centers = cloud.points_in_base[~filled], cloud.camera_centers_in_base
     if len(x) < 100:
-        raise InputError(f"the cloud has {counted(len(x), 'point')}; a support plane needs some hundreds")
+        raise InputError(f"the cloud has {count_of(len(x), 'point')}; a support plane needs some hundreds")
     far = float(np.median(np.linalg.norm(x - centers[cloud.image[~filled]], axis=1)))
     if (plane := support_plane(x, centers, far, z_is_up=True)) is None:
         raise InputError(

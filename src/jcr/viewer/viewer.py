@@ -22,7 +22,7 @@ from viser.transforms import SO3
 from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
 from jcr.capture.urdf_chain import load_urdf
-from jcr.errors import InputError, counted
+from jcr.errors import InputError, count_of
 from jcr.geometry import scale_translation
 from jcr.progress import Progress, silent
 from jcr.records import Capture
@@ -112,7 +112,7 @@ def read_robot(urdf: Path, capture: Capture) -> "tuple[yourdfpy.URDF, Float[ndar
         )
     if len(moving) < joints.shape[1]:
         raise InputError(
-            f"{urdf}: moves {counted(len(moving), 'joint')}, the capture has {joints.shape[1]} values for each image; "
+            f"{urdf}: moves {count_of(len(moving), 'joint')}, the capture has {joints.shape[1]} values for each image; "
             "give the URDF of the whole arm"
         )
     try:

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from jcr.capture.checks import checked_capture, require_frames
 from jcr.capture.images import read_image, size_of_all
 from jcr.capture.options import ReadOptions
-from jcr.errors import InputError, counted, did_you_mean, shown
+from jcr.errors import InputError, count_of, did_you_mean, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import capture_file, path_inside, read_bytes, write_new
 from jcr.records import Capture, CellCamera
@@ -133,7 +133,7 @@ def stated_fields(
         known = ", ".join(ROBOT_NAMES)
         robot, notes = None, (f"robot {shown(robot)} is not one of {known}: its kinematics are not used",)
     if robot is not None and joints is not None and joints.shape[1] != (dof := arm_named(robot).dof):
-        text = f"frames have {counted(joints.shape[1], 'joint')}, but a {robot} has {dof}; correct either"
+        text = f"frames have {count_of(joints.shape[1], 'joint')}, but a {robot} has {dof}; correct either"
         raise InputError(f"{file}: {text}")
     depths = tuple(frame.depth for frame in frames)
     return _stated_intrinsics(content, size, str(file)) | {
@@ -186,7 +186,7 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
     elif entry.mount == "gripper" or watches:
         if len(listed) != len(used):
             raise InputError(
-                f"{where}: {counted(len(listed), 'image')} for {counted(len(used), 'frame')}; give one each, or null"
+                f"{where}: {count_of(len(listed), 'image')} for {count_of(len(used), 'frame')}; give one each, or null"
             )
         listed = [image for image, is_used in zip(listed, used, strict=True) if is_used]
         frame = np.flatnonzero([image is not None for image in listed])
@@ -225,7 +225,7 @@ def _stated_intrinsics(
     if intrinsics is None:
         raise InputError(f"{where}: there are no intrinsics whose errors these are; give both or none")
     if (missing := len(intrinsics.distortion) - len(std.distortion)) < 0:
-        raise InputError(f"{where}: distortion has at most {counted(len(intrinsics.distortion), 'number')}")
+        raise InputError(f"{where}: distortion has at most {count_of(len(intrinsics.distortion), 'number')}")
     values = [std.fx, std.fy, std.cx, std.cy, *std.distortion, *[None] * missing]
     return {"intrinsics": intrinsics, "intrinsics_std": np.array(values, np.float64)}
 

@@ -19,7 +19,7 @@ from jcr.capture.options import ReadOptions, chosen_name
 from jcr.capture.pose_track import interpolated_poses, speed
 from jcr.capture.readings import readings_of, undecided
 from jcr.capture.urdf_chain import RecordedArm, read_arm
-from jcr.errors import InputError, counted, shown
+from jcr.errors import InputError, count_of, shown
 from jcr.extras import extra
 from jcr.files import path_inside
 from jcr.progress import Progress
@@ -125,7 +125,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
     if len(options.episode) != 1:
         raise InputError(
-            f"{path}: {counted(len(options.episode), 'episode')}; read one, or several one by one with jcr batch"
+            f"{path}: {count_of(len(options.episode), 'episode')}; read one, or several one by one with jcr batch"
         )
     ((index, *_), _) = episodes_of(path, options)
     episode = read_episode(path, info, camera, key, index)
@@ -320,7 +320,7 @@ def _poses(
         names = ["x", "y", "z", "roll", "pitch", "yaw"]
     if len(names) > width:
         raise InputError(
-            f"{where}: {counted(len(names), 'name')} for {counted(width, 'number')}; correct {INFO}"
+            f"{where}: {count_of(len(names), 'name')} for {count_of(width, 'number')}; correct {INFO}"
         )
     if arm is not None:
         recorded = state[:, arm.columns(names, where)]
