@@ -164,3 +164,17 @@ def test_poses_that_are_moved_differently_are_no_step(faultless: tuple[Capture, 
         poses[row] = poses[row] @ transform(np.eye(3), draw.normal(0, 0.1, 3))
     found = calibrate_reconstruction(with_poses(capture, poses), made)
     assert not {FindingKind.SLIP, FindingKind.BASE_MOVED} & {one.kind for one in found.findings}
+
+
+def test_a_step_between_halves_of_four_images_is_named(faultless: tuple[Capture, Reconstruction]):
+    capture, made = faultless
+    nothing = made.tracks.only(np.zeros(len(made.tracks.image), bool))
+    few = replace(
+        made, image_index=np.arange(8), recon_from_camera=made.recon_from_camera[:8], tracks=nothing
+    )
+    poses = capture.base_from_gripper[:8].copy()
+    poses[4:] = poses[4:] @ TOOL
+    some = with_poses(capture.of_rows(np.arange(8)), poses)
+    found = calibrate_reconstruction(some, replace(few, pointmaps=None, evidence=None))
+    (step,) = [one for one in without_consequences(found.findings) if one.severity == "rejects"]
+    assert step.kind is FindingKind.SLIP and step.images == capture.images[3:5]

@@ -11,6 +11,7 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
 from jcr.capture.images import read_image
 from jcr.estimation.absolute_pose import CameraPose
+from jcr.estimation.observability import observability
 from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, Transform, inverse, motion_length, step_between
@@ -49,6 +50,8 @@ def _step_beyond_half(case: Case) -> list[Finding]:
     gripper, every = case.moving, np.arange(len(case.moving))
     size = max(MIN_IMAGES, (len(every) + 1) // 2)
     for half in (every[:size], every[-size:]):
+        if not observability(gripper[half]).observable:  # a fit would find any scale
+            continue
         fit = solve_hand_eye(gripper[half], case.recon_from_camera[half], camera_errors="none")
         if fit.converged and fit.inliers.all():
             found = left_out_poses(case.capture, case.reconstruction, fit, half)
