@@ -347,9 +347,8 @@ def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
     """
     given, made = _given_options(options), list[ReconstructOptions]()
     defaults = {field.name: field.default for field in fields(options) if field.name in given}
-    networks = set[
-        bool
-    ]()  # kinds of networks among the attempts: whether for all views or for pairs of views
+    # Kinds of networks among the attempts: whether for all views or for pairs of views.
+    networks = set[bool]()
     for name in candidates(options):
         row = BACKENDS[name]
         if row.hub_id and row.sees_all_views in networks:
