@@ -105,7 +105,8 @@ def api_page() -> str:
         "Every public name of `jcr`. Transforms are `a_from_b` (4×4), points `x_in_a`; metres and radians, or the unit "
         "in the name. Cameras are OpenCV's: x right, y down, z forward. A path may be text, an array a list, options a "
         'dict with the names of the fields: `jcr.run(capture, out, {"calibrate": {"require": (2, 0.3)}})`. What is '
-        "wrong in files, poses and options is an `InputError`; an argument of a wrong type may be a `TypeError`.\n",
+        "wrong in files, poses and options is an `InputError`; an argument of a wrong type may be a `TypeError`. A "
+        "message that names an option of the command line, such as `--pose-units`, means the field `pose_units` here.\n",
         f"A complete example, `examples/{EXAMPLE.name}`:\n\n```python\n{EXAMPLE.read_text('utf-8')}```\n",
     ]
     for name in jcr.__all__:

@@ -31,9 +31,9 @@ GROUP = "jcr.backends"
 MARKER = "marker"
 """Name of the back end that uses only the corners of a board."""
 NEEDED = {
-    "board": "the board with --board, such as chessboard:9x6:0.025",
-    "predictions": "the file with --predictions FILE.npz (jcr docs predictions)",
-    "cameras": "the COLMAP model with --cameras PATH",
+    "board": "board, such as chessboard:9x6:0.025",
+    "predictions": "predictions, the file FILE.npz (jcr docs predictions)",
+    "cameras": "cameras, the folder of the COLMAP model",
 }
 """Text of a message about a missing option, for each option that some back end requires."""
 
@@ -298,7 +298,7 @@ def ready_backend(options: ReconstructOptions, name: str) -> Backend:
         more = ", or choose another" if row.has_weights() else f"; then {weights_command(row)}"
         raise InputError(f"backend {name} needs {row.package}, which is not installed: {row.install}{more}")
     if row.needs and getattr(options, row.needs) is None:
-        raise InputError(f"backend {name}: name {NEEDED[row.needs]}")
+        raise InputError(f"backend {name}: give the option {NEEDED[row.needs]}")
     return row
 
 

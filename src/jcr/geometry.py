@@ -260,7 +260,7 @@ def require_rigid(matrix: Transform, where: str) -> Transform:
     """
     if not (np.abs(matrix) < HUGE).all():
         raise InputError(
-            f"{where}: holds NaN or infinity (or beyond {HUGE:.0e}); record that pose again or drop the frame"
+            f"{where}: holds NaN or infinity (or beyond {HUGE:.0e}); record that pose again or leave it out"
         )
     if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], atol=1e-9)

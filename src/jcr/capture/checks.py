@@ -76,12 +76,10 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
     """Raise InputError, begun with `where`, if `count` frames are fewer than `at_least` or more than 1000."""
     if count > MAX_FRAMES:
         raise InputError(
-            f"{where}: {count_of(count, 'frame')}; choose {MAX_FRAMES} at most, 8 to 15 are good"
+            f"{where}: {count_of(count, 'frame')}; choose {MAX_FRAMES} at most; 5 to 15 are usual"
         )
     if count < at_least:
-        raise InputError(
-            f"{where}: {count_of(count, 'frame')}; at least {at_least} are needed, 8 to 12 are good"
-        )
+        raise InputError(f"{where}: {count_of(count, 'frame')}; at least {at_least} are needed; take 5 to 15")
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:

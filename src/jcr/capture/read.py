@@ -69,7 +69,7 @@ def read_source(
     if not path.exists():
         raise InputError(f"{path}: no such capture; name a folder with a capture.json, or another format")
     if options.frames < MIN_FRAMES:
-        raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed, 8 to 15 are good")
+        raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed; take 5 to 15")
     if options.pose_convention != "auto":
         notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     name = format_of(path) if options.format == "auto" else options.format

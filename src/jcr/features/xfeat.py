@@ -54,7 +54,7 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
 
     Raises InputError if kornia or the weights are not installed.
     """
-    kornia = extra("kornia.feature", "match", "--features xfeat", ", or --features sift")
+    kornia = extra("kornia.feature", "match", "features xfeat", ", or take features sift")
     network, matcher = (
         kornia.XFeatModel(),
         kornia.LightGlue(
@@ -88,7 +88,7 @@ def read_weights(name: str) -> dict[str, Tensor]:
     folders = (spec.submodule_search_locations or ()) if spec else ()
     path = next((Path(folder) / "weights" / name for folder in folders), None)
     if path is None or not path.is_file():
-        raise InputError(f"weights {name} are not on this machine: {install('match')}, or --features sift")
+        raise InputError(f"weights {name} are not on this machine: {install('match')}, or take features sift")
     if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256[name]:
         raise InputError(
             f"{path}: not the published file (another SHA-256); install the package again: {install('match')}"

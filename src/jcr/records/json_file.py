@@ -55,4 +55,6 @@ def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where
     try:
         return validate(content)
     except ValidationError as error:
-        raise InputError(f"{where}: {first_fault(error)}; correct it there") from None
+        # The message of a check of the schema has its remedy already.
+        remedy = "" if error.errors()[0]["type"] == "value_error" else "; correct it there"
+        raise InputError(f"{where}: {first_fault(error)}{remedy}") from None

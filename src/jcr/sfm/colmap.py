@@ -319,7 +319,7 @@ def matcher_of(
         found = SiftFeatures(images, size, min(os.cpu_count() or 1, _SIFT_THREADS), report)
         give_back()
         return Matcher(found, camera, known, seed)
-    extra("torch", "match", f"--features {features}")
+    extra("torch", "match", f"features {features}")
     from jcr.features.xfeat import LearnedFeatures
 
     return Matcher(LearnedFeatures(images, size, report), camera, known, seed)
