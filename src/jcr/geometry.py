@@ -54,7 +54,14 @@ def rotation_log(rotation: Rotations) -> Vectors:
 
 def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"] | np.floating:
     """Return the angles (...) of rotations (...,3,3), 0 to π rad; accurate near 0 and π, unlike arccos of the trace."""
-    return np.linalg.norm(rotation_log(rotation), axis=-1)
+    cosine = (np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2
+    return np.arctan2(np.linalg.norm(sine_axis(rotation), axis=-1), cosine)
+
+
+def sine_axis(rotation: Rotations) -> Vectors:
+    """Return the rotation axis times the sine of the angle (...,3), which is smooth at angles 0 and π."""
+    antisymmetric = (rotation - np.swapaxes(rotation, -1, -2)) / 2
+    return np.stack([antisymmetric[..., 2, 1], antisymmetric[..., 0, 2], antisymmetric[..., 1, 0]], axis=-1)
 
 
 def skew(v: Vectors) -> Rotations:

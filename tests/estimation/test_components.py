@@ -160,3 +160,19 @@ def test_problem_and_state_of_a_robust_fit_are_in_the_given_frame(camera_std: fl
     assert np.allclose(fit.covariance / np.outer(std, std), again.covariance / np.outer(std, std), atol=1e-3)
     errors, own = again.leave_one_out[0], fit.leave_one_out[0]
     assert np.allclose(errors, own, atol=1e-6)
+
+
+def test_motions_that_determine_nothing_leave_a_covariance_and_a_reason():
+    """Poses that only translate, up to noise: the part that X and Z absorb was lost in rounding (-1 % eigenvalues)."""
+    rng = np.random.default_rng(7)
+    for count in (3, 4, 5):
+        offset = transform(rotation_exp(np.array([0.3, -1.0, 0.5])), np.array([0.03, 0.02, 0.1]))
+        gripper = transform(np.eye(3), 0.2 * rng.normal(size=(count, 3)))
+        camera = gripper @ offset @ transform(rotation_exp(1e-6 * rng.normal(size=(count, 3))), np.zeros(3))
+        problem, state = pose_problem(gripper, camera, (offset, 1.0, np.eye(4)))
+        values = np.linalg.eigvalsh(pose_equations(problem, state, None).equations.systematic)
+        assert values.min() > -1e-9 * values.max()
+        turned = gripper @ transform(rotation_exp(rng.uniform(-1, 1, (count, 1)) * [0, 0, 1]), np.zeros(3))
+        for poses_of, scale in ((gripper, None), (gripper, 1.0), (turned, 1.0), (gripper[[0] * count], None)):
+            found = jcr.solve_hand_eye(poses_of, poses_of @ offset, scale=scale)
+            assert found.verdict == "rejected" and "unobservable" in str(found.doubt)

@@ -257,17 +257,19 @@ def leave_one_out(
     return LeaveOneOut(1e3 * float(metres), float(np.degrees(radians)), reprojection_px, how)
 
 
-def _systematic(gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None) -> Float[ndarray, "r r"]:
-    """Return the covariance (6n,6n) of the systematic errors of n gripper poses for errors of 1 rad.
+def _systematic(
+    gripper: Poses, robot: str | Arm | None, joints: ArrayLike | None
+) -> Float[ndarray, "r r"] | None:
+    """Return the covariance (6n,6n) of the systematic errors of n gripper poses for joint errors of 1 rad.
 
-    Each pose has six rows: translation (m), rotation vector (rad), base axes. The errors are those of the joint angles
-    or, if `robot` is None, of the gripper's rotation. `joints` (n,dof) are in rad; None: they are computed from the
-    poses. Raises InputError if the poses do not fit the arm and its joint angles.
+    Each pose has six rows: translation (m), rotation vector (rad), base axes. None without a `robot`: the errors vary
+    smoothly over the poses. `joints` (n,dof) are in rad; None: they are computed from the poses. Raises InputError if
+    the poses do not fit the arm and its joint angles.
     """
     if robot is None:
         if joints is not None:
             raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
-        return errors_of(gripper).systematic
+        return None
     arm = arm_named(robot) if isinstance(robot, str) else robot
     angles = None if joints is None else _numbers(joints, "joints", "(n,dof) in rad")
     if angles is not None and angles.shape != (wanted := (len(gripper), arm.dof)):

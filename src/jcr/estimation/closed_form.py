@@ -17,6 +17,7 @@ from jcr.geometry import (
     nearest_rotation,
     rotation_exp,
     scale_translation,
+    sine_axis,
     transform,
 )
 
@@ -144,12 +145,6 @@ def initial_estimate(
 def motions(a_from_b: Poses) -> Float[ndarray, "... n n 4 4"]:
     """Return all relative motions of n poses: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j], that is bᵢ_from_bⱼ."""
     return inverse(a_from_b)[..., :, None, :, :] @ a_from_b[..., None, :, :, :]
-
-
-def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
-    """Return the rotation axis times the sine of the angle (...,3), which is smooth at angles 0 and π."""
-    antisymmetric = (rotation - np.swapaxes(rotation, -1, -2)) / 2
-    return np.stack([antisymmetric[..., 2, 1], antisymmetric[..., 0, 2], antisymmetric[..., 1, 0]], axis=-1)
 
 
 def rotations(

@@ -75,9 +75,12 @@ def posterior(
         # E[e eᵀ] of each pose's systematic error e, given the residuals of all poses, minus its prior value.
         mean = (part @ solution.weighed_left[..., None]).reshape(*part.shape[:-2], -1, 6)
         learned = mean[..., :, None] * mean[..., None, :]
-        for sign, whitened in zip((-1, 1), _whitened_and_fitted(solution, part), strict=True):
-            columns = np.moveaxis(whitened.reshape(*whitened.shape[:-1], -1, 6), -2, -3)
-            learned = learned + sign * np.swapaxes(columns, -1, -2) @ columns
+        for first in range(0, poses, MOST_FOR_SIZES):  # which bounds the memory
+            some = slice(first, first + MOST_FOR_SIZES)
+            columns = part[..., 6 * some.start : 6 * some.stop]
+            for sign, whitened in zip((-1, 1), _whitened_and_fitted(solution, columns), strict=True):
+                each_pose = np.moveaxis(whitened.reshape(*whitened.shape[:-1], -1, 6), -2, -3)
+                learned[..., some, :, :] += sign * np.swapaxes(each_pose, -1, -2) @ each_pose
         return region.spread(second_moment + poses / (poses + PRIOR_POSES) * learned)
 
     spread = elsewhere(at_mode, mode)

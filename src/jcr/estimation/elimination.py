@@ -16,7 +16,9 @@ Matrices = Float[ndarray, "*k n n"]
 Columns = Float[ndarray, "*#k n r"]
 JITTER = (0.0, 1e-14, 1e-12, 1e-10)
 """Values tried in turn on the diagonal of a correlation matrix whose smallest eigenvalue is lost in rounding."""
-_solve_triangular, _invert, _invert_triangle = get_lapack_funcs(("trtrs", "potri", "trtri"), dtype=np.float64)
+_factor, _solve_triangular, _invert, _invert_triangle = get_lapack_funcs(
+    ("potrf", "trtrs", "potri", "trtri"), dtype=np.float64
+)
 
 
 def cholesky(matrix: Matrices) -> Matrices:
@@ -24,19 +26,19 @@ def cholesky(matrix: Matrices) -> Matrices:
 
     The diagonal of a matrix that is singular up to rounding, as of degenerate motions, is increased slightly.
     """
-    size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
-    scaled = matrix / size[..., :, None]
-    scaled /= size[..., None, :]
-    each = np.arange(matrix.shape[-1])
-    for rounding in JITTER:
-        scaled[..., each, each] += rounding
-        try:
-            root = np.linalg.cholesky(scaled)
-            root *= size[..., None]
-            return root
-        except np.linalg.LinAlgError:
-            if matrix.ndim > 2:
-                return np.array([cholesky(each) for each in matrix])
+    if matrix.ndim > 2:
+        return np.array([cholesky(each) for each in matrix])
+    size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
+    scaled = np.empty_like(matrix)
+    for rounding in np.cumsum(JITTER):
+        np.divide(matrix, size[:, None], out=scaled)
+        scaled /= size
+        scaled[np.diag_indices(len(scaled))] += rounding
+        # A row-major L is a column-major Lᵀ; the factor takes the place of `scaled`.
+        root, failed = _factor(scaled.T, lower=0, overwrite_a=1)
+        if not failed:
+            return np.multiply(root.T, size[:, None], out=scaled)
+    np.divide(matrix, np.outer(size, size), out=scaled)
     values, vectors = np.linalg.eigh(scaled)
     r = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, JITTER[-1]))).T, mode="r"))
     return size[:, None] * (r.T * np.sign(np.diag(r)))

@@ -387,7 +387,7 @@ def joint_offsets(poses: PoseEquations, arm: Arm, joints: Joints) -> JointOffset
     solution = solve_equations(poses.equations, sizes)
     size = float(np.sqrt(poses.equations.variances(sizes)[2]))
     columns = error_jacobian(arm, joints)[:, :, : arm.dof].reshape(-1, arm.dof)
-    columns = columns - poses.region.by_unknown @ (poses.region.fit @ columns)
+    columns = columns - poses.region.basis @ (poses.region.coordinates @ columns)
     offset = size**2 * columns.T @ solution.weighed_left
     known = np.diag(columns.T @ solution.projection @ columns)
     return JointOffsets(offset, size * np.sqrt(np.maximum(1 - size**2 * known, 0.0)), size)

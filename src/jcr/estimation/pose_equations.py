@@ -7,7 +7,7 @@ the workspace of the capture; 1 mm and 2 mrad weigh the same. It absorbs part of
 leaves e' = (I − J A) e, A = (JᵀWJ)⁻¹JᵀW.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -56,8 +56,14 @@ class Region:
     robot errors; the scale is not fitted.
     """
 
-    by_unknown: Float[ndarray, "s u"]
-    """J: derivative of the residuals (m, then rad, pose by pose) by the u unknowns X and Z, 12 for each arm."""
+    basis: Float[ndarray, "s r"]
+    """B: residuals (m, then rad, pose by pose) of the r independent changes of X and Z, orthonormal when weighted."""
+    coordinates: Float[ndarray, "r s"]
+    """C: those r coordinates of the fit to an error of the poses, so that J A = B C; zero for unused poses.
+
+    J is the derivative of the residuals by the u unknowns X and Z, 12 for each arm. Motions that hardly determine an
+    unknown give a large A, whose rounding errors the products B C do not have.
+    """
     fit: Float[ndarray, "u s"]
     """A = (JᵀWJ)⁻¹JᵀW: change of X and Z per error of the poses, W being EFFECTIVE_WEIGHT²; zero for unused poses."""
     unknowns: int
@@ -66,13 +72,12 @@ class Region:
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Return the covariance of (I − J A) e, the part of a systematic error e that X and Z do not absorb.
 
-        `systematic` (s,s) is the covariance of e; A e is the change of X and Z by the error (`fit`), J the derivative
-        `by_unknown`.
+        `systematic` (s,s) is the covariance of e; J A e is the change of the residuals by the change A e of X and Z.
         """
         # (I − J A) S (I − J A)ᵀ = S − J M − (J M)ᵀ, without a product of two matrices of the residuals' size.
-        shift = self.fit @ systematic
-        shift -= (shift @ self.fit.T / 2) @ self.by_unknown.T
-        left = np.hstack([self.by_unknown, shift.T]) @ np.vstack([shift, self.by_unknown.T])
+        shift = self.coordinates @ systematic
+        shift -= (shift @ self.coordinates.T / 2) @ self.basis.T
+        left = np.hstack([self.basis, shift.T]) @ np.vstack([shift, self.basis.T])
         return np.subtract(systematic, left, out=left)
 
     def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
@@ -82,10 +87,10 @@ class Region:
         E[e'e'ᵀ] (m,6,6) of the error e' of each pose that X and Z do not absorb (m, then rad). It is corrected for each
         pose's leverage (MacKinnon and White, J. Econometrics 29, 1985, "HC3").
         """
-        m, u = second_moment.shape[-3], self.by_unknown.shape[1]
-        own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
+        m, (r, u) = second_moment.shape[-3], (len(self.coordinates), len(self.fit))
+        own, coordinates = (one.reshape(-1, m, 6).swapaxes(0, 1) for one in (self.fit, self.coordinates))
         # The derivative of X and Z by each pose's residual is divided by one minus the pose's leverage.
-        leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, u) @ own) / EFFECTIVE_WEIGHT
+        leverage = EFFECTIVE_WEIGHT[:, None] * (self.basis.reshape(m, 6, r) @ coordinates) / EFFECTIVE_WEIGHT
         values, vectors = np.linalg.eigh((leverage + leverage.swapaxes(1, 2)) / 2)
         vectors = vectors / EFFECTIVE_WEIGHT[:, None]
         own = own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))
@@ -301,13 +306,17 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         shared = pose_by_pose(by_rig, pose_by_pose(by_rig, covariance).T)
         shared = (shared + shared.T) / 2
     by_unknown = np.delete(by_arms.reshape(6 * n, arms), SCALE, axis=1)
-    root, fit = np.tile(EFFECTIVE_WEIGHT, len(rows) // 6), np.zeros((by_unknown.shape[1], 6 * n))
+    root, u = np.tile(EFFECTIVE_WEIGHT, len(rows) // 6), by_unknown.shape[1]
     # A known coordinate of the camera determines the effective transform along a direction that the motions do not.
     known = [np.delete(one.row[:arms], SCALE) / one.std for one in problem.priors]
-    weighted = np.concatenate([root[:, None] * by_unknown[rows], np.reshape(known, (-1, fit.shape[0]))])
-    fit[:, rows] = np.linalg.pinv(weighted, rcond=1e-9)[:, : len(rows)] * root
-    everywhere = Region(by_unknown, fit, problem.unknowns)
-    region = replace(everywhere, by_unknown=by_unknown[rows], fit=fit[:, rows])
+    weighted = np.concatenate([root[:, None] * by_unknown[rows], np.reshape(known, (-1, u))])
+    left, size, right = np.linalg.svd(weighted, full_matrices=False)
+    kept = size > 1e-9 * size.max()
+    to_unknown, coordinates = right[kept].T / size[kept], left[: len(rows), kept].T * root
+    basis, everywhere = by_unknown @ to_unknown, np.zeros((len(to_unknown.T), 6 * n))
+    basis[rows], everywhere[:, rows] = left[: len(rows), kept] / root[:, None], coordinates
+    region = Region(basis[rows], coordinates, to_unknown @ coordinates, problem.unknowns)
+    every_region = Region(basis, everywhere, to_unknown @ everywhere, problem.unknowns)
     systematic, *others = (arm.error_covariance for arm in problem.arms)
     systematic = np.asarray(block_diag(systematic, *others)) if others else systematic
     bent = problem.bent
@@ -317,9 +326,9 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         prior_information=information,
         prior_gradient=gradient,
         known=shared,
-        systematic=everywhere.left(systematic),
+        systematic=every_region.left(systematic),
         given=problem.robot_noise_floor,
-        confirmed=everywhere.left(bent @ bent.T) if bent.size else None,
+        confirmed=every_region.left(bent @ bent.T) if bent.size else None,
         arm=np.repeat(np.arange(len(problem.arms)), [len(one.rigs) for one in problem.arms])
         if len(problem.arms) > 1
         else None,

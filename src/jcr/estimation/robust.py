@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.estimation.closed_form import closed_form, initial_estimate, motions, sine_axis
+from jcr.estimation.closed_form import closed_form, initial_estimate
 from jcr.estimation.problem import PoseModel, State, pose_problem
 from jcr.estimation.robot_noise import MOST_FOR_SIZES
-from jcr.estimation.solve import Solution, solve
-from jcr.geometry import ARM, Poses, Transform, inverse, rotation_angle
+from jcr.estimation.solve import Solution, solve, with_covariance
+from jcr.geometry import ARM, Poses, Rotations, Transform, inverse, sine_axis
 
 Images = Bool[ndarray, " n"]
 """Mask of the used images."""
@@ -62,50 +62,51 @@ def robust_fit(
     """Solve for hand-eye transform, scale and base_from_recon with the images that agree with each other.
 
     The mask `problem.used` of the solution has these images; fewer than five are all used. The search compares the log
-    evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images unless
-    they are more than MOST_FOR_SIZES. `model` is that of `pose_problem`.
+    evidence of masks. It starts from the mask `agreeing` (None: that of `least_trimmed`), and from all images. Of more
+    images than MOST_FOR_SIZES it starts only from as many agreeing ones, evenly spaced. `model` is that of
+    `pose_problem`.
     """
     n, fits, model = len(base_from_gripper), dict[bytes, _Trial](), model or PoseModel()
     moving, unknown = model.moving(base_from_gripper), (np.eye(4), 1.0, np.eye(4))
     every, state = pose_problem(base_from_gripper, recon_from_camera, unknown, model)
 
-    def fitted(used: Images) -> _Trial:
+    def fitted(used: Images, near: State | None = None) -> _Trial:
         """Return the fit with the used images, without averaging over error sizes.
 
-        With more than MOST_FOR_SIZES images it starts from the solution with as many of them, evenly spaced, because a
-        step takes the cube of their number.
+        With more than MOST_FOR_SIZES images it starts from the state `near`, because a step takes the cube of their
+        number.
         """
         if used.tobytes() not in fits:
-            x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
-            start = {"x": x[None], "scale": scale, "z": z[None]}
-            if (rows := np.flatnonzero(used)).size > MOST_FOR_SIZES:
-                few = rows[np.linspace(0, len(rows) - 1, MOST_FOR_SIZES).astype(int)]
-                first = x, scale, z
-                some = pose_problem(base_from_gripper[few], recon_from_camera[few], first, model.of(few))
-                near = solve(*some, averaged=False).most_likely
-                start = {name: getattr(near, name) for name in (*start, "robot_log_sizes")}
-            fits[used.tobytes()] = _trial(
-                solve(replace(every, used=used), replace(state, **start), averaged=False), used
-            )
+            start = near
+            if start is None or used.sum() <= MOST_FOR_SIZES:
+                x, scale, z = initial_estimate(moving[used], recon_from_camera[used])
+                start = replace(state, x=x[None], scale=scale, z=z[None])
+            fits[used.tobytes()] = _trial(solve(replace(every, used=used), start, averaged=False), used)
         return fits[used.tobytes()]
 
     best = fitted(np.ones(n, dtype=bool)) if n <= MOST_FOR_SIZES else None
     if n >= 5:
         if agreeing is None:
             agreeing = least_trimmed(moving, recon_from_camera)[0]
+        if best is None:
+            rows = np.flatnonzero(agreeing)
+            few = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_FOR_SIZES)).astype(int)]
+            agreeing = np.isin(np.arange(n), few)
         more = _improved(fitted, fitted(agreeing), adding=True)
         fewer = more if best is None else _improved(fitted, best, adding=False)
         best = fewer if fewer.evidence >= more.evidence else more
     assert best is not None
-    return solve(replace(every, used=best.used), best.state)
+    problem = replace(every, used=best.used)
+    # Of many images the state is settled, and each further step takes the cube of their number.
+    return solve(problem, best.state) if n <= MOST_FOR_SIZES else with_covariance(problem, best.state, None)
 
 
-def _improved(fitted: Callable[[Images], _Trial], best: _Trial, adding: bool) -> _Trial:
+def _improved(fitted: Callable[[Images, State], _Trial], best: _Trial, adding: bool) -> _Trial:
     """Return the fit with the largest log evidence, by a greedy search from the fit `best`.
 
-    `fitted` returns the fit for a mask. `adding`: each step adds all images whose pose is more likely right than wrong,
-    or else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error, down to four
-    images.
+    `fitted` returns the fit for a mask, near a state. `adding`: each step adds all images whose pose is more likely
+    right than wrong, or else the likeliest one; not `adding`: it removes the image of the largest leave-one-out error,
+    down to four images.
     """
     while True:
         used = best.used
@@ -116,7 +117,9 @@ def _improved(fitted: Callable[[Images], _Trial], best: _Trial, adding: bool) ->
         else:
             worst = np.arange(len(used)) == np.where(used, best.distance, -np.inf).argmax()
             changes = [used & ~worst] if used.sum() > 4 else []
-        better = (tried for changed in changes if (tried := fitted(changed)).evidence > best.evidence)
+        better = (
+            tried for changed in changes if (tried := fitted(changed, best.state)).evidence > best.evidence
+        )
         if (found := next(better, None)) is None:
             return best
         best = found
@@ -154,7 +157,7 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
     """
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
-    triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
+    triples = _congruent_triples(base_from_gripper[:, :3, :3], recon_from_camera[:, :3, :3])
     x, scale, z = closed_form(base_from_gripper[triples], recon_from_camera[triples], rounds=0)
     error = np.full((len(triples), n), np.inf)
     for k in np.flatnonzero(scale > 0):
@@ -199,14 +202,16 @@ def _squared_error(
     return (gap[..., 3] ** 2).sum(1) + ARM**2 * (gap[..., :3] ** 2).sum((1, 2)) / 2
 
 
-def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
-    """Return h triples of images whose motions `a` (gripper) and `b` (camera) have the most similar angles, best first.
+def _congruent_triples(gripper: Rotations, camera: Rotations) -> Int[ndarray, "h 3"]:
+    """Return h triples of images between which gripper and camera turn by the most similar angles, best first.
 
-    `a` and `b` hold the relative motion of every pair (i, j) of images, as `closed_form.motions`. Rows of the result
-    are image numbers.
+    `gripper` and `camera` (n,3,3) are the rotations of the poses. Rows of the result are image numbers.
     """
-    n = len(a)
-    gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
+    n = len(gripper)
+    # The trace of RᵢᵀRⱼ for all pairs; its arccos is wrong by 1e-8 rad near 0, far below `typical`.
+    traces = (flat @ flat.T for flat in (gripper.reshape(n, 9), camera.reshape(n, 9)))
+    of_gripper, of_camera = (np.arccos(np.clip((trace - 1) / 2, -1, 1)) for trace in traces)
+    gap = np.abs(of_gripper - of_camera)
     if n * (n - 1) * (n - 2) > 6 * MOST_TRIPLES:
         drawn = np.sort(np.random.default_rng(0).integers(n, size=(MOST_TRIPLES, 3)), axis=1)
         i, j, k = drawn[(np.diff(drawn, axis=1) > 0).all(1)].T
@@ -215,8 +220,8 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
         i, j, k = np.nonzero((row[:, None, None] < row[:, None]) & (row[:, None] < row))
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
     # Motions about one axis do not determine X, so triples with two different axes are preferred.
-    axes = sine_axis(a[..., :3, :3])
-    spread = np.linalg.norm(np.cross(axes[i, j], axes[i, k]), axis=1)
+    back = np.swapaxes(gripper[i], 1, 2)
+    spread = np.linalg.norm(np.cross(sine_axis(back @ gripper[j]), sine_axis(back @ gripper[k])), axis=1)
     # The 0.3 quantile comes from pairs of correct images even if 30 % of the images are wrong.
     typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
     order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]

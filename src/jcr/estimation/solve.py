@@ -84,7 +84,7 @@ STEP_SETTLED = 0.01
 """Largest step of an arm's unknown, in standard deviations, at which the rounds end."""
 ROUNDING = 1e-9
 """Relative increase of a cost that is accepted as rounding."""
-ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-6
+ARMS_SETTLED, NEARLY_SETTLED = 1e-14, 1e-5
 """Squared step of the arms' unknowns (in σ²) at which their iteration ends: for a result, for a comparison of fits."""
 TINY_STEP = 1e-6
 """Step of numerical derivatives by the arms' unknowns (m, rad, log scale)."""
@@ -161,14 +161,16 @@ class Solution:
         if used.all():
             return found, covariance
         # The used poses predict the systematic error of an unused one (best linear unbiased prediction).
-        alike = every.systematic_part(self.log_sizes) + (0.0 if every.known is None else every.known)
-        rows = np.repeat(used, 6)
+        variance, rows = every.variances(self.log_sizes)[2], np.repeat(used, 6)
         for i in np.flatnonzero(~used):
             mine = slice(6 * i, 6 * i + 6)
-            gain = over(solution.root, alike[rows, mine]).T
+            alike = variance * every.systematic[:, mine] + (
+                0.0 if every.known is None else every.known[:, mine]
+            )
+            gain = over(solution.root, alike[rows]).T
             by = every.jacobian[mine] - gain @ self.equations.jacobian
             found[i] -= gain @ self.equations.residual
-            own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(random[mine])
+            own = alike[mine] - gain @ alike[rows] + np.diag(random[mine])
             covariance[i] = own + by @ solution.covariance @ by.T
         return found, covariance
 
@@ -221,14 +223,16 @@ def solve(
     else use their most likely values, which is faster and understates the uncertainty. `start_noise` are these assumed
     random errors of the poses (m, rad), unless the problem has a lower bound.
     """
+    least = ARMS_SETTLED if averaged else NEARLY_SETTLED
     if problem.observations is None:
-        return with_covariance(problem, start, None, averaged)
+        return with_covariance(problem, _most_likely_arms(problem, start, None, least), None, averaged)
     if start.pixel_noise is None:
         state = with_pixel_noise(problem, start, view_of(problem, start))
         noise = np.repeat(problem.robot_noise_floor or start_noise, 3)
         white = np.tile(noise, sum(len(arm.rigs) for arm in problem.arms))
         start = adjusted_images(problem, state, _rig_information(problem, state, np.diag(white)))
     state, images, settled, rounds, last_step = _rounds(problem, start)
+    state = _most_likely_arms(problem, state, images, least)
     found = with_covariance(problem, state, images, averaged)
     return replace(found, settled=settled, iterations=rounds, last_step=last_step)
 
@@ -361,14 +365,11 @@ def with_covariance(
     averaged: bool = True,
     expected: RobotNoise | None = None,
 ) -> Solution:
-    """Return the solution with its covariance, from a state near the solution and the evidence of the images.
+    """Return the solution with its covariance, from the most likely state and the evidence of the images.
 
-    The arms' unknowns and error sizes are first iterated to convergence. `images` None: camera poses are given.
-    `averaged` is that of `solve`. `expected` is the assumed robot noise of a predicted solution, whose residuals are 0
-    and whose state is not iterated; None: the noise is estimated.
+    `images` None: camera poses are given. `averaged` is that of `solve`. `expected` is the assumed robot noise of a
+    predicted solution, whose residuals are 0; None: the noise is estimated.
     """
-    if expected is None:
-        state = _most_likely_arms(problem, state, images, ARMS_SETTLED if averaged else NEARLY_SETTLED)
     poses = pose_equations(problem, state, images)
     equations = poses.equations
     if expected is None:

@@ -14,9 +14,8 @@ import pycolmap
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.estimation.closed_form import sine_axis
 from jcr.features.two_view import CameraMotion
-from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log
+from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log, sine_axis
 from jcr.least_squares import minimise
 
 ROBOT_STD = math.radians(0.3)
