@@ -41,7 +41,6 @@ def begin(folder: Path, capture: Capture) -> Path:
 
 def write_camera_info(capture: Capture, folder: Path) -> None:
     intrinsics = capture.intrinsics
-    assert intrinsics is not None
     content = {
         "image_width": intrinsics.width,
         "image_height": intrinsics.height,
@@ -92,7 +91,6 @@ def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) 
     write_table(folder, capture)
     (folder / "camera_info.yaml").unlink()
     intrinsics = capture.intrinsics
-    assert intrinsics is not None
     centre = intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL
     params = [intrinsics.fx, intrinsics.fy, *centre, *intrinsics.distortion, 0, 0, 0]
     model = pycolmap.Reconstruction()
@@ -149,11 +147,8 @@ def write_list(folder: Path, capture: Capture) -> Path:
 
 
 CORPUS: dict[str, Callable[[Path, Capture], Path]] = {
-    "poses.csv": write_table,
-    "poses.npy": write_npy,
-    "poses.txt": write_tum,
-    "poses.json": write_list,
-}
+    "poses.csv": write_table, "poses.npy": write_npy, "poses.txt": write_tum, "poses.json": write_list,
+}  # fmt: skip
 """Writers of each kind of file of poses, with the images beside it."""
 
 

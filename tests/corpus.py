@@ -225,12 +225,9 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     build_scene(cloud, MapOptions(cell=0.2, max_seconds=0.1)).save(folder / "map.safetensors")
     readers: dict[str, Read] = {
         "reconstruction.npz": read_reconstruction,
-        "depth.npz": lambda path: read_depth(path, reconstruction, None),
-        "cloud.ply": read_cloud,
-        "map.safetensors": load_map,
-        "points.csv": read_points,
-        "points.npy": read_points,
-    }
+        "depth.npz": lambda path: read_depth(path, reconstruction, None), "cloud.ply": read_cloud,
+        "map.safetensors": load_map, "points.csv": read_points, "points.npy": read_points,
+    }  # fmt: skip
     with np.load(folder / "reconstruction.npz") as stored:
         arrays = dict(stored)
     (folder / "about.json").write_text(str(arrays.pop("about")))

@@ -41,13 +41,9 @@ def a_hand_eye(met: bool, reached_mm: float = 1.0) -> Calibration:
         reached_deg=0.1,
     )
     seen = PointUncertainty(
-        distance_mm=500.0,
-        within_95_mm=required.reached_mm,
-        lateral_95_mm=0.0,
-        along_95_mm=0.0,
-        ray_95_deg=0.0,
-        rotation_95_deg=required.reached_deg,
-    )
+        distance_mm=500.0, within_95_mm=required.reached_mm, lateral_95_mm=0.0, along_95_mm=0.0,
+        ray_95_deg=0.0, rotation_95_deg=required.reached_deg,
+    )  # fmt: skip
     seen = PointUncertaintyOverImage(**vars(seen), corners=seen)
     return replace(found, requirement=required, uncertainty=replace(found.uncertainty, seen=seen))
 
@@ -87,13 +83,9 @@ class Scripted:
                 ),
             )
         self.progress = LiveProgress(
-            images=images,
-            added=images[-1] if images else None,
-            registered=images,
-            findings=findings,
-            hand_eye=hand_eye,
-            points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
-        )
+            images=images, added=images[-1] if images else None, registered=images, findings=findings,
+            hand_eye=hand_eye, points_in_base=np.random.default_rng(0).normal(size=(50, 3)),
+        )  # fmt: skip
         return self.progress
 
     def finish(self) -> Any:

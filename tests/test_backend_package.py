@@ -124,15 +124,8 @@ def test_the_example_calibrates(packages: Path, capture: Path, tmp_path: Path) -
     (package / "__init__.py").touch()
     (package / "models.py").write_text(MODELS)
     words = [
-        "calibrate",
-        capture,
-        tmp_path / "out",
-        "--backend",
-        "mapanything",
-        "--weights",
-        capture,
-        "--json",
-    ]
+        "calibrate", capture, tmp_path / "out", "--backend", "mapanything", "--weights", capture, "--json",
+    ]  # fmt: skip
     done = run(*words, packages=[packages, tmp_path])
     found = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert found["backend"] == "mapanything", done.stderr

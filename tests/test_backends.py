@@ -23,13 +23,12 @@ from jcr.pipeline import backend_selection
 from jcr.pipeline.stages import begun
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.result import RunOptions, RunResult
+from refusal import refused
 from scenes import capture_of, reconstruction_of
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 
-def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_alignment(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_colmap_comes_first_then_networks_whose_weights_are_here_then_direct_alignment(present, monkeypatch):
     assert candidates(ReconstructOptions()) == ("colmap", "direct")
     present |= {"dust3r", "da3"}
     assert candidates(ReconstructOptions()) == ("colmap", "dust3r", "da3", "direct")
@@ -52,9 +51,8 @@ def test_without_weights_the_command_to_get_them_is_named(present: set[str], mon
     ):
         monkeypatch.setattr(Backend, "is_installed", lambda self, there=installed: there)
         monkeypatch.setattr(backends, "cached_files", lambda *of: [])
-        with pytest.raises(InputError, match=words) as caught:
+        with refused(words):
             backends.reconstruct(capture, ReconstructOptions(backend="da3"))
-        assert "\n" not in str(caught.value)
 
 
 def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
@@ -82,18 +80,16 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ],
 )  # fmt: skip
 def test_what_a_back_end_does_not_use_is_refused(options: ReconstructOptions, words: str, present: set[str]):
-    with pytest.raises(InputError, match=words) as caught:
+    with refused(words):
         candidates(options)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("name", "flag"), [("marker", "--board"), ("predictions", "--predictions"), ("given", "--cameras")]
+    ("name", "option"), [("marker", "board"), ("predictions", "predictions"), ("given", "cameras")]
 )
-def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, flag: str) -> None:
-    capture = capture_of(np.eye(4)[None])
-    with pytest.raises(InputError, match=f"backend {name}: name the .* with {flag}[ ,]"):
-        backends.reconstruct(capture, ReconstructOptions(backend=name))
+def test_a_back_end_without_its_input_names_the_option(name: str, option: str) -> None:
+    with refused(f"backend {name}: give the option {option},"):
+        backends.reconstruct(capture_of(np.eye(4)[None]), ReconstructOptions(backend=name))
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
@@ -203,12 +199,9 @@ def test_of_two_rejected_the_one_that_shows_a_cause_stays(present: set[str], mon
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
     sound = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     uncertain = Finding(
-        kind=FindingKind.UNCERTAIN,
-        severity="rejects",
-        concerns="images",
-        value=0.03,
+        kind=FindingKind.UNCERTAIN, severity="rejects", concerns="images", value=0.03,
         details={"part": "translation"},
-    )
+    )  # fmt: skip
     sheared = Finding(kind=FindingKind.ROLLING_SHUTTER, severity="rejects", value=9.0, std=0.5, p=1e-9)
     held_out = sound.held_out
     assert held_out is not None
@@ -228,9 +221,7 @@ def test_of_two_rejected_the_one_that_shows_a_cause_stays(present: set[str], mon
 
 
 @pytest.mark.slow
-def test_of_two_rejected_the_least_leave_one_out_error_stays(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_of_two_rejected_the_least_leave_one_out_error_stays(present: set[str], monkeypatch):
     present.add("dust3r")
     rng = np.random.default_rng(1)
     problem = hand_eye_problem(rng, 8)
@@ -275,9 +266,7 @@ def test_what_many_features_reject_colours_do_not_accept(present: set[str], monk
 
 
 @pytest.mark.slow
-def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
-    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_every_attempt_is_recorded_with_the_time_of_each_stage(present, tmp_path, tabletop, monkeypatch):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
 
@@ -316,9 +305,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
 
 
-def test_where_nothing_is_found_each_attempt_reports_why(
-    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_where_nothing_is_found_each_attempt_reports_why(present, tmp_path, tabletop, monkeypatch):
     from jcr.capture.read import read_capture
     from jcr.pipeline.run import calibrate
 

@@ -72,7 +72,7 @@ def pixels(draw, camera: Intrinsics) -> np.ndarray:
 
 @repeatable
 @given(st.data(), cameras(), st.integers(1, 3000), st.integers(1, 3000), between(0.1, 5))
-def test_unprojection_is_undone_and_resized_cropped_and_zoomed_images_show_the_same_point(
+def test_unprojected_resized_cropped_and_zoomed_pixels_are_the_same_point(
     data, arguments, width, height, factor
 ):
     camera = Intrinsics(*arguments)

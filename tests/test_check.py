@@ -111,9 +111,8 @@ def test_check_names_the_remedy_the_board_and_the_images_that_a_run_names():
     """The systematic robot error was named, which is the main part for a simulated scene; for the images it is not."""
     found = check_capture(SHARED / "data/realman_carpet")
     (missed,) = [one for one in found.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
-    assert missed.concerns == "intrinsics" and "not as exact as needed, 20 images, a point within" in repr(
-        found
-    )
+    assert missed.concerns == "intrinsics"
+    assert "not as exact as needed, 20 images, a point within" in repr(found)
     (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
     assert "--board chessboard:11x8:SIDE" in board.remedy
     belt = check_capture(SHARED / "attacks/scene_belt")

@@ -33,7 +33,6 @@ EXAMPLES = ROOT / "examples"
 def example(name: str) -> ModuleType:
     """An example as a module, without running its main."""
     spec = spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -45,15 +44,10 @@ def truly_touches(joint_values: np.ndarray, true_mesh: "trimesh.Trimesh") -> np.
     import yourdfpy
 
     arm = yourdfpy.URDF.load(
-        EXAMPLES / "arm.urdf",
-        build_scene_graph=True,
-        build_collision_scene_graph=True,
-        load_collision_meshes=True,
-        force_collision_mesh=False,
-        load_meshes=False,
-    )
+        EXAMPLES / "arm.urdf", build_scene_graph=True, build_collision_scene_graph=True,
+        load_collision_meshes=True, force_collision_mesh=False, load_meshes=False,
+    )  # fmt: skip
     shapes = arm.collision_scene
-    assert shapes is not None
     scene = trimesh.collision.CollisionManager()
     scene.add_object("scene", true_mesh)
     robot = trimesh.collision.CollisionManager()
@@ -177,9 +171,7 @@ def test_the_notebook_runs(done: Path, tmp_path: Path):
     assert "out/notebook/export/hand_eye.launch" in out.getvalue()
 
 
-def test_the_python_of_the_readme_prints_what_the_readme_shows(
-    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_python_of_the_readme_prints_what_the_readme_shows(done: Path, tmp_path, monkeypatch, capsys):
     """Its call of `jcr.run` is that of the quick start, which runs: here the same run is read."""
     pytest.importorskip("torch")
     section = (ROOT / "README.md").read_text().split("## Ten lines of Python")[1]

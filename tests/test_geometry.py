@@ -92,17 +92,14 @@ def test_angles_near_zero_and_reflections_have_a_rotation():
     assert rotation_between_deg(np.eye(3), rotation) == pytest.approx(np.degrees(1e-7), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "words"),
-    [
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "scaled by 2"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "reflection"),
-        (transform(np.eye(3), np.array([1.0, 2.0, 3.0])).T, "transposed"),
-        (np.full((4, 4), np.nan), "NaN"),
-        (np.eye(4) + 0.1 * np.eye(4)[::-1], "not 0 0 0 1"),
-        (np.eye(4) + 0.2 * np.eye(4)[[1, 2, 0, 3]] * (np.arange(4)[:, None] == 0), "not a rotation matrix"),
-    ],
-)
+@pytest.mark.parametrize(("matrix", "words"), [
+    (np.diag([2.0, 2.0, 2.0, 1.0]), "scaled by 2"),
+    (np.diag([1.0, 1.0, -1.0, 1.0]), "reflection"),
+    (transform(np.eye(3), np.array([1.0, 2.0, 3.0])).T, "transposed"),
+    (np.full((4, 4), np.nan), "NaN"),
+    (np.eye(4) + 0.1 * np.eye(4)[::-1], "not 0 0 0 1"),
+    (np.eye(4) + 0.2 * np.eye(4)[[1, 2, 0, 3]] * (np.arange(4)[:, None] == 0), "not a rotation matrix"),
+])  # fmt: skip
 def test_what_is_not_rigid_is_named(matrix, words):
     with pytest.raises(InputError, match=words) as error:
         require_rigid(matrix, "frame 3")

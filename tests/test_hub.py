@@ -117,13 +117,10 @@ def get(hub: Hub, home: Path, *arguments: str, look_for: str = "") -> subprocess
         if not name.lower().endswith("_proxy") and name[:3] != "HF_"
     }
     return subprocess.run(
-        [sys.executable, "-c", GET, *arguments, look_for],
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        timeout=120,
+        [sys.executable, "-c", GET, *arguments, look_for], capture_output=True, text=True,
+        stdin=subprocess.DEVNULL, timeout=120,
         env=environment | {"HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_HUB_DISABLE_TELEMETRY": "1"},
-    )
+    )  # fmt: skip
 
 
 def test_weights_come_whole_and_not_twice(hub: Hub, tmp_path: Path) -> None:

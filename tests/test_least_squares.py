@@ -26,11 +26,8 @@ def linearised(observed):
         decayed = np.exp(-p[1] * TIME)
         wave, slope = np.cos(p[2] * TIME), -np.sin(p[2] * TIME)
         columns = (
-            decayed * wave,
-            -TIME * p[0] * decayed * wave,
-            TIME * p[0] * decayed * slope,
-            np.full(60, 100.0),
-        )
+            decayed * wave, -TIME * p[0] * decayed * wave, TIME * p[0] * decayed * slope, np.full(60, 100.0),
+        )  # fmt: skip
         return (curve(p) - observed)[:, None], np.stack(columns, axis=1)[:, None]
 
     return at

@@ -82,9 +82,7 @@ def stamps_of(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_second_run_makes_nothing(
-    format: str, capture: Capture, tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
-):
+def test_the_second_run_makes_nothing(format: str, capture: Capture, tmp_path, made: list[str], capsys):
     path = FORMATS[format](tmp_path / "input", capture)
     path = path.parent if path.is_file() else path
     out = tmp_path / "out"
@@ -106,9 +104,7 @@ def test_the_second_run_makes_nothing(
 
 
 @pytest.mark.parametrize("format", ["poses.csv", "bag"])
-def test_edited_input_is_read_and_run_again(
-    format: str, capture: Capture, tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
-):
+def test_edited_input_is_read_and_run_again(format: str, capture: Capture, tmp_path, made: list[str], capsys):
     path, out = tmp_path / "input", tmp_path / "out"
     moved = capture.base_from_gripper.copy()
     moved[:, 0, 3] += 0.1

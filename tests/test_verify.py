@@ -45,6 +45,7 @@ from jcr.pipeline.verify import TOLERANCE, of_two_poses
 from jcr.records import Capture, RobotNoise, Uncertainty
 from jcr.result import RunOptions, RunResult
 from jcr.sfm.register import Registration
+from refusal import refused
 from scenes import hand_eye_of, reconstruction_of, reference_of
 from simulation.capture import with_robot_noise
 from simulation.poses import gripper_poses
@@ -150,19 +151,15 @@ def test_a_moved_table_is_distinguished_from_a_moved_camera(capture: Capture, x:
         if len(rows) == 1:  # both fit a single image exactly
             assert {"camera", "scene"} <= {table.cause, *table.rivals}
             continue
-        assert (table.cause, table.rivals) == ("scene", ()) and (camera.cause, camera.rivals) == (
-            "camera",
-            (),
-        )
+        assert (table.cause, table.rivals) == ("scene", ())
+        assert (camera.cause, camera.rivals) == ("camera", ())
         np.testing.assert_allclose(camera.motion, step_between(x, x @ BUMP), atol=5e-4)
         turned, shift = rotation_log(NUDGE[:3, :3]), NUDGE[:3, 3]
         np.testing.assert_allclose(table.motion[3:], turned, atol=5e-4)
         assert np.linalg.norm(table.motion[:3] - shift) < 0.5 * np.linalg.norm(shift)
 
 
-def test_captures_together_find_a_bump_that_one_does_not_and_a_later_push_of_the_table(
-    capture: Capture, x: np.ndarray
-):
+def test_captures_together_find_a_bump_that_one_does_not_and_a_later_push_of_the_table(capture, x):
     rows, bump = [9, 10, 11], transform(np.eye(3), np.array([1.2e-3, 0.0, 0.0]))
     push = transform(np.eye(3), np.array([0.0, 0.01, 0.0]))
     reference, later, _ = series(capture, x, 5, 9 * [rows], (0.2, 0.03), bump=bump, at=3)
@@ -251,9 +248,7 @@ def test_images_of_a_calibration_are_refused_by_content(out: Path, capture: Capt
     assert f"fresh.jpg: equals {capture.images[3]}, an image of the calibration" in capsys.readouterr().err
 
 
-def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
-    out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, capsys
-):
+def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(out, capture, x, tmp_path, capsys):
     poses = capture.base_from_gripper @ x @ inverse(x @ BUMP)
     write_capture(tmp_path / "today", capture, poses, [10])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
@@ -265,9 +260,8 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet", "--json"]) == 3
     printed = capsys.readouterr()
     found = json.loads(printed.out)
-    assert (
-        found["moved"] and found["p_value"] < 1e-3 and {"camera", "scene"} <= set(found["moves"][0]["causes"])
-    )
+    assert found["moved"] and found["p_value"] < 1e-3
+    assert {"camera", "scene"} <= set(found["moves"][0]["causes"])
     assert np.linalg.norm(found["drift_mm"]) == pytest.approx(3.0, abs=2.0)
     assert np.linalg.norm(found["drift_deg"]) == pytest.approx(1.0, abs=0.3)
     assert not printed.err
@@ -287,9 +281,9 @@ def test_a_start_check_in_python_counts_an_image_once(out: Path, capture: Captur
     again = run.verify(files[10:12], poses[10:12])
     assert [row.name for row in again.history] == ["start"]
     run.verify([files[9]], poses[[9]], name="next")
-    with pytest.raises(InputError, match="verified before"):
+    with refused("verified before"):
         run.verify(files[9:11], poses[9:11])
-    with pytest.raises(InputError, match="n images"):
+    with refused("n images"):
         run.verify(files[9:11], poses[[9]])
 
 
@@ -314,17 +308,13 @@ def test_images_of_another_scene_cannot_tell(out: Path, capture: Capture, tmp_pa
     assert "no such capture" in capsys.readouterr().err
 
 
-def test_a_new_image_of_a_fixed_camera_shows_rotation(
-    out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, capsys
-):
+def test_a_new_image_of_a_fixed_camera_shows_rotation(out, capture, x, tmp_path, capsys):
     """A rotation about the camera's own centre moves pixels by a homography, whatever the scene."""
     run = out
     intrinsics = capture.intrinsics
-    assert intrinsics is not None
     content = json.loads((capture.folder / "capture.json").read_text())
     (tmp_path / "camera.json").write_text(json.dumps(content["intrinsics"]))
     image = cv2.imread(str(capture.folder / capture.images[10]))
-    assert image is not None
     cv2.imwrite(str(tmp_path / "overhead.png"), image)
     given = ["--name", "overhead", "--intrinsics", str(tmp_path / "camera.json")]
     assert dispatch(["add-camera", str(run), str(tmp_path / "overhead.png"), *given, "--quiet"]) == 0
@@ -349,9 +339,7 @@ def test_a_new_image_of_a_fixed_camera_shows_rotation(
         assert [along, np.linalg.norm(found["drift_deg"])] == pytest.approx([deg, deg], abs=0.06)
 
 
-def test_a_run_is_calibrated_again_with_old_images_unless_the_camera_moved(
-    out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_run_is_calibrated_again_unless_the_camera_moved(out, capture, x, tmp_path, monkeypatch):
     made = list[Capture]()
 
     def calibrate(one: Capture, folder: Path, options: RunOptions, progress: object) -> RunResult:
@@ -379,13 +367,11 @@ def test_a_run_is_calibrated_again_with_old_images_unless_the_camera_moved(
     assert [move.since for move in found.moves] == ["tuesday"]
     recalibrating.recalibrate(out, taken, tmp_path / "third", found)
     assert len(made[1]) == 1
-    with pytest.raises(InputError, match="holds a run"):
+    with refused("holds a run"):
         recalibrating.recalibrate(out, taken, tmp_path / "third", found)
 
 
-def test_a_calibration_of_another_scene_is_compared(
-    out: Path, capture: Capture, x: np.ndarray, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_calibration_of_another_scene_is_compared(out: Path, capture: Capture, x: np.ndarray, monkeypatch):
     before = jcr.load_run(out).found
     offset = np.array([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
     for step, moved in ((0.0, False), (1.0, True)):
@@ -441,9 +427,7 @@ def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_true_points_agree_and_a_tip_that_is_off_is_named_by_status_3_and_its_mean(
-    done: Path, touched: Path, tmp_path: Path, capsys
-):
+def test_true_points_agree_and_a_tip_that_is_off_is_named_by_its_mean(done, touched, tmp_path, capsys):
     found = touch(done, touched)
     assert found.p_value > 0.01 and len(found.error) == 6 and found.rms < 3 * found.expected
     lines = [line.split(",") for line in touched.read_text().splitlines()]
@@ -468,7 +452,7 @@ FAULTS = {
 @pytest.mark.parametrize("words", FAULTS)
 def test_what_is_no_list_of_touched_points_is_refused(done: Path, tmp_path: Path, words: str):
     (tmp_path / "points.csv").write_text(FAULTS[words])
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         touch(done, tmp_path / "points.csv")
 
 
@@ -512,13 +496,9 @@ def test_a_place_that_few_points_are_left_of_has_changed(kept: float):
         similarity=Similarity(np.eye(4), 1.0),
     )
     pose = CameraPose(
-        a_from_camera=np.eye(4),
-        covariance=np.eye(6),
-        camera=INTRINSICS,
-        inlier=left[left],
-        std_px=0.3,
+        a_from_camera=np.eye(4), covariance=np.eye(6), camera=INTRINSICS, inlier=left[left], std_px=0.3,
         rms_px=0.3,
-    )
+    )  # fmt: skip
     none, x_px = np.zeros(0, int), project(INTRINSICS, x[left])
     placed = Registration(
         pose=pose, points_in_recon=x[left], x_px=x_px, row=none, row_x_px=np.zeros((0, 2)), row_point=none

@@ -74,13 +74,10 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
         case = Case(
             capture=capture_of(problem.base_from_gripper, intrinsics=given),
             reconstruction=reconstruction_of(np.array(camera), intrinsics=given, tracks=tracks),
-            options=CalibrateOptions(),
-            robot=errors_of(problem.base_from_gripper),
-            priors=(scale_prior(problem.scale, 1e-3),),
-            fit=solved,
-            numbers=solved,
+            options=CalibrateOptions(), robot=errors_of(problem.base_from_gripper),
+            priors=(scale_prior(problem.scale, 1e-3),), fit=solved, numbers=solved,
             model=Model(tracks=tracks, used=solved.inliers, camera=camera_about(given, True)),
-        )
+        )  # fmt: skip
         whole = adjusted(case).numbers
         off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
         without.append(np.abs(off / np.sqrt(np.diag(solved.covariance)[:6])).max())

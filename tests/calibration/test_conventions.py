@@ -89,11 +89,8 @@ def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
         rows=np.arange(10),
         untaken=untaken,
     )
-    assert (
-        found.details["remedy"] == "give --pose-convention euler:ZYZ"
-        and found.details["pose_convention"] == "euler:ZYZ"
-        and misfit(found.details["fits"]) < 1.0
-    )
+    assert found.details["remedy"] == "give --pose-convention euler:ZYZ"
+    assert found.details["pose_convention"] == "euler:ZYZ" and misfit(found.details["fits"]) < 1.0
 
 
 def test_inverted_samples_name_both_possibilities():

@@ -58,7 +58,6 @@ def test_the_error_of_a_mixed_pair_is_that_of_the_rays():
     other = replace(found.with_given_intrinsics, intrinsics=replace(camera, fx=505.0))
     found = replace(found, intrinsics=camera.with_std(None), with_given_intrinsics=other)
     seen = found.uncertainty.seen
-    assert seen is not None
     turned = np.arctan2(499.5, 500.0) - np.arctan2(499.5, 505.0)
     expected = 2 * np.sin(turned / 2) * seen.distance_mm
     assert mixed_pair_mm(found) == pytest.approx(expected)
@@ -106,7 +105,6 @@ def test_other_intrinsics_are_named_where_they_explain_a_difference_and_a_slip_i
     ours = read_calibration(ACCEPTED)
     assert isinstance(ours, Calibration) and ours.with_given_intrinsics is not None
     joint = ours.uncertainty.joint
-    assert joint is not None and ours.intrinsics is not None
     by = joint.covariance[:6, 7:] @ np.linalg.pinv(joint.covariance[7:, 7:], rcond=1e-12, hermitian=True)
     off = np.r_[6.0, 6.0, 4.0, -3.0, np.zeros(len(by[0]) - 4)]
     moved = retract(ours.gripper_from_camera, by @ off)

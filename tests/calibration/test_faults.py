@@ -22,7 +22,6 @@ from jcr.findings import Finding, FindingKind, kinds_of, sentence
 from jcr.geometry import inverse, step_between
 from jcr.records import CameraEvidence
 from scenes import capture_of, pairs_of, reconstruction_of
-from simulation.arms import PresetName
 from simulation.faults import INTRINSICS, Faults, faulty_capture, reconstructed
 from simulation.problems import INTRINSICS as OBSERVED_BY
 from simulation.problems import bent_problem, hand_eye_problem, observed
@@ -75,7 +74,6 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
     assert said, hand_eye.warnings
     assert [float(size) for size in said[0].groups()] == pytest.approx(sizes, abs=within)
     assert outcome(found, hand_eye).is_sound
-    assert hand_eye.uncertainty.budget is not None
     parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)
     assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
     # An effect on the camera is part of the calibration, and its uncertainty is not that of a fault.
@@ -128,9 +126,7 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 
-def test_an_adopted_effect_keeps_the_findings_before_it_and_states_whether_its_adjustment_settled(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_an_adopted_effect_keeps_earlier_findings_and_states_whether_its_adjustment_settled(monkeypatch):
     capture, reconstruction = reconstructed(
         faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0]), estimated=False
     )
@@ -150,7 +146,6 @@ def test_points_behind_a_camera_give_no_numpy_warning():
     options, robot = CalibrateOptions(), errors_of(capture.base_from_gripper)
     model = examined_case(adjusted(fitted_case(capture, reconstruction, options, robot)))
     images, observations = model.solution.images, model.solution.problem.observations
-    assert observations is not None
     x_in_camera = images.view.in_camera * np.where(observations.image == 2, -1.0, 1.0)[:, None]
     behind = replace(images, view=replace(images.view, in_camera=x_in_camera))
     model = replace(model, solution=replace(model.solution, evidence=behind))
@@ -173,16 +168,13 @@ def test_joint_offsets_follow_from_adjusted_images_and_from_the_stated_covarianc
         capture, reconstruction_of(problem.recon_from_camera, evidence=stated)
     )
     for found, least, most in ((by_images, 0.01, 0.03), (by_poses, 0.03, 0.1)):
-        assert found.joint_offsets is not None
         off = problem.bent.errors[1:5] - found.joint_offsets.offset[1:5]
         assert (np.abs(off) < 3 * found.joint_offsets.std[1:5]).all()
         assert least < np.degrees(found.joint_offsets.std[1:5]).max() < most
 
 
 @pytest.mark.parametrize(("preset", "images", "is_named"), [("low-cost", 40, True), ("typical", 24, False)])
-def test_smooth_errors_that_leave_one_out_does_not_show_are_a_finding(
-    preset: PresetName, images: int, is_named: bool
-):
+def test_smooth_errors_that_leave_one_out_does_not_show_are_a_finding(preset, images, is_named):
     problem = bent_problem(arm_named("ur5e"), preset, images, 2)
     capture = capture_of(problem.base_from_gripper, intrinsics=OBSERVED_BY)
     tracks = observed(problem, np.random.default_rng(2), 100, 0.4)

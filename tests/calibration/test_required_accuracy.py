@@ -65,9 +65,8 @@ def test_the_images_that_are_missing_are_counted():
     perhaps = calibrate_pose_pairs(
         given, CalibrateOptions(require=(0.62 * reached.reached_mm, 10.0))
     ).requirement
-    assert perhaps is not None and perhaps.more_images == 5, (
-        "12 more may be enough: no other camera or robot yet"
-    )
+    assert perhaps is not None, "12 more may be enough: no other camera or robot yet"
+    assert perhaps.more_images == 5, "12 more may be enough: no other camera or robot yet"
     content, html = hand_eye, page(given, hand_eye)
     assert content.short is not None and content.verdict == NOT_EXACT and hand_eye.converged
     show = sentence(content.short)
@@ -88,7 +87,6 @@ def test_the_images_that_are_missing_are_counted():
 def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, severity: str):
     given, _ = pairs(12, 12)
     found = calibrate_pose_pairs(given)
-    assert found.requirement is not None
     size = {
         "value": 1e-3 * share * found.requirement.reached_mm,
         "rotation": 0.0,
@@ -101,9 +99,7 @@ def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, se
 
 
 @pytest.mark.slow
-def test_the_command_ends_with_3_unless_the_accuracy_is_reached_or_none_is_required(
-    capsys: pytest.CaptureFixture[str],
-):
+def test_the_command_ends_with_3_unless_the_accuracy_is_reached_or_none_is_required(capsys):
     given, _ = pairs(12, 12)
     required: tuple[tuple[RequiredAccuracy, str], ...] = (
         (GRASPING, "ACCEPTED (5 mm and 1° required). "),

@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
 from jcr.capture.ros_messages import image_of, read_ros_depth
 from jcr.records import Capture, FrameNames
+from refusal import refused
 from simulation.problems import hand_eye_problem
 from simulation.ros_bag import nearest_view, write_bag
 
@@ -64,9 +65,7 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "images"), [("ros1", 1), ("sqlite3", 2)])
-def test_a_camera_that_is_triggered_has_a_view_at_each_stop(
-    tmp_path: Path, capture: Capture, kind: Literal["ros1", "sqlite3"], images: int
-):
+def test_a_camera_that_is_triggered_has_a_view_at_each_stop(tmp_path, capture, kind, images):
     """One image at each stop, and another one on the way."""
     bag = write_bag(
         tmp_path / ("scan.bag" if kind == "ros1" else "scan"), capture, kind, 12.0, fps=images, tf_hz=20.0
@@ -89,7 +88,7 @@ def test_depth_messages_are_read_in_every_encoding():
     assert (read_ros_depth(message(mm, "16UC1"), "d") == mm).all()
     assert (read_ros_depth(message(mm.byteswap(), "16UC1", 1), "d") == mm).all()
     assert read_ros_depth(message(metres, "32FC1"), "d").tolist() == [[0, 700], [1200, 0]]
-    with pytest.raises(jcr.InputError, match="no depth"):
+    with refused("no depth"):
         read_ros_depth(message(mm, "rgb8"), "d")
     packed = SimpleNamespace(
         format="16UC1; compressedDepth png", data=np.frombuffer(bytes(12) + encode_png(mm), np.uint8)
@@ -170,7 +169,6 @@ def test_a_topic_of_poses_stands_in_for_tf(tmp_path: Path, capture: Capture):
 def foxglove_stream(capture: Capture) -> Iterator[tuple[str, str, int, dict[str, Any]]]:
     """Topic, schema, time and content of the messages of a recording at the poses of a capture."""
     intrinsics = capture.intrinsics
-    assert intrinsics is not None
     start = 10**18
     matrices = {"K": intrinsics.matrix.ravel().tolist(), "D": list(intrinsics.distortion)}
     size = {"width": intrinsics.width, "height": intrinsics.height}
@@ -218,9 +216,8 @@ def test_messages_of_foxglove_are_read(tmp_path: Path, capture: Capture):
     options = {"frames": 12, "base_frame": "base", "gripper_frame": "tool0"}
     got = jcr.read_capture(tmp_path / "scan.mcap", options, into=tmp_path / "frames")
     np.testing.assert_allclose(got.base_from_gripper, capture.base_from_gripper, atol=1e-9)
-    assert got.intrinsics == capture.intrinsics and got.frame_names == FrameNames(
-        base="base", gripper="tool0", camera="lens"
-    )
+    assert got.intrinsics == capture.intrinsics
+    assert got.frame_names == FrameNames(base="base", gripper="tool0", camera="lens")
     for name, original in zip(got.images, capture.images, strict=True):
         assert (got.folder / name).read_bytes() == (capture.folder / original).read_bytes()
     # A frame that is published once, as the mount of the camera, does not move.
@@ -233,9 +230,7 @@ def test_messages_of_foxglove_are_read(tmp_path: Path, capture: Capture):
 @pytest.mark.slow
 def test_a_video_topic_is_named_with_the_command_that_converts_it(tmp_path: Path, capture: Capture):
     write_foxglove_json(tmp_path / "scan.mcap", capture, video="CompressedVideo")
-    with pytest.raises(
-        jcr.InputError, match="/wrist is a video; .*in_transport:=foxglove .*in/foxglove:=/wrist"
-    ):
+    with refused("/wrist is a video; .*in_transport:=foxglove .*in/foxglove:=/wrist"):
         jcr.read_capture(tmp_path / "scan.mcap", into=tmp_path / "frames")
 
 
@@ -256,9 +251,8 @@ def test_a_video_topic_is_named_with_the_command_that_converts_it(tmp_path: Path
     ],
 )
 def test_what_is_not_in_the_bag_is_listed(tmp_path: Path, mcap: Path, options: dict, words: str):
-    with pytest.raises(jcr.InputError, match=words) as caught:
+    with refused(words):
         jcr.read_capture(mcap, ReadOptions(**options), into=tmp_path / "frames")
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "frames").exists()
 
 
@@ -266,7 +260,7 @@ def test_what_is_not_in_the_bag_is_listed(tmp_path: Path, mcap: Path, options: d
 def test_stale_poses_are_refused_with_their_gap(tmp_path: Path, capture: Capture):
     """At 5 Hz the poses around an image are 200 ms apart."""
     bag = write_bag(tmp_path / "slow", capture, "mcap", 12.0, fps=10.0, tf_hz=5.0)
-    with pytest.raises(jcr.InputError, match=r"stale .* 200 ms apart"):
+    with refused(r"stale .* 200 ms apart"):
         jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
     patient = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12, max_gap_ms=250.0)
     assert len(jcr.read_capture(bag, patient, into=tmp_path / "frames")) == 12
@@ -277,9 +271,8 @@ def test_files_that_are_no_bags_are_one_line(fault: str, tmp_path: Path, mcap: P
     file = tmp_path / "scan.mcap"
     data = next(mcap.glob("*.mcap")).read_bytes()
     file.write_bytes({"gzip": b"\x1f\x8b\x08\x00", "cut": data[: len(data) // 2], "text": b"hello"}[fault])
-    with pytest.raises(jcr.InputError, match=r"scan\.mcap: not a readable bag") as caught:
+    with refused(r"scan\.mcap: not a readable bag"):
         jcr.read_capture(file, FRAMES, into=tmp_path / "frames")
-    assert "\n" not in str(caught.value)
 
 
 def test_the_best_frames_are_still_sharp_and_spread():
@@ -346,5 +339,5 @@ def test_colours_of_raw_images(encoding: str):
     assert np.abs(pixels[1, 2:-2].mean(0) - [200, 0, 0]).max() < 20
     assert np.abs(pixels[6, 2:-2].mean(0) - [0, 0, 200]).max() < 20
     message.encoding = "16UC1"
-    with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour image"):
+    with refused("encoding '16UC1' is no colour image"):
         image_of(message, "bag")

@@ -19,6 +19,7 @@ import jcr
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.geometry import scale_translation
+from refusal import refused
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def change_poses(folder: Path, change, rows=(1,)) -> None:
 
 
 def test_a_folder_of_captures_is_refused(capture: Path):
-    with pytest.raises(jcr.InputError, match=f"holds captures, not images; did you mean {capture}"):
+    with refused(f"holds captures, not images; did you mean {capture}"):
         jcr.read_capture(capture.parent)
 
 
@@ -218,9 +219,8 @@ def test_several_frames_that_cannot_be_used_are_named_in_one_message(capture: Pa
     change_poses(capture, lambda pose: np.nan * pose, (2,))
     (capture / "images/03.jpg").unlink()
     named = r"\(3 of 4 frames cannot be used: images/02\.jpg, images/01\.jpg, images/03\.jpg\)"
-    with pytest.raises(jcr.InputError, match=r"01\.jpg: not a readable image.* " + named) as error:
+    with refused(r"01\.jpg: not a readable image.* " + named):
         jcr.read_capture(capture)
-    assert "\n" not in str(error.value)
 
 
 def test_joints_and_other_cameras_stay_with_the_frames_that_are_used(capture: Path):
@@ -258,22 +258,19 @@ def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path
     assert again.robot == "ur5e" and again.urdf == tmp_path / "copy" / "robot.urdf"
     assert again.urdf.read_text() == "<robot/>"
     edit(capture, lambda c: c.update(robot="panda"))
-    with pytest.raises(jcr.InputError, match="frames have 6 joints, but a panda has 7; correct either"):
+    with refused("frames have 6 joints, but a panda has 7; correct either"):
         jcr.read_capture(capture)
     edit(capture, lambda c: c.update(robot="cobot 9"))
     read = jcr.read_capture(capture)
     assert read.robot is None and "robot 'cobot 9' is not one of ur3e" in read.notes[0]
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        (None, r"frame 3 .*: no joint angles, others have 6; give them for all"),
-        (JOINTS[3][:5], r"frame 3 .*: 5 joint angles, others have 6"),
-        ([float("nan")] * 6, r"frame 3 .*: joints.0: nan: Input should be a finite number"),
-        ("0 1 2", r"frame 3 .*: joints: .0 1 2.: Input should be a valid list"),
-    ],
-)
+@pytest.mark.parametrize(("row", "words"), [
+    (None, r"frame 3 .*: no joint angles, others have 6; give them for all"),
+    (JOINTS[3][:5], r"frame 3 .*: 5 joint angles, others have 6"),
+    ([float("nan")] * 6, r"frame 3 .*: joints.0: nan: Input should be a finite number"),
+    ("0 1 2", r"frame 3 .*: joints: .0 1 2.: Input should be a valid list"),
+])  # fmt: skip
 def test_a_frame_with_unusable_joints_is_left_out(capture: Path, row, words: str):
     edit(capture, lambda c: set_joints(c, [*JOINTS[:3], row]))
     read = jcr.read_capture(capture)

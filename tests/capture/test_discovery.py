@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from jcr.geometry import inverse, transform
 from jcr.pipeline.reading_decision import decide
 from jcr.records import Capture
 from places import ROOT
+from refusal import refused
 from scenes import capture_of
 from simulation.layouts import LAYOUTS, Layout
 from simulation.problems import HandEyeProblem, hand_eye_problem
@@ -100,17 +100,13 @@ def test_images_left_out_and_chosen_are_stated(tmp_path: Path):
 
 def test_pictures_in_other_formats_are_named(tmp_path: Path):
     (tmp_path / "IMG_1.HEIC").write_bytes(b"ftypheic")
-    with pytest.raises(
-        jcr.InputError, match="holds no images .*it holds HEIC pictures: convert them to PNG or JPEG"
-    ):
+    with refused("holds no images .*it holds HEIC pictures: convert them to PNG or JPEG"):
         jcr.read_capture(tmp_path)
 
 
 def test_a_folder_without_poses_says_what_to_add(tmp_path: Path):
     write(draw(tmp_path / "a") / "readme.txt", ["hello"])
-    with pytest.raises(
-        jcr.InputError, match=r"no gripper poses for its 6 images \(8.png … 13.png\) in readme.txt; add"
-    ):
+    with refused(r"no gripper poses for its 6 images \(8.png … 13.png\) in readme.txt; add"):
         jcr.read_capture(tmp_path / "a")
 
 
@@ -146,9 +142,8 @@ def decided(capture: Capture, problem: HandEyeProblem = PROBLEM, rows: np.ndarra
 def assert_refused(
     capture: Capture, words: str, problem: HandEyeProblem = PROBLEM, rows: np.ndarray | None = None
 ):
-    with pytest.raises(jcr.InputError, match=words) as caught:
+    with refused(words):
         decided(capture, problem, rows)
-    assert "\n" not in str(caught.value)
 
 
 def test_images_without_a_camera_pose_do_not_change_the_reading():
@@ -183,15 +178,12 @@ def test_readings_that_both_fit_are_refused_with_the_option_for_each():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("order", "words"),
-    [
-        (np.arange(12)[::-1], "listed in reverse order of the images"),
-        (np.r_[0, np.arange(11)], r"one ahead of the images \(image k has pose k \+ 1\)"),
-        (np.r_[np.arange(1, 12), 11], r"one behind the images \(image k has pose k − 1\)"),
-        (np.argsort([str(k) for k in range(12)]), "as text"),
-    ],
-)
+@pytest.mark.parametrize(("order", "words"), [
+    (np.arange(12)[::-1], "listed in reverse order of the images"),
+    (np.r_[0, np.arange(11)], r"one ahead of the images \(image k has pose k \+ 1\)"),
+    (np.r_[np.arange(1, 12), 11], r"one behind the images \(image k has pose k − 1\)"),
+    (np.argsort([str(k) for k in range(12)]), "as text"),
+])  # fmt: skip
 def test_another_order_is_named_and_never_taken(order: np.ndarray, words: str):
     """Row k holds the pose of image order[k]."""
     capture = undecided(PROBLEM.base_from_gripper[order], "euler:xyz")
@@ -263,9 +255,7 @@ def test_four_images_decide_nothing():
     ("inverted", "write", "way"),
     [("marker", write_moveit, ()), ("gripper", write_easy_handeye2, ("--pose-inverted",))],
 )
-def test_pairs_with_an_inverse_are_never_accepted(
-    inverted: str, write: Callable[..., Path], way: tuple[str, ...], tmp_path: Path
-):
+def test_pairs_with_an_inverse_are_never_accepted(inverted, write, way, tmp_path):
     gripper, marker = PROBLEM.base_from_gripper[:7], PROBLEM.recon_from_camera[:7]
     pairs = (inverse(gripper), marker) if inverted == "gripper" else (gripper, inverse(marker))
     done = run_jcr("calibrate", write(tmp_path / "in", *pairs), tmp_path / "out", *way)
@@ -296,32 +286,27 @@ def test_the_images_decide_once_and_the_run_keeps_the_reading(tmp_path: Path):
     (6, "half", "column qw holds 'half'"), (slice(3, 7), ["0"] * 4, "0 0 0 0 is no rotation"),
     (slice(3, 7), ["1", "1", "0", "0"], "1 1 0 0 is no rotation"), (2, "812.5", "is 812.5 m from the base"),
 ])  # fmt: skip
-def test_a_row_without_a_pose_is_left_out_with_the_cell_that_is_wrong(
-    tmp_path: Path, column: int | slice, cell: str | list[str], said: str
-):
+def test_a_row_without_a_pose_is_left_out_with_the_cell_that_is_wrong(tmp_path, column, cell, said):
     cells = [row.split(",") for row in ROWS]
     cells[2][column] = cell
     rows = [f"{','.join(row)},{name}" for row, name in zip(cells, NAMES, strict=True)]
     write(draw(tmp_path) / "poses.csv", [f"{HEADER},image", *rows])
     kept = jcr.read_capture(tmp_path)
-    assert len(kept) == COUNT - 1 and any(said in note and NAMES[2] in note for note in kept.notes), (
-        kept.notes
-    )
+    assert len(kept) == COUNT - 1, kept.notes
+    assert any(said in note and NAMES[2] in note for note in kept.notes), kept.notes
 
 
 @pytest.mark.parametrize(("header", "cell", "said"), [
     ("x,y,z,qx,qy,qz,other", None, "its columns x, y, z, qx, qy, qz, other, image are no position with a rotation"),
     (HEADER, "nan", f"column y has no number in {COUNT} of {COUNT} rows"),
 ])  # fmt: skip
-def test_a_file_without_poses_says_which_columns_it_has(
-    tmp_path: Path, header: str, cell: str | None, said: str
-):
+def test_a_file_without_poses_says_which_columns_it_has(tmp_path, header: str, cell: str | None, said: str):
     cells = [row.split(",") for row in ROWS]
     rows = [
         ",".join([row[0], cell or row[1], *row[2:], name]) for row, name in zip(cells, NAMES, strict=True)
     ]
     write(draw(tmp_path) / "poses.csv", [f"{header},image", *rows])
-    with pytest.raises(jcr.InputError, match=said):
+    with refused(said):
         jcr.read_capture(tmp_path)
 
 

@@ -16,6 +16,7 @@ from scipy.io import savemat
 from jcr.capture.documents import Table, read_content, read_record_tables, read_tables
 from jcr.errors import InputError
 from places import SHARED
+from refusal import refused
 
 INPUTS = SHARED / "inputs"
 SIX = (None,) * 6
@@ -196,24 +197,20 @@ def test_arrays(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", R=poses[:, :3, :3], t=poses[:, :3, 3], id=np.arange(7))
     found = {one.place: one for one in read_tables(tmp_path / "b.npz")}
     assert found["t"].columns == (None,) * 3 and np.array_equal(np.array(found["t"].rows), poses[:, :3, 3])
-    assert found[""].columns[:2] == ("R.0.0", "R.0.1") and found[""].columns[9:] == (
-        "t.0",
-        "t.1",
-        "t.2",
-        "id.0",
-    )
+    assert found[""].columns[:2] == ("R.0.0", "R.0.1")
+    assert found[""].columns[9:] == ("t.0", "t.1", "t.2", "id.0")
     arrays = {"T": np.moveaxis(poses, 0, -1), "big": np.zeros((7, 3)), "note": "mm", "s": {"A": poses}}
     savemat(tmp_path / "c.mat", arrays, do_compression=True)
     assert {one.place: one for one in read_tables(tmp_path / "c.mat")}["T"].rows == table.rows
     savemat(tmp_path / "c.mat", {"s": {"A": poses}})
-    with pytest.raises(InputError, match="a cell array or a struct; save a table with writetable"):
+    with refused("a cell array or a struct; save a table with writetable"):
         read_tables(tmp_path / "c.mat")
     np.save(tmp_path / "a.npy", np.array([{}], object))
-    with pytest.raises(InputError, match="pickle"):
+    with refused("pickle"):
         read_tables(tmp_path / "a.npy")
     for bomb, what in ((np.zeros(3_000_000), "20 MB"), (np.zeros(9_000_000, np.int8), "1,000,000 values")):
         savemat(tmp_path / "c.mat", {"A": bomb}, do_compression=True)
-        with pytest.raises(InputError, match=what):
+        with refused(what):
             read_tables(tmp_path / "c.mat")
 
 

@@ -15,6 +15,7 @@ from jcr.capture.formats.lerobot import Feature, _poses
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.records import Capture
+from refusal import refused
 from simulation.problems import HandEyeProblem, hand_eye_problem
 
 pytestmark = [
@@ -70,9 +71,7 @@ def assert_paired(capture: Capture, poses: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_cartesian_states_give_still_frames_with_their_poses(
-    version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem
-):
+def test_cartesian_states_give_still_frames_with_their_poses(version, tmp_path, tabletop, problem):
     states = writers.rows_as("rpy", problem.base_from_gripper)
     other = pictured(tabletop, 3, first=12), walked(states[:3])
     episode = pictured(tabletop, 12), walked(states)
@@ -108,7 +107,7 @@ def test_images_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Path
         at = table.column_names.index("observation.images.wrist")
         images = pa.array(emptied, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
         pq.write_table(table.set_column(at, "observation.images.wrist", images), file)
-    with pytest.raises(jcr.InputError, match="holds no observation.images.wrist of frame .*embedded"):
+    with refused("holds no observation.images.wrist of frame .*embedded"):
         jcr.read_capture(path, ReadOptions(episode=(1,), frames=6), into=tmp_path / "again")
 
 
@@ -127,28 +126,23 @@ def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: P
     got = jcr.read_capture(path, options, into=tmp_path / "frames")
     assert_paired(got, writers.arm_poses(angles))
     writers.assert_joints(got, angles)
-    with pytest.raises(jcr.InputError, match="if they are degrees, add --pose-units m-deg"):
+    with refused("if they are degrees, add --pose-units m-deg"):
         options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0")
         jcr.read_capture(path, options, into=tmp_path / "more")
-    with pytest.raises(jcr.InputError, match="pan, lift, roll, grip are no pose; give --urdf"):
+    with refused("pan, lift, roll, grip are no pose; give --urdf"):
         jcr.read_capture(path, into=tmp_path / "more")
 
 
 JOINTS = [f"joint_{k}" for k in range(7)]
 
 
-@pytest.mark.parametrize(
-    ("names", "notation"),
-    [
-        (["gripper", *XYZRPY], "rpy"),
-        ([*JOINTS, "gripper", "x", "y", "z", "qx", "qy", "qz", "qw"], "quat:xyzw"),
-        ([f"ee.{name}" for name in ("x", "y", "z", "wx", "wy", "wz")], "rotvec"),
-    ],
-)
+@pytest.mark.parametrize(("names", "notation"), [
+    (["gripper", *XYZRPY], "rpy"),
+    ([*JOINTS, "gripper", "x", "y", "z", "qx", "qy", "qz", "qw"], "quat:xyzw"),
+    ([f"ee.{name}" for name in ("x", "y", "z", "wx", "wy", "wz")], "rotvec"),
+])  # fmt: skip
 @pytest.mark.parametrize("option", ["auto", "asked"])
-def test_a_pose_is_found_by_its_names_whatever_option_is_given(
-    problem: HandEyeProblem, names: list[str], notation: str, option: str
-):
+def test_a_pose_is_found_by_its_names_whatever_option_is_given(problem, names, notation, option):
     numbers = writers.rows_as(notation, problem.base_from_gripper)
     others = np.random.default_rng(0).uniform(-1, 1, (12, len(names)))
     others[:, len(names) - numbers.shape[1] :] = numbers
@@ -186,7 +180,7 @@ def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: Han
     ],
 )
 def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: dict, words: str):
-    with pytest.raises(jcr.InputError, match=words):
+    with refused(words):
         jcr.read_capture(small, ReadOptions(**options), into=tmp_path / "frames")
     assert not (tmp_path / "frames").exists()
 
@@ -206,11 +200,10 @@ def test_damaged_sets_are_one_line(tmp_path: Path, small: Path):
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(small, copy)
         (copy / name).write_bytes(content)
-        with pytest.raises(jcr.InputError, match=words) as caught:
+        with refused(words):
             jcr.read_capture(copy, into=tmp_path / "frames")
-        assert "\n" not in str(caught.value)
     shutil.copytree(small, tmp_path / "escaped")
     info = json.loads((small / "meta/info.json").read_text()) | {"video_path": "../{video_key}.mp4"}
     (tmp_path / "escaped" / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(jcr.InputError, match="leads out of"):
+    with refused("leads out of"):
         jcr.read_capture(tmp_path / "escaped", into=tmp_path / "frames")

@@ -3,12 +3,10 @@
 import unicodedata
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 
-import jcr
 from jcr.capture.documents import Table
 from jcr.capture.pairing import (
     AS_NUMBERS,
@@ -20,6 +18,7 @@ from jcr.capture.pairing import (
     stamp_ns,
     stamps_of_names,
 )
+from refusal import refused
 from simulation.problems import hand_eye_problem
 
 POSES = hand_eye_problem(np.random.default_rng(3), 6).base_from_gripper
@@ -41,13 +40,9 @@ def table_of(
 
 IMAGES = [f"images/{k}.png" for k in range(7, 13)]
 CELLS = {
-    "path": "images/{}.png",
-    "name": "{}.png",
-    "other folder and ending": "/home/robot/run 7/{}.JPG",
-    "Windows": "C:\\run\\{}.png",
-    "beside": "./images/{}.png",
-    "stem": "{}",
-}
+    "path": "images/{}.png", "name": "{}.png", "other folder and ending": "/home/robot/run 7/{}.JPG",
+    "Windows": "C:\\run\\{}.png", "beside": "./images/{}.png", "stem": "{}",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("cell", "column"), [(cell, "id" if cell == "stem" else "photo") for cell in CELLS])
@@ -62,9 +57,7 @@ def test_any_column_of_images_names_pairs_them(cell: str, column: str | None):
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
-def test_names_in_another_unicode_form_are_the_same(
-    forms: tuple[Literal["NFC", "NFD"], Literal["NFC", "NFD"]],
-):
+def test_names_in_another_unicode_form_are_the_same(forms):
     images = [unicodedata.normalize(forms[0], f"Größe é {k}.png") for k in range(6)]
     cells: list[list[float | str]] = [[unicodedata.normalize(forms[1], f"Größe é {k}.png")] for k in ORDER]
     found = pair(table_of(cells), images)
@@ -102,16 +95,12 @@ def dated(form: str, second: int) -> str:
 
 
 NAMES = {
-    "seconds": lambda s: f"{s}.250000000.png",
-    "nanoseconds": lambda s: f"{s}250000000.png",
-    "microseconds": lambda s: f"{s}250000.png",
-    "milliseconds": lambda s: f"{s}250.png",
-    "prefix": lambda s: f"frame_{s}250000000.png",
-    "suffix": lambda s: f"{s}250000000_color.jpg",
-    "two parts": lambda s: f"{s}_250000000.png",
-    "date": lambda s: dated("%Y-%m-%d_%H-%M-%S.25.jpg", s),
+    "seconds": lambda s: f"{s}.250000000.png", "nanoseconds": lambda s: f"{s}250000000.png",
+    "microseconds": lambda s: f"{s}250000.png", "milliseconds": lambda s: f"{s}250.png",
+    "prefix": lambda s: f"frame_{s}250000000.png", "suffix": lambda s: f"{s}250000000_color.jpg",
+    "two parts": lambda s: f"{s}_250000000.png", "date": lambda s: dated("%Y-%m-%d_%H-%M-%S.25.jpg", s),
     "camera's date": lambda s: dated("IMG_%Y%m%d_%H%M%S_250.jpg", s),
-}
+}  # fmt: skip
 COLUMNS = {
     "s": (["timestamp"], lambda s: [f"{s}.000000000"]),
     "s, a number": (["time"], lambda s: [float(s)]),
@@ -133,11 +122,8 @@ def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
     table = table_of([write(second) for second in EVERY], columns)
     images = [NAMES[name](second) for second in EVERY[:5]]
     found = pair(table, images)
-    assert (
-        found.stamp_ns is not None
-        and found.image_ns is not None
-        and found.skipped >= set(range(len(columns)))
-    )
+    assert found.stamp_ns is not None and found.image_ns is not None
+    assert found.skipped >= set(range(len(columns)))
     assert found.stamp_ns.tolist() == [second * 10**9 for second in EVERY]
     assert (found.image_ns - found.stamp_ns[:5]).tolist() == [250_000_000] * 5
     poses = np.tile(np.eye(4), (6, 1, 1))
@@ -172,9 +158,7 @@ def test_clocks_in_other_time_zones_are_found_where_the_arm_rests(hours: float):
 def test_clocks_that_differ_otherwise_are_named_with_the_difference():
     table = table_of([[f"{second}000000000"] for second in EVERY], ["stamp"])
     found = pair(table, [f"{second + 1234567}000000000.png" for second in EVERY])
-    with pytest.raises(
-        jcr.InputError, match=r"p.csv: no image lies within the times.*\+1234567\.0 s.*the two clocks differ"
-    ):
+    with refused(r"p.csv: no image lies within the times.*\+1234567\.0 s.*the two clocks differ"):
         poses_at_images(np.tile(np.eye(4), (6, 1, 1)), found, 100.0, "p.csv")
 
 
@@ -194,7 +178,7 @@ def test_names_without_stamps_have_none():
 def test_a_stamp_that_64_bits_do_not_hold_is_refused(text: str):
     """By fuzzing: the first made floats of all the stamps beside it, the third was too large to compare."""
     assert stamp_ns("9200000000000000000", "a table") == 9_200_000_000_000_000_000
-    with pytest.raises(jcr.InputError, match="a table: .*not a time stamp"):
+    with refused("a table: .*not a time stamp"):
         stamp_ns(text, "a table")
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import jcr
 from jcr.capture.documents import Table
 from jcr.capture.notations import (
     MAKERS,
@@ -20,6 +19,7 @@ from jcr.capture.notations import (
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import Candidate, pose_columns, readings_of, text_of
 from jcr.geometry import inverse
+from refusal import refused
 from simulation.problems import hand_eye_problem
 
 POSES = hand_eye_problem(np.random.default_rng(3), 12).base_from_gripper
@@ -87,9 +87,7 @@ def test_every_maker_has_a_known_pose():
 @pytest.mark.parametrize(
     ("units", "length", "angle"), [("m-rad", 1, 1), ("mm-deg", 1e3, np.degrees(1)), ("cm-rad", 100, 1)]
 )
-def test_notations_and_units_are_inverted_by_the_writer(
-    notation: str, units: str, length: float, angle: float
-):
+def test_notations_and_units_are_inverted_by_the_writer(notation, units, length, angle):
     numbers = as_numbers(notation, length, angle)
     np.testing.assert_allclose(poses_of(numbers[:, :3], numbers[:, 3:], notation, units), POSES, atol=1e-9)
 
@@ -113,15 +111,13 @@ def test_a_transposed_or_scaled_matrix_is_refused(convention: str):
     right = POSES if convention == "matrix" else np.swapaxes(POSES, 1, 2)
     np.testing.assert_allclose(poses_of_rows(right.reshape(-1, 16), convention), POSES, atol=1e-9)
     for wrong in (np.swapaxes(right, 1, 2), 2 * right):
-        with pytest.raises(jcr.InputError, match="poses: the last row of pose 1 is not 0 0 0 1"):
+        with refused("poses: the last row of pose 1 is not 0 0 0 1"):
             poses_of_rows(wrong.reshape(-1, 16), convention)
 
 
 @pytest.mark.parametrize("name", ["kukka", "euler:xx", "euler:abc", "euler:", "quat", "euler:zyx "])
 def test_an_unknown_notation_lists_those_there_are(name: str):
-    with pytest.raises(
-        jcr.InputError, match=r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"
-    ):
+    with refused(r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"):
         poses_of_rows(np.zeros((1, 6)), name)
 
 
@@ -158,12 +154,9 @@ def test_one_wrong_row_does_not_change_the_unit_of_the_others():
         (1e3 * POSITION + [35e3, 0, 0], "mm", "far away: subtract one offset"),
     ],
 )
-def test_units_that_the_numbers_contradict_and_far_base_frames_are_refused(
-    position: np.ndarray, stated: str | None, words: str
-):
-    with pytest.raises(jcr.InputError, match=f"poses.csv: .*{words}") as caught:
+def test_units_that_the_numbers_contradict_and_far_base_frames_are_refused(position, stated, words):
+    with refused(f"poses.csv: .*{words}"):
         length_unit(position, stated, "poses.csv")
-    assert "\n" not in str(caught.value)
 
 
 def test_units_of_angles_follow_from_the_size():
@@ -171,9 +164,9 @@ def test_units_of_angles_follow_from_the_size():
     for factor, unit in ((1.0, "rad"), (np.degrees(1.0), "deg")):
         assert angle_unit(factor * numbers, "euler:ZYX", None, "") == unit
         assert angle_unit(factor * numbers, "euler:ZYX", unit, "") == unit
-    with pytest.raises(jcr.InputError, match="look like degrees: give --pose-units m-deg"):
+    with refused("look like degrees: give --pose-units m-deg"):
         angle_unit(np.degrees(numbers), "euler:ZYX", "rad", "poses.csv")
-    with pytest.raises(jcr.InputError, match="look like radians: give --pose-units m-rad"):
+    with refused("look like radians: give --pose-units m-rad"):
         angle_unit(0.5 * numbers, "euler:ZYX", "deg", "poses.csv")
     assert angle_unit(numbers_of(ROTATION, "quat:wxyz"), "quat:wxyz", "deg", "") == "rad"
 
@@ -226,11 +219,11 @@ def test_numbers_exclude_what_cannot_be():
 
 
 def test_units_stated_by_a_name_or_an_option_are_refused_where_numbers_contradict():
-    with pytest.raises(jcr.InputError, match=r"poses.csv: .*too near for mm"):
+    with refused(r"poses.csv: .*too near for mm"):
         read(table_of(RPY, "x_mm y_mm z_mm roll pitch yaw"))
-    with pytest.raises(jcr.InputError, match="look like degrees"):
+    with refused("look like degrees"):
         read(table_of(MM_DEG, "x y z roll_rad pitch_rad yaw_rad"))
-    with pytest.raises(jcr.InputError, match="too near for cm"):
+    with refused("too near for cm"):
         read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_units="cm-rad")
     ((reading, poses),) = read(
         table_of(as_numbers("euler:xyz", 100), f"{XYZ} roll pitch yaw"), pose_units="cm-rad"
@@ -239,9 +232,7 @@ def test_units_stated_by_a_name_or_an_option_are_refused_where_numbers_contradic
 
 
 def test_columns_without_the_numbers_of_the_notation_are_named():
-    with pytest.raises(
-        jcr.InputError, match="no columns hold the 4 numbers of --pose-convention abb; .*euler:xyz"
-    ):
+    with refused("no columns hold the 4 numbers of --pose-convention abb; .*euler:xyz"):
         read(table_of(RPY, f"{XYZ} roll pitch yaw"), pose_convention="abb")
 
 
@@ -258,20 +249,11 @@ def test_two_poses_that_could_be_the_robots_are_both_read_and_a_name_chooses():
     assert reading.columns == "tcp" and np.allclose(poses, POSES, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("place", "file", "inverted"),
-    [
-        ("base_from_gripper", "a.json", [False]),
-        ("T_gripper2base", "a.json", [False]),
-        ("end2base", "a.json", [False]),
-        ("", "O_T_EE.txt", [False]),
-        ("gripper_from_base", "a.json", [True]),
-        ("base2gripper", "a.json", [True]),
-        ("", "base_in_gripper.npy", [True]),
-        ("", "poses.npy", [False, True]),
-        ("T", "a.json", [False, True]),
-    ],
-)
+@pytest.mark.parametrize(("place", "file", "inverted"), [
+    ("base_from_gripper", "a.json", [False]), ("T_gripper2base", "a.json", [False]), ("end2base", "a.json", [False]),
+    ("", "O_T_EE.txt", [False]), ("gripper_from_base", "a.json", [True]), ("base2gripper", "a.json", [True]),
+    ("", "base_in_gripper.npy", [True]), ("", "poses.npy", [False, True]), ("T", "a.json", [False, True]),
+])  # fmt: skip
 def test_words_state_the_direction(place: str, file: str, inverted: list[bool]):
     table = table_of(POSES.reshape(12, 16), place=place, file=Path(file))
     found = read(table)

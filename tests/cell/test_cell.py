@@ -29,6 +29,7 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
+from refusal import refused
 from scenes import carried_capture, png_names, reconstruction_of
 from simulation.arms import ArmErrors
 from simulation.cells import FIXED_CAMERA, Kind, cell_problem
@@ -68,7 +69,6 @@ def test_the_stated_accuracy_of_a_fixed_camera_follows_from_its_own_covariance()
     x, distance_m = hand_eye.base_from_camera, required.distance_mm / 1e3
     own = seen_points(x, hand_eye.uncertainty, hand_eye.intrinsics, distance_m)
     assert own.within_95_mm == pytest.approx(required.reached_mm, rel=1e-6)
-    assert hand_eye.uncertainty.seen is not None
     assert own.corners.within_95_mm == pytest.approx(hand_eye.uncertainty.seen.corners.within_95_mm, rel=1e-6)
     # Reported gripper poses are predicted, and not their inverses, whose positions move by the lever of a rotation.
     assert held_out.translation_mm < 3 * np.sqrt(3) * 1e3 * hand_eye.robot_noise.together[0]
@@ -114,24 +114,16 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
     )
     x, z = (np.stack(each) for each in zip(*cell.starts, strict=True))
     start = State(
-        x=x,
-        scale=cell.scale,
-        z=z,
-        world_from_rig=cell.world_from_rig,
-        rig_from_camera=cell.rig_from_camera,
+        x=x, scale=cell.scale, z=z, world_from_rig=cell.world_from_rig, rig_from_camera=cell.rig_from_camera,
         points_in_world=cell.points_in_world,
-    )
+    )  # fmt: skip
     names = png_names(count)
     alone = solve(*with_observations(problem, start))
     tested = Examined(
-        solution=alone,
-        arm=1,
-        names=names,
-        is_given=True,
-        std=np.sqrt(np.diag(alone.transform(lambda state: state.x[1])[1])),
-        camera=1,
+        solution=alone, arm=1, names=names, is_given=True,
+        std=np.sqrt(np.diag(alone.transform(lambda state: state.x[1])[1])), camera=1,
         place=lambda state: state.x[1],
-    )
+    )  # fmt: skip
     confirmed, faults = effects(tested)
     assert [one.kind for one in faults] == [FindingKind.LENGTHS] and faults[0].shift is None
     solution, adopted = _adopted(tested, confirmed, faults)
@@ -169,19 +161,14 @@ def placed(calibrated: tuple[Capture, Reconstruction, Calibration], *cameras: Ce
 
 def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
     return CellCamera(
-        name="overhead",
-        mount="base",
-        images=images,
-        image_size=capture.image_size,
+        name="overhead", mount="base", images=images, image_size=capture.image_size,
         intrinsics=capture.intrinsics if known else None,
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
-def test_an_image_of_the_scene_places_a_fixed_camera(
-    tabletop: Path, whole: Capture, calibrated, known: bool, tmp_path: Path
-):
+def test_an_image_of_the_scene_places_a_fixed_camera(tabletop, whole, calibrated, known, tmp_path):
     truth, own = read_truth(tabletop), calibrated[0].camera_name
     added = added_camera("camera", [whole.folder / whole.images[10]], None, (own,), tmp_path)
     (camera,) = placed(calibrated, replace(added, intrinsics=whole.intrinsics if known else None)).cameras
@@ -194,9 +181,7 @@ def test_an_image_of_the_scene_places_a_fixed_camera(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.009, 1.06])
-def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_used(
-    tabletop: Path, calibrated, factor: float
-):
+def test_given_intrinsics_that_an_image_contradicts_are_named_and_not_used(tabletop, calibrated, factor):
     """Used, 6 % too long would be 20 mm off."""
     truth, true = read_truth(tabletop), calibrated[0].intrinsics
     given = replace(true, fx=factor * true.fx, fy=factor * true.fy)
@@ -218,13 +203,9 @@ def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses
 
     def second(*frames: int) -> CameraPlacement:
         camera = CellCamera(
-            name="second",
-            mount="gripper",
-            images=(old.images[4], old.images[6])[: len(frames)],
-            image_size=old.image_size,
-            intrinsics=old.intrinsics,
-            frame=np.array(frames),
-        )
+            name="second", mount="gripper", images=(old.images[4], old.images[6])[: len(frames)],
+            image_size=old.image_size, intrinsics=old.intrinsics, frame=np.array(frames),
+        )  # fmt: skip
         return placed(calibrated, camera).cameras[0]
 
     for one in (second(5), second(4, 4)):
@@ -241,28 +222,21 @@ def test_the_base_of_a_second_arm_is_found_from_its_wrist_camera(whole: Capture,
     base_from_other = transform(rotation_exp(np.array([0.1, -0.2, 2.8])), np.array([0.9, 0.3, 0.1]))
     rows = [2, 5, *range(OLD, len(capture))]
     camera = CellCamera(
-        name="other_wrist",
-        mount="gripper",
-        arm="other",
-        images=tuple(capture.images[row] for row in rows),
-        image_size=capture.image_size,
-        intrinsics=capture.intrinsics,
+        name="other_wrist", mount="gripper", arm="other", images=tuple(capture.images[row] for row in rows),
+        image_size=capture.image_size, intrinsics=capture.intrinsics,
         base_from_gripper=inverse(base_from_other) @ capture.base_from_gripper[rows],
-    )
+    )  # fmt: skip
     found = placed(calibrated, camera)
     assert found.cameras[0].converged and found.arms[0].name == "other"
     off = step_between(np.array(found.arms[0].base_from_other_base), base_from_other)
     assert np.linalg.norm(off[:3]) < 0.01 and np.degrees(np.linalg.norm(off[3:])) < 1.0
 
 
-@pytest.mark.parametrize(
-    ("faults", "kind", "size"),
-    [
-        (Faults(), None, 0.0),
-        (Faults(slip=(0.005, 0.0)), FindingKind.SLIP, 0.005),
-        (Faults(delay_s=0.05, view_s=1.0), FindingKind.DELAY, 0.05),
-    ],
-)
+@pytest.mark.parametrize(("faults", "kind", "size"), [
+    (Faults(), None, 0.0),
+    (Faults(slip=(0.005, 0.0)), FindingKind.SLIP, 0.005),
+    (Faults(delay_s=0.05, view_s=1.0), FindingKind.DELAY, 0.05),
+])  # fmt: skip
 def test_a_slip_and_late_poses_of_a_further_camera_are_named_with_their_size(faults, kind, size: float):
     """Named "zoom", "principal point moves with gravity" and "poses contradict the images" without this test."""
     rng = np.random.default_rng(901)
@@ -312,7 +286,7 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert written[0]["warnings"] == found.cameras[0].warnings and not written[0]["converged"]
     written[3]["converged"] = False
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": written, "arms": [], "version": "0"}))
-    with pytest.raises(jcr.InputError, match="contradict one another"):
+    with refused("contradict one another"):
         read_cameras(tmp_path)
 
 
@@ -354,11 +328,8 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     )
     (folder / "capture.json").write_text(json.dumps(said))
     capture = read(folder)
-    assert capture.camera_name == "eye" and [camera.name for camera in capture.others] == [
-        "overhead",
-        "second",
-        "right",
-    ]
+    assert capture.camera_name == "eye"
+    assert [camera.name for camera in capture.others] == ["overhead", "second", "right"]
     overhead, second, right = capture.others
     assert overhead.intrinsics is not None and overhead.frame is None
     assert second.frame is not None and second.frame.tolist() == [0, 2]
@@ -373,32 +344,19 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     ]
 
 
-@pytest.mark.parametrize(
-    ("camera", "message"),
-    [
-        (
-            {"mount": "table", "images": ["3.png"]},
-            "overhead.mount: 'table': Input should be 'gripper' or 'base'",
-        ),
-        ({"mount": "base", "images": []}, "no images"),
-        ({"mount": "base", "images": ["3.png", "7.png"]}, "take all with one camera"),
-        ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
-        ({"mount": "gripper", "images": ["3.png"]}, "1 image for 3 frames"),
-        (
-            {"mount": "base", "images": ["3.png"], "intrinsics": INTRINSICS | {"width": 640}},
-            "intrinsics of 640x",
-        ),
-        ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
-        ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
-        ({"mount": "base", "images": ["3.png"], "watches": "gripper"}, "make a capture for each"),
-        (
-            {"mount": "base", "imagse": ["3.png"], "images": ["3.png"]},
-            "overhead.imagse: Extra inputs are not permitted",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("camera", "message"), [
+    ({"mount": "table", "images": ["3.png"]}, "overhead.mount: 'table': Input should be 'gripper' or 'base'"),
+    ({"mount": "base", "images": []}, "no images"),
+    ({"mount": "base", "images": ["3.png", "7.png"]}, "take all with one camera"),
+    ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
+    ({"mount": "gripper", "images": ["3.png"]}, "1 image for 3 frames"),
+    ({"mount": "base", "images": ["3.png"], "intrinsics": INTRINSICS | {"width": 640}}, "intrinsics of 640x"),
+    ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
+    ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
+    ({"mount": "base", "images": ["3.png"], "watches": "gripper"}, "make a capture for each"),
+    ({"mount": "base", "imagse": ["3.png"], "images": ["3.png"]}, "overhead.imagse: Extra inputs are not permitted"),
+])  # fmt: skip
 def test_impossible_cameras_are_refused_in_one_line(folder: Path, camera: dict[str, object], message: str):
     (folder / "capture.json").write_text(json.dumps(content(overhead=camera)))
-    with pytest.raises(jcr.InputError, match=message) as refusal:
+    with refused(message):
         read(folder)
-    assert "\n" not in str(refusal.value)

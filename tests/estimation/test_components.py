@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import jcr
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.robot_errors import errors_of
 from jcr.distributions import chi2
@@ -16,6 +15,7 @@ from jcr.estimation.robot_noise import smooth_errors
 from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import solve
 from jcr.geometry import rotation_exp, step_between, transform
+from refusal import refused
 from simulation.arms import PresetName
 from simulation.problems import bent_problem, error, hand_eye_problem
 
@@ -103,20 +103,17 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
     assert np.allclose(again.gripper_from_camera, known.gripper_from_camera, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("joints", "robot", "words"),
-    [
-        (np.zeros((8, 6)), None, "which robot"),
-        (None, "ur99", "not known; choose one of"),
-        (np.zeros((8, 7)), "ur5e", r"8 poses of a ur5e need \(8, 6\)"),
-        (np.full((8, 6), np.nan), "ur5e", "NaN"),
-        (np.zeros((8, 6)), "ur5e", "disagree"),
-        (None, "so101", "poses do not fit a so101"),
-    ],
-)
+@pytest.mark.parametrize(("joints", "robot", "words"), [
+    (np.zeros((8, 6)), None, "which robot"),
+    (None, "ur99", "not known; choose one of"),
+    (np.zeros((8, 7)), "ur5e", r"8 poses of a ur5e need \(8, 6\)"),
+    (np.full((8, 6), np.nan), "ur5e", "NaN"),
+    (np.zeros((8, 6)), "ur5e", "disagree"),
+    (None, "so101", "poses do not fit a so101"),
+])  # fmt: skip
 def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, robot, words):
     problem = hand_eye_problem(np.random.default_rng(2), 8)
-    with pytest.raises(jcr.InputError, match=words):
+    with refused(words):
         solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)
 
 

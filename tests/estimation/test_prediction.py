@@ -31,9 +31,7 @@ def test_what_is_expected_is_what_is_reported():
     assert (np.abs(np.median(ratios, axis=0)) < np.log(1.25)).all()
 
 
-def test_check_finds_the_bundled_capture_good_and_expects_what_its_run_reports(
-    tabletop: Path, done: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_check_finds_the_bundled_capture_good_and_expects_what_its_run_reports(tabletop, done, monkeypatch):
     kept: list[Examination] = []
 
     def noted(*arguments: Any, **options: Any) -> Examination:
@@ -45,8 +43,6 @@ def test_check_finds_the_bundled_capture_good_and_expects_what_its_run_reports(
     assert good.returncode == 0 and good.stdout.startswith("ACCEPTED") and not good.stderr
     assert "good to calibrate" in good.stdout
     uncertainty, found = read_calibration(done).uncertainty, kept[0].expected
-    assert uncertainty is not None and uncertainty.seen is not None
-    assert found is not None and found.seen is not None
     assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
     assert abs(np.log(found.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
     assert (np.abs(np.log(found.std[:3] / (1e-3 * np.array(uncertainty.translation_std_mm)))) < WITHIN).all()
@@ -67,7 +63,6 @@ def test_what_is_not_known_of_the_camera_is_in_the_expectation():
     assumptions = assumed(gripper, exact, None)
     shifted = predict(replace(assumptions, shifts=(1e-3 * np.eye(7)[3],)), gripper, systematic)
     assert shifted.std[3] == pytest.approx(np.hypot(known.std[3], 1e-3))
-    assert shifted.seen is not None and known.seen is not None
     assert shifted.seen.rotation_95_deg > known.seen.rotation_95_deg
 
 

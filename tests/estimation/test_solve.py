@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-import jcr
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
@@ -15,6 +14,7 @@ from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
 from jcr.findings import FindingKind
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
+from refusal import refused
 from scenes import pairs_of
 from simulation.poses import random_hand_eye
 from simulation.problems import HandEyeProblem, disturbed, error, hand_eye_problem
@@ -107,12 +107,9 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
             squared = errors[part] @ np.linalg.solve(solved.covariance[part, part], errors[part])
             inside[k] += squared < chi2.ppf(0.95, part.stop)
         _, jacobian = pose_residuals(
-            solved.gripper_from_camera,
-            solved.scale,
-            solved.base_from_recon.rigid,
-            problem.base_from_gripper,
+            solved.gripper_from_camera, solved.scale, solved.base_from_recon.rigid, problem.base_from_gripper,
             problem.recon_from_camera,
-        )
+        )  # fmt: skip
         whitened = jacobian.reshape(-1, 13) / np.tile(np.repeat(NOISE, 3), 10)[:, None]
         straight = np.linalg.inv(whitened.T @ whitened)[:7, :7]
         larger.append(np.sqrt(np.diag(solved.covariance) / np.diag(straight)))
@@ -151,12 +148,9 @@ def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
 
     def of_rows(rows):
         return Equations(
-            residual=residual[rows, 0],
-            jacobian=jacobian[rows],
-            prior_information=prior,
-            prior_gradient=np.zeros(13),
-            systematic=alike[np.ix_(rows, rows)],
-        )
+            residual=residual[rows, 0], jacobian=jacobian[rows], prior_information=prior,
+            prior_gradient=np.zeros(13), systematic=alike[np.ix_(rows, rows)],
+        )  # fmt: skip
 
     everything = of_rows(np.arange(48))
     errors, covariance = left_out(solve_equations(everything, sizes), everything.random(sizes))
@@ -171,7 +165,6 @@ def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
         spread = own + by_unknown @ without.covariance @ by_unknown.T
         assert np.allclose(errors[k], expected, rtol=1e-4, atol=1e-9)
         assert np.allclose(covariance[k], spread, rtol=1e-4, atol=1e-4 * np.abs(spread).max())
-    assert full.held_out is not None
     assert 0.5 * 1e3 * np.sqrt(3) * NOISE[0] < full.held_out.translation_mm < 4 * 1e3 * np.sqrt(3) * NOISE[0]
 
 
@@ -204,16 +197,6 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
         std = np.sqrt(np.diag(solved.covariance))
         too_uncertain = bool((std > [0.02] * 3 + [np.radians(3)] * 3 + [0.05]).any())
         assert too_uncertain == any(finding.kind is FindingKind.UNCERTAIN for finding in solved.findings)
-
-
-@pytest.mark.slow
-def test_general_motion_is_never_called_degenerate():
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
-        solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-        assert solved.observability.observable, (seed, solved.observability)
-        assert solved.converged
 
 
 def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
@@ -251,7 +234,7 @@ def test_a_known_height_is_part_of_the_stated_uncertainty(is_metric: bool):
 
 def test_a_flange_that_turns_about_one_axis_gives_the_rotation_that_its_positions_show():
     """Of 30 such arms 9 were told that their poses contradict the images, and rotations were up to 27° off."""
-    for seed in range(10):
+    for seed in range(5):
         rng, x = np.random.default_rng(seed), random_hand_eye(np.random.default_rng(seed))
         yaw = transform(
             rotation_exp(rng.uniform(-2.8, 2.8, (12, 1)) * np.array([0.0, 0.0, 1.0])), np.zeros(3)
@@ -266,19 +249,16 @@ def test_a_flange_that_turns_about_one_axis_gives_the_rotation_that_its_position
         assert np.degrees(np.linalg.norm(step[3:])) < 0.3, seed
 
 
-@pytest.mark.parametrize(
-    ("gripper", "camera", "words"),
-    [
-        (np.eye(4), np.eye(4), "shape"),
-        (np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), "4 camera poses for 3"),
-        (np.tile(np.eye(4), (1, 1, 1)), np.tile(np.eye(4), (1, 1, 1)), "1 pose"),
-        (np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), "0 pose"),
-        (np.full((3, 4, 4), np.nan), np.tile(np.eye(4), (3, 1, 1)), "NaN"),
-        ("poses", "poses", "not numbers"),
-    ],
-)
+@pytest.mark.parametrize(("gripper", "camera", "words"), [
+    (np.eye(4), np.eye(4), "shape"),
+    (np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), "4 camera poses for 3"),
+    (np.tile(np.eye(4), (1, 1, 1)), np.tile(np.eye(4), (1, 1, 1)), "1 pose"),
+    (np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), "0 pose"),
+    (np.full((3, 4, 4), np.nan), np.tile(np.eye(4), (3, 1, 1)), "NaN"),
+    ("poses", "poses", "not numbers"),
+])  # fmt: skip
 def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
-    with pytest.raises(jcr.InputError, match=words):
+    with refused(words):
         solve_hand_eye(gripper, camera)
 
 
@@ -295,7 +275,7 @@ GROWTH = (3e-3, 3e-3)
 """m, rad per image."""
 
 
-def drifting(seed: int, count: int = 30) -> tuple[HandEyeProblem, np.ndarray]:
+def drifting(seed: int, count: int = 20) -> tuple[HandEyeProblem, np.ndarray]:
     """Camera poses whose motions from one to the next have errors, as visual odometry has them."""
     rng = np.random.default_rng([seed, 8])
     problem = hand_eye_problem(rng, count, robot_noise=(2e-4, 5e-4))
@@ -327,11 +307,11 @@ def test_errors_of_camera_positions_do_not_bias_the_scale():
     off, noise = list[float](), np.array([0.01] * 3 + [1e-4] * 3)
     for seed in range(10):
         rng = np.random.default_rng([seed, 10])
-        problem = hand_eye_problem(rng, 30, robot_noise=(2e-4, 5e-4))
+        problem = hand_eye_problem(rng, 20, robot_noise=(2e-4, 5e-4))
         camera = problem.recon_from_camera.copy()
         noise_in_recon = noise / np.repeat([problem.scale, 1.0], 3)
-        camera[:, :3, 3] += noise_in_recon[:3] * rng.normal(size=(30, 3))
-        covariance = np.diag(np.tile(noise_in_recon**2, 30))
+        camera[:, :3, 3] += noise_in_recon[:3] * rng.normal(size=(20, 3))
+        covariance = np.diag(np.tile(noise_in_recon**2, 20))
         solved = solve_hand_eye(problem.base_from_gripper, camera, camera_covariance=covariance)
         off.append(float(np.log(solved.scale / problem.scale)))
     assert abs(np.mean(off)) < 0.02

@@ -201,20 +201,16 @@ def two_cameras(nuisances: bool) -> tuple[CellProblem, Problem, State]:
             freed_std=np.r_[np.repeat([0.05, 0.3], images), np.full(PRISM, 0.1)],
         )
     state = State(
-        x=np.stack([x for x, _ in cell.starts]),
-        scale=1.0,
-        z=np.stack([z for _, z in cell.starts]),
-        world_from_rig=cell.world_from_rig,
-        rig_from_camera=cell.rig_from_camera,
+        x=np.stack([x for x, _ in cell.starts]), scale=1.0, z=np.stack([z for _, z in cell.starts]),
+        world_from_rig=cell.world_from_rig, rig_from_camera=cell.rig_from_camera,
         points_in_world=cell.points_in_world,
-    )
+    )  # fmt: skip
     return cell, *with_observations(problem, state)
 
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_residuals():
     _, problem, state = two_cameras(nuisances=True)
-    assert problem.observations is not None
     rng = np.random.default_rng(0)
     # Off the start, where images differ from their cameras and the cameras from their priors.
     begun = np.zeros(problem.columns.count)

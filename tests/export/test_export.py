@@ -28,7 +28,7 @@ import jcr
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
-from jcr.errors import InputError, RejectedError
+from jcr.errors import RejectedError
 from jcr.export import ros, simulators
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.options import ExportOptions, provenance
@@ -36,6 +36,7 @@ from jcr.geometry import ROOT_FROM_OPTICAL, Similarity, apply, inverse, rotation
 from jcr.records import Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
+from refusal import refused
 from simulation.capture import FRAME_NAMES
 from simulation.problems import shown_points
 from simulation.scenes import make_scene, solid_labels
@@ -71,10 +72,8 @@ def of_publisher(words: list[str]) -> np.ndarray:
 
 def of_launch_xml(path: Path) -> np.ndarray:
     node = ElementTree.parse(path).getroot().find("node")
-    assert node is not None and (node.get("pkg"), node.get("exec")) == (
-        "tf2_ros",
-        "static_transform_publisher",
-    )
+    assert node is not None
+    assert (node.get("pkg"), node.get("exec")) == ("tf2_ros", "static_transform_publisher")
     return of_publisher(node.get("args", "").split())
 
 
@@ -135,9 +134,7 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
 
 
-def test_files_name_the_intrinsics_that_their_transform_belongs_to(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path, capsys):
     content = json.loads((done / "calibration.json").read_text())
     kept = content["with_given_intrinsics"]
     pairs = {
@@ -163,7 +160,7 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(
     assert "mm (median), by the robot's errors" in capsys.readouterr().err
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
-    with pytest.raises(InputError, match="--intrinsics given"):
+    with refused("--intrinsics given"):
         export_run(done, "camera_info", tmp_path / "none.yaml", {"intrinsics": "given"})
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": kept}))
 
@@ -295,20 +292,15 @@ def test_the_joint_of_a_robots_own_urdf_is_replaced_and_all_else_kept(done: Path
         assert dispatch([*command, "--overwrite"]) == 2 and words in capsys.readouterr().err
 
 
-def test_depth_images_lie_on_the_scene(
-    done: Path, tabletop: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path
-):
+def test_depth_images_lie_on_the_scene(done: Path, tabletop: Path, true_mesh: "trimesh.Trimesh", tmp_path):
     folder = export(done, "depth", tmp_path / "depth")
     metres = export(done, "depth", tmp_path / "metres", "--float-depth")
     content = json.loads((folder / "cameras.json").read_text())
     matrix, frame = np.array(content["K"]), content["frames"][3]
     depth = cv2.imread(str(folder / frame["depth"]), cv2.IMREAD_UNCHANGED)
     exact = np.load(metres / json.loads((metres / "cameras.json").read_text())["frames"][3]["depth"])
-    assert (
-        depth is not None
-        and depth.dtype == np.uint16
-        and depth.shape == (content["height"], content["width"])
-    )
+    assert depth is not None and depth.dtype == np.uint16
+    assert depth.shape == (content["height"], content["width"])
     np.testing.assert_allclose(depth / content["depth_scale"], exact, atol=5.1e-4)
     rows = np.argwhere(depth > 0)[::211]
     z = depth[tuple(rows.T)] / content["depth_scale"]
@@ -347,11 +339,11 @@ def test_the_cameras_of_a_data_set_are_a_table_by_episode(done: Path, tmp_path: 
 
 def test_names_that_are_no_frames_are_refused():
     for name in ("", "/tool0", "tool 0", 'a"b', "<x>", "ü", "a--b"):
-        with pytest.raises(InputError, match="frame"):
+        with refused("frame"):
             ros.CameraMount(parent="tool0", child=name, parent_from_child=PARENT_FROM_CHILD)
-    with pytest.raises(InputError, match="different"):
+    with refused("different"):
         ros.CameraMount(parent="tool0", child="tool0", parent_from_child=PARENT_FROM_CHILD)
-    with pytest.raises(InputError, match="root"):
+    with refused("root"):
         ros.on_root(mount(), "optical")
 
 
@@ -381,15 +373,9 @@ def views(tmp_path: Path) -> "PosedImages":
     assert len(image) > 100
     tracks = Tracks(image=image, x_px=x_px, point=point, points_in_recon=points)
     return PosedImages(
-        folder=folder,
-        images=images,
-        base_from_camera=poses,
-        base_from_gripper=poses,
-        intrinsics=INTRINSICS,
-        tracks=tracks,
-        points_in_base=points,
-        base_from_recon=Similarity(np.eye(4), 1.0),
-    )
+        folder=folder, images=images, base_from_camera=poses, base_from_gripper=poses, intrinsics=INTRINSICS,
+        tracks=tracks, points_in_base=points, base_from_recon=Similarity(np.eye(4), 1.0),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("undistorted", "read"), [(False, "read_binary"), (True, "read_text")])
@@ -562,9 +548,7 @@ def test_command_gives_the_asked_root_link(done: Path, tmp_path: Path, capsys: p
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
 
 
-def test_frames_are_those_of_the_capture_and_asked_for_where_unknown(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_frames_are_those_of_the_capture_and_asked_for_where_unknown(done: Path, tmp_path, capsys):
     content, run = json.loads((done / "calibration.json").read_text()), tmp_path / "run"
     run.mkdir()
     shutil.copy(done / "uncertainty.npz", run)
@@ -590,23 +574,19 @@ def of_publisher_names(path: Path) -> tuple[str, str]:
     return words[words.index("--frame-id") + 1], words[words.index("--child-frame-id") + 1]
 
 
-def test_a_file_with_other_content_is_replaced_by_overwrite_alone(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_file_with_other_content_is_replaced_by_overwrite_alone(done: Path, tmp_path, capsys):
     path = export(done, "urdf", tmp_path / "a.urdf")
     before = export(done, "urdf", path).read_text()
     other = ["export", str(done), "urdf", str(path), "--child-frame", "left_optical"]
     assert dispatch(other) == 2 and path.read_text() == before
     assert f"{path}: is there with other content" in capsys.readouterr().err
-    with pytest.raises(InputError, match="--overwrite"):
+    with refused("--overwrite"):
         export_run(done, "moveit", path)
     assert dispatch([*other, "--overwrite"]) == 0 and "left_optical" in path.read_text()
     assert [file.name for file in tmp_path.iterdir()] == ["a.urdf"]
 
 
-def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_every_file(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_rejected_calibration_is_exported_by_force_with_its_reason_in_every_file(done, tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
     for name in (
@@ -653,23 +633,18 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
     assert not [path for path in run.rglob("*") if ".part" in path.name]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["fbx"], "'fbx'"),
-        (["ply"], "jcr map"),
-        (["colmap"], "jcr calibrate"),
-        (["urdf", "--child-frame", "tool0"], "different"),
-        (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
-        (["urdf", "--to-root", "a", "--root-from-optical", *"0000000"], "quaternion"),
-        (["mjcf", "--to-root", "a"], "camera itself"),
-        (["mjcf", "--into", "a.urdf"], "is for the format urdf"),
-        (["lerobot"], "no run of an episode"),
-    ],
-)
-def test_what_cannot_be_exported_is_one_line(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
-):
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["fbx"], "'fbx'"),
+    (["ply"], "jcr map"),
+    (["colmap"], "jcr calibrate"),
+    (["urdf", "--child-frame", "tool0"], "different"),
+    (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
+    (["urdf", "--to-root", "a", "--root-from-optical", *"0000000"], "quaternion"),
+    (["mjcf", "--to-root", "a"], "camera itself"),
+    (["mjcf", "--into", "a.urdf"], "is for the format urdf"),
+    (["lerobot"], "no run of an episode"),
+])  # fmt: skip
+def test_what_cannot_be_exported_is_one_line(done: Path, tmp_path, capsys, arguments: list[str], words: str):
     """In a run folder that holds its calibration and nothing else."""
     for name in ("calibration.json", "uncertainty.npz"):
         shutil.copy(done / name, tmp_path)
@@ -681,24 +656,14 @@ def test_what_cannot_be_exported_is_one_line(
         assert all(row.name in complaint for row in FORMATS)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["octomap", "x.bt", "--voxel-size", "0.0005"], "million"),
-        (["esdf", "x.npz", "--voxel-size", "5"], "voxels of"),
-        (["spheres", "x.npz", "--excess", "0"], "voxels of"),
-        (["esdf", ".", "--voxel-size", "0.05"], "folder"),
-        (["colmap", "."], "is there already"),
-    ],
-)
-def test_wrong_sizes_and_places_are_refused(
-    done: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    options: list[str],
-    words: str,
-):
+@pytest.mark.parametrize(("options", "words"), [
+    (["octomap", "x.bt", "--voxel-size", "0.0005"], "million"),
+    (["esdf", "x.npz", "--voxel-size", "5"], "voxels of"),
+    (["spheres", "x.npz", "--excess", "0"], "voxels of"),
+    (["esdf", ".", "--voxel-size", "0.05"], "folder"),
+    (["colmap", "."], "is there already"),
+])  # fmt: skip
+def test_wrong_sizes_and_places_are_refused(done, tmp_path, monkeypatch, capsys, options, words):
     (tmp_path / "mine.txt").write_text("kept")
     monkeypatch.chdir(tmp_path)
     assert dispatch(["export", str(done), *options]) == 2
@@ -706,9 +671,7 @@ def test_wrong_sizes_and_places_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_rerun_recording_is_read_by_rerun_and_a_missing_package_is_named(
-    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_rerun_recording_is_read_by_rerun_and_a_missing_package_is_named(done, tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "rerun", None)
         without.setattr("jcr.export.formats.load_map", None)  # The package is missed before the map is read.

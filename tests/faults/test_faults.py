@@ -25,13 +25,13 @@ from corpus import small_capture as noise_capture
 from in_process import run_jcr
 from jcr.calibration.record import read_calibration
 from jcr.cli import dispatch
-from jcr.errors import InputError
 from jcr.estimation.arms import arm_named
 from jcr.estimation.kinematics import forward_kinematics
 from jcr.geometry import scale_translation
 from jcr.pipeline import stages
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.result import RunResult
+from refusal import refused
 from simulation.problems import hand_eye_problem
 from waiting import until
 
@@ -144,9 +144,7 @@ def state(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_ends_in_one_line_and_harms_nothing(
-    place: Path, fault: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_each_fault_ends_in_one_line_and_harms_nothing(place: Path, fault: str, monkeypatch, capsys):
     file, change, command, words = FAULTS[fault]
     monkeypatch.chdir(place)
     Path("points.csv").write_text("x,y,z\n0.4,0,0.2\n")
@@ -171,6 +169,7 @@ def test_a_damaged_reconstruction_is_named_others_stay(tmp_path: Path, small_don
     assert state(copy) == before
 
 
+@pytest.mark.usefixtures("nothing_found")
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, small_done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(small_done, out)
@@ -184,9 +183,7 @@ def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Pat
     assert capsys.readouterr().err.startswith("error: ") and not (out / "map.safetensors").exists()
 
 
-def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
-    tmp_path: Path, small_done: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(tmp_path, small_done, monkeypatch):
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
     out, made = tmp_path / "out", RunResult(small_done)
     shutil.copytree(small_done, out)
@@ -268,13 +265,9 @@ def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path:
     environment = {key: value for key, value in os.environ.items() if key not in case.without}
     command = [sys.executable, "-m", "jcr", "calibrate", str(samples), str(out)]
     finished = subprocess.run(
-        ["sh", "-c", case.shell, "sh", *command],
-        env=environment | case.environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-    )
+        ["sh", "-c", case.shell, "sh", *command], env=environment | case.environment, capture_output=True,
+        text=True, check=False, timeout=200,
+    )  # fmt: skip
     assert finished.returncode == case.status, finished.stderr
     assert "Traceback" not in finished.stderr and case.said in finished.stderr
     # What was found is kept, whatever became of the words about it.
@@ -282,9 +275,7 @@ def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path:
     assert case.check(out) and not list(out.glob("*.part*"))
 
 
-def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
-    small_capture: Path, tmp_path: Path
-):
+def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(small_capture: Path, tmp_path):
     out, temporary = tmp_path / "out", tmp_path / "temporary"
     temporary.mkdir()
     words = ["calibrate", str(small_capture), str(out), "--quiet", "--json", "--require", "none"]
@@ -314,7 +305,5 @@ def test_arrays_larger_than_the_memory_are_refused_unread(tmp_path: Path, monkey
     np.savez_compressed(file, about=np.array("{}"), image_index=np.zeros(1_000_000))
     assert file.stat().st_size < 20_000
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}[name])
-    with pytest.raises(
-        InputError, match=r"reconstruction\.npz: unpacks to 0\.0 GB, this machine has 0\.0 GB"
-    ):
+    with refused(r"reconstruction\.npz: unpacks to 0\.0 GB, this machine has 0\.0 GB"):
         read_reconstruction(file)

@@ -117,9 +117,7 @@ def results(out: Path) -> dict[str, object]:
     }
 
 
-def test_a_killed_run_leaves_whole_files_and_resumes_to_the_same_calibration(
-    small_capture: Path, small_done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_killed_run_leaves_whole_files_and_resumes_to_the_same(small_capture, small_done, tmp_path, capsys):
     """JCR_TEST_KILLS=100 for a hundred; half at a random moment, half while a random file is written."""
     draw = random.Random(0)
     expected = results(small_done)

@@ -24,7 +24,6 @@ from PIL import Image
 
 import capture_writers as writers
 import jcr
-from corpus import RUN_IMAGES, sound_run
 from corpus import small_capture as noise_capture
 from jcr.capture.documents import Table
 from jcr.capture.formats import capture_json
@@ -41,6 +40,7 @@ from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud, write_cloud
 from jcr.segments.segmentation import read_labels
 from jcr.sfm.given import reconstruct_given
+from refusal import refused
 from scenes import NO_TRACKS, capture_of, cloud_of, hand_eye_of, maps_of, reconstruction_of
 from scripted_capture import a_capture, still_frames
 from simulation.problems import hand_eye_problem
@@ -83,28 +83,18 @@ def table_capture(folder: Path, named: Callable[[str], str]) -> Path:
     return folder
 
 
-def test_no_name_in_a_file_is_written_outside_of_the_run_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+@pytest.mark.usefixtures("nothing_found")
+def test_no_name_in_a_file_is_written_outside_of_the_run_folder(tmp_path, capsys):
     """The names lead out of the capture and back in, and out of the run folder for good."""
     capture = table_capture(tmp_path / "in/cap", lambda name: f"../../in/cap/{name}")
     (tmp_path / "results/deep").mkdir(parents=True)
     before = state(tmp_path)
-    # The images are found by their last names inside the capture, and noise is rejected.
-    command = [
-        "calibrate",
-        str(capture),
-        str(tmp_path / "results/deep/out"),
-        "--backend",
-        "colmap",
-        "--quiet",
-    ]
-    assert dispatch(command) == 3
-    capsys.readouterr()
     made = tmp_path / "results/deep/out"
-    assert {
-        file: one for file, one in state(tmp_path).items() if not Path(file).is_relative_to(made)
-    } == before
+    # The images are found by their last names inside the capture, and rejected.
+    assert dispatch(["calibrate", str(capture), str(made), "--backend", "colmap", "--quiet"]) == 3
+    capsys.readouterr()
+    after = state(tmp_path)
+    assert {file: after[file] for file in after if not Path(file).is_relative_to(made)} == before
     assert not list(tmp_path.glob("results/*/in"))
 
 
@@ -132,11 +122,11 @@ def test_a_link_to_poses_elsewhere_is_refused_and_no_linked_folder_is_searched(t
     assert "linked folders are left out: log/deep;" in "".join(jcr.read_capture(capture).notes)
     (capture / "poses.csv").rename(tmp_path / "private")
     (capture / "poses.csv").symlink_to(tmp_path / "private")
-    with pytest.raises(InputError, match="leads out of"):
+    with refused("leads out of"):
         jcr.read_capture(capture)
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked/rgb").symlink_to(capture)
-    with pytest.raises(InputError, match="holds no images .*; linked folders are left out: rgb: copy them"):
+    with refused("holds no images .*; linked folders are left out: rgb: copy them"):
         jcr.read_capture(tmp_path / "linked")
 
 
@@ -175,10 +165,10 @@ def test_devices_and_ports_are_decimal_numbers():
     from jcr.live.cameras import open_camera
     from jcr.live.robot import states_of
 
-    with pytest.raises(InputError, match="no such video file"), open_camera("²"):
+    with refused("no such video file"), open_camera("²"):
         pass
     for port in ("²", "9" * 5000):
-        with pytest.raises(InputError, match="no address"):
+        with refused("no address"):
             states_of(f"ur:host:{port}")
 
 
@@ -208,16 +198,22 @@ import resource, sys
 from pathlib import Path
 from types import SimpleNamespace
 sys.path[:0] = {paths}
+import numpy as np
 import jcr
 from jcr.capture.images import read_depth_images, read_image
 from jcr.capture.ros_messages import image_of, read_ros_image
-from test_strangers import labelled
+from jcr.segments.segmentation import read_labels
+from scenes import capture_of, maps_of, reconstruction_of
 folder = Path({folder!r})
+images, poses = ("0.png", "1.png", "2.png"), np.stack([np.eye(4)] * 3)
+capture = capture_of(poses, folder=folder, images=images, image_size=(96, 72))
+camera = jcr.Intrinsics(90.0, 90.0, 47.5, 35.5, 96, 72)
+made = reconstruction_of(poses, intrinsics=camera, pointmaps=maps_of(np.zeros((3, 72, 96, 3)), camera))
 image = SimpleNamespace(format="png", data=(folder / "image.png").read_bytes())
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 before = peak()
 for read in (
-    lambda: read_depth_images(folder / "depth.png", {size}), lambda: labelled(folder),
+    lambda: read_depth_images(folder / "depth.png", {size}), lambda: read_labels(capture, made),
     lambda: read_ros_image(image), lambda: read_image(image_of(image, "x")[0], "x"),
 ):
     try:
@@ -238,29 +234,17 @@ def test_large_images_are_refused_before_they_are_unpacked(tmp_path: Path):
     for name in ("depth", *(f"labels/{k}" for k in range(3))):
         (tmp_path / f"{name}.png").write_bytes(large)
     (tmp_path / "image.png").write_bytes(png_of_zeros(*HUGE, 8))
-    paths = [*sys.path, str(Path(__file__).parent)]
-    program = MEASURED.format(paths=paths, folder=str(tmp_path), size=HUGE)
+    program = MEASURED.format(paths=sys.path, folder=str(tmp_path), size=HUGE)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     *ended, grown = done.stdout.split()
     assert ended == 4 * ["refused"] and int(grown) < 150
-
-
-def labelled(folder: Path) -> object:
-    """Read the labels of a capture whose three images registered."""
-    capture = capture_of(
-        np.stack([np.eye(4)] * 3), folder=folder, images=("0.png", "1.png", "2.png"), image_size=SIZE
-    )
-    maps = maps_of(np.zeros((3, *SIZE[::-1], 3)), CAMERA)
-    return read_labels(
-        capture, reconstruction_of(np.stack([np.eye(4)] * 3), intrinsics=CAMERA, pointmaps=maps)
-    )
 
 
 def test_a_file_that_starts_a_program_is_no_image(tmp_path: Path):
     """Pillow reads PostScript by Ghostscript, whatever the file is called."""
     file = tmp_path / "0.png"
     Image.new("RGB", SIZE).save(file, format="EPS")
-    with pytest.raises(InputError, match="not a readable image"):
+    with refused("not a readable image"):
         read_image(file)
 
 
@@ -278,7 +262,7 @@ def test_a_small_image_in_a_large_tile_is_refused(tmp_path: Path):
     file.write_bytes(tiff_of_tiles(SIZE, (112, 80), zlib.compress(bytes(112 * 80))))
     assert read_image(file).shape == (72, 96, 3)
     file.write_bytes(tiff_of_tiles(SIZE, HUGE, zlib.compress(bytes(1000))))
-    with pytest.raises(InputError, match="over 64 million pixels"):
+    with refused("over 64 million pixels"):
         read_image(file)
 
 
@@ -291,7 +275,7 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
     data = file.read_bytes()
     last = data[data.rfind(b"\xff\xda") : -2]
     file.write_bytes(data[:-2] + 200 * last[:500] + b"\xff\xd9")
-    with pytest.raises(InputError, match="a JPEG of 2[01][0-9] scans"):
+    with refused("a JPEG of 2[01][0-9] scans"):
         read_image(file)
 
 
@@ -331,9 +315,8 @@ WRONG_MESSAGES: dict[str, tuple[Any, Callable[[Any], object]]] = {
 @pytest.mark.parametrize("what", WRONG_MESSAGES)
 def test_images_in_messages_are_read_or_refused(what: str):
     message, read = WRONG_MESSAGES[what]
-    with pytest.raises(InputError, match="^(image|depth): ") as caught:
+    with refused("^(image|depth): "):
         read(message)
-    assert "\n" not in str(caught.value)
 
 
 def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_path: Path):
@@ -345,14 +328,11 @@ def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_
     good = [encode_png(draw.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)) for _ in range(30)]
     damaged = {row: good[row][:300] for row in range(30) if row % 5 in (1, 2)}
     recording = Recording(
-        source=tmp_path / "scan.bag",
-        options=ReadOptions(frames=6),
-        names=[str(k) for k in range(30)],
-        base_from_gripper=poses,
-        speed=np.zeros(30) + np.where(np.arange(30) % 5 == 0, 1.0, 0.0),
+        source=tmp_path / "scan.bag", options=ReadOptions(frames=6), names=[str(k) for k in range(30)],
+        base_from_gripper=poses, speed=np.zeros(30) + np.where(np.arange(30) % 5 == 0, 1.0, 0.0),
         gap_ns=np.zeros(30, np.int64),
         images_of_rows=lambda rows: ((row, damaged.get(row, good[row]), ".png") for row in rows.tolist()),
-    )
+    )  # fmt: skip
     capture = capture_of_recording(recording, tmp_path / "into", lambda *_: None)
     assert len(capture) == 6 and not {int(Path(name).stem) for name in capture.images} & damaged.keys()
     (note,) = [note for note in capture.notes if "cannot be read" in note]
@@ -360,7 +340,7 @@ def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_
     everything = replace(
         recording, images_of_rows=lambda rows: ((row, b"\xff\xd8\xff", ".jpg") for row in rows.tolist())
     )
-    with pytest.raises(InputError, match="not a readable image"):
+    with refused("not a readable image"):
         capture_of_recording(everything, tmp_path / "nothing", lambda *_: None)
 
 
@@ -369,9 +349,7 @@ def test_images_of_a_bag_that_cannot_be_read_are_left_out_with_their_reason(tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["a state of zeros", "too many frames"])
-def test_a_data_set_unpacks_to_no_more_than_a_few_times_its_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-):
+def test_a_data_set_unpacks_to_no_more_than_a_few_times_its_size(tmp_path, monkeypatch, what: str):
     """Whole: 0.1 MB of zeros took 7.6 GB, and three million frames in 0.8 MB 3.4 GB and 41 s."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -392,7 +370,7 @@ def test_a_data_set_unpacks_to_no_more_than_a_few_times_its_size(
         zeros = pa.array([[0.0] * 10**5] * 5)
         place = table.column_names.index("observation.state")
         pq.write_table(table.set_column(place, "observation.state", zeros), file, compression="zstd")
-    with pytest.raises(InputError, match="5 frames in episode 0; 4 at most|unpacks to 0.0 GB"):
+    with refused("5 frames in episode 0; 4 at most|unpacks to 0.0 GB"):
         read_source(folder, ReadOptions(frames=3), into=tmp_path / "into")
 
 
@@ -412,7 +390,7 @@ def test_two_images_share_no_label_image(tmp_path: Path):
     capture = capture_of(poses, folder=tmp_path, images=images, image_size=SIZE)
     labels = read_labels(capture, made)
     assert labels is not None and [np.unique(label).tolist() for label in labels[0]] == [[1], [2], [3]]
-    with pytest.raises(InputError, match="share one label image"):
+    with refused("share one label image"):
         read_labels(replace(capture, images=("images/1.jpg", "images/1.png", "2.png")), made)
 
 
@@ -440,13 +418,10 @@ def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
         assert abs(int(read_image(tmp_path / "out" / frame["file_path"])[0, 0, 0]) - 80 * k) < 4
 
 
-@pytest.mark.parametrize(
-    ("images", "names", "words"),
-    [
-        ("left/1.png left/2.png left/3.png right/1.png", "1.png 2.png 3.png", "1.png could be"),
-        ("1.png 2.png 3.png", "a/1.png b/1.png 2.png 3.png", "could both be 1.png"),
-    ],
-)
+@pytest.mark.parametrize(("images", "names", "words"), [
+    ("left/1.png left/2.png left/3.png right/1.png", "1.png 2.png 3.png", "1.png could be"),
+    ("1.png 2.png 3.png", "a/1.png b/1.png 2.png 3.png", "could both be 1.png"),
+])  # fmt: skip
 def test_an_image_of_a_model_is_one_of_the_capture(tmp_path: Path, images: str, names: str, words: str):
     import pycolmap
 
@@ -460,7 +435,7 @@ def test_an_image_of_a_model_is_one_of_the_capture(tmp_path: Path, images: str, 
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
     model.write_binary(str(tmp_path))
     poses, own = np.stack([np.eye(4)] * len(images.split())), tuple(images.split())
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         reconstruct_given(capture_of(poses, folder=tmp_path, images=own, image_size=SIZE), tmp_path)
 
 
@@ -485,7 +460,7 @@ def test_an_added_image_that_sees_no_point_is_named(tmp_path: Path):
     made = reconstruction_of(cameras, intrinsics=CAMERA, tracks=tracks, pointmaps=maps)
     away = np.diag([1.0, -1.0, -1.0, 1.0])[None]  # the camera looks the other way
     added = replace(capture.of_rows([0]), base_from_gripper=away)
-    with pytest.raises(InputError, match=r"0\.png: sees no point"):
+    with refused(r"0\.png: sees no point"):
         extend(made, np.eye(4), hand_eye_of(np.eye(4)).base_from_recon, 3, added, lambda *_: None)
     # A file may list an image without any track, and points behind a camera.
     two = tracks.only(rows < 2)
@@ -562,7 +537,7 @@ def test_a_map_that_was_changed_answers_nothing(tmp_path: Path, map_file: Path):
     cases = [(what, True) for what in MAP_CHANGES] + [("cells of NaN", False), ("no seen space", False)]
     for what, seals in cases:
         changed_map(map_file, file, MAP_CHANGES[what], seals)
-        with pytest.raises(InputError, match=r"map\.safetensors: the map file is damaged"):
+        with refused(r"map\.safetensors: the map file is damaged"):
             jcr.load_map(file)
             pytest.fail(what)
 
@@ -612,7 +587,7 @@ def test_a_cloud_that_was_changed_is_refused(tmp_path: Path, what: str):
     file = cloud_file(tmp_path)
     assert len(read_cloud(file).label) == 100
     file.write_bytes(CLOUD_CHANGES[what](file.read_bytes()))
-    with pytest.raises(InputError, match=r"cloud\.ply: "):
+    with refused(r"cloud\.ply: "):
         read_cloud(file)
 
 
@@ -638,7 +613,7 @@ def test_depth_of_a_run_folder_is_checked(tmp_path: Path):
         arrays = dict(file)
     for name, value in (("confidence", -1.0), ("relative_std", -1.0), ("depth", -1.0)):
         np.savez(tmp_path / "depth.npz", **arrays | {name: np.full_like(arrays[name], value)})
-        with pytest.raises(InputError, match=r"depth\.npz: damaged"):
+        with refused(r"depth\.npz: damaged"):
             read_depth(tmp_path / "depth.npz", made, None)
 
 
@@ -646,7 +621,7 @@ def test_a_reconstruction_is_not_compressed(tmp_path: Path):
     """Zeros pack 1000 to 1; jcr writes without compression."""
     about = np.array(json.dumps({"format": "jcr.reconstruction/9"}))
     np.savez_compressed(tmp_path / "reconstruction.npz", about=about)
-    with pytest.raises(InputError, match="compressed"):
+    with refused("compressed"):
         read_reconstruction(tmp_path / "reconstruction.npz")
 
 
@@ -659,7 +634,7 @@ def test_a_reading_is_one_that_jcr_writes(tmp_path: Path, reading: dict[str, str
     for stated in ({"file": "poses.csv"}, {"file": "poses.csv", **reading}):
         (folder / "capture.json").write_text(json.dumps(content | {"reading": stated}))
         if reading.keys() <= stated.keys():
-            with pytest.raises(InputError, match="reading"):
+            with refused("reading"):
                 jcr.read_capture(folder)
         else:
             assert jcr.read_capture(folder).reading == Reading(file="poses.csv")
@@ -675,7 +650,7 @@ def test_a_bag_with_computed_columns_is_refused(tmp_path: Path):
             "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1), (2, 2);"
         )
     bag.close()
-    with pytest.raises(InputError, match="computed columns"):
+    with refused("computed columns"):
         jcr.read_capture(tmp_path / "a.db3", into=tmp_path / "into")
 
 
@@ -730,7 +705,6 @@ def test_the_viewer_shows_names_as_text(tmp_path: Path, small_done: Path):
         (capture / one).rename(capture / (own := f"{len(list(capture.iterdir()))}{MARKUP}"))
         images = tuple(replace(i, image=own) for i in images)
     scene = run.scene
-    assert scene is not None
     scene.label_names = tuple(MARKUP for _ in scene.label_names)
     run = run.with_parts(scene=scene)
     server = open_server(0, "test")
@@ -807,23 +781,12 @@ def test_records_check_their_fields_when_they_are_made(what: str):
         RECORDS[what]()
 
 
-def test_names_of_a_run_are_used_as_they_are(tmp_path: Path):
-    """The run folder of a stranger: its calibration names images that its capture does not have."""
-    out = sound_run(tmp_path / "run")
-    content = json.loads((out / "calibration.json").read_text())
-    assert len(content["images"]) == RUN_IMAGES
-    content["images"][0]["image"] = "../../secret.png"
-    (out / "calibration.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="has changed since"):
-        jcr.load_run(out).of_wrist_camera()
-
-
 def test_copies_are_made_after_every_name_was_checked(tmp_path: Path):
     capture = noise_capture(tmp_path / "capture", SIZE, 3)
     wrong = replace(
         capture, images=("images/0.png", "images/1.png", "../secret.png"), source=tmp_path / "table.csv"
     )
     (tmp_path / "secret.png").write_bytes(b"x")
-    with pytest.raises(InputError, match="leads out of"):
+    with refused("leads out of"):
         capture_json.kept(wrong, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -131,16 +131,11 @@ def test_a_reconstruction_in_pieces_leads(faultless: tuple[Capture, Reconstructi
 TOOL = transform(rotation_exp(np.array([0.0, 0.0, 0.4])), np.array([0.0, 0.0, 0.15]))
 
 
-@pytest.mark.parametrize(
-    ("kind", "at_start", "moved"),
-    [
-        *((FindingKind.SLIP, at_start, moved) for at_start, moved in ((False, 5), (True, 3))),
-        *((FindingKind.BASE_MOVED, at_start, moved) for at_start, moved in ((False, 3), (True, 5))),
-    ],
-)
-def test_poses_that_are_moved_alike_to_one_end_are_one_finding(
-    faultless: tuple[Capture, Reconstruction], kind: FindingKind, at_start: bool, moved: int
-):
+@pytest.mark.parametrize(("kind", "at_start", "moved"), [
+    *((FindingKind.SLIP, at_start, moved) for at_start, moved in ((False, 5), (True, 3))),
+    *((FindingKind.BASE_MOVED, at_start, moved) for at_start, moved in ((False, 3), (True, 5))),
+])  # fmt: skip
+def test_poses_that_are_moved_alike_to_one_end_are_one_finding(faultless, kind, at_start, moved):
     """Another TCP moves the poses in gripper axes, another base frame in base axes.
 
     With five of twelve moved, the images that are used contradict each other, and only that was said.

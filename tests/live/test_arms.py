@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-import jcr
 from jcr.geometry import rotation_exp, rotation_log, transform
 from jcr.live.cameras import set_up
 from jcr.live.robot import MOVED_ON, next_rest, states_of
 from places import ROOT
+from refusal import refused
 
 POSE = transform(rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.42, -0.11, 0.36]))
 JOINTS = np.array([0.3, -1.2, 1.5, -1.8, -1.5, 0.4])
@@ -48,7 +48,7 @@ def test_an_xarm_gives_pose_and_joints_from_its_makers_units(monkeypatch: pytest
     found = next_rest(read, None, MOVED_ON)
     assert found.joints is not None
     assert np.allclose(found.base_from_gripper, POSE) and np.allclose(found.joints, JOINTS)
-    with pytest.raises(jcr.InputError, match="xarm:nobody: no answer; check the address"):
+    with refused("xarm:nobody: no answer; check the address"):
         next(nobody())
 
 
@@ -111,5 +111,5 @@ def test_a_device_keeps_to_its_size_or_shows_what_it_does_instead():
     ]
     assert values == [1280, 720, 0]
     small = Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480})
-    with pytest.raises(jcr.InputError, match="--camera-size 1280 720: camera 0 gives 640x480"):
+    with refused("--camera-size 1280 720: camera 0 gives 640x480"):
         set_up(small, (1280, 720), "0")

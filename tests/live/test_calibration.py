@@ -17,6 +17,7 @@ from jcr.geometry import rotation_exp, scale_translation, step_between, transfor
 from jcr.live.calibration import LiveCalibration
 from jcr.live.progress import FIRST_ADVICE, LiveProgress
 from jcr.records import Capture
+from refusal import refused
 from scripted_capture import REQUIRED, still
 
 
@@ -83,9 +84,7 @@ def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_e
     assert error is not None and error.translation_mm < REQUIRED[0] and error.rotation_deg < REQUIRED[1]
 
 
-def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_the_images(
-    small_capture: Path, small_done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_end_is_the_batch_calibration_in_any_order(small_capture, small_done, tmp_path, monkeypatch):
     capture, batch = jcr.read_capture(small_capture), jcr.load_run(small_done)
     with closing(LiveCalibration(tmp_path / "capture", intrinsics=capture.intrinsics)) as live:
         for k in (3, 0, 4, 2, 1):
@@ -103,15 +102,12 @@ def test_the_end_is_the_batch_calibration_whatever_the_names_and_the_order_of_th
 
 
 @pytest.mark.slow
-def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_counts_as_an_image(
-    grown, resumed: LiveCalibration, capture: Capture
-):
+def test_a_resumed_capture_stands_where_it_stood_and_a_retake_is_an_image(grown, resumed, capture):
     before = grown[1][7]
     std = np.sqrt(np.diag(before.hand_eye.covariance)[:6])
 
     def sigmas(state: LiveProgress) -> float:
         """Return the largest difference from the calibration before."""
-        assert state.hand_eye is not None
         away = step_between(state.hand_eye.gripper_from_camera, before.hand_eye.gripper_from_camera)
         return float(np.abs(away / std).max())
 
@@ -147,9 +143,8 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     )
     resumed.remove(len(resumed.live.names) - 1)
     blurred = resumed.add(np.asarray(cv2.GaussianBlur(image, (0, 0), 9), np.uint8), pose)
-    assert FindingKind.BLURRED in against(blurred) and FindingKind.POSE_CONTRADICTS_IMAGE not in against(
-        blurred
-    )
+    assert FindingKind.BLURRED in against(blurred)
+    assert FindingKind.POSE_CONTRADICTS_IMAGE not in against(blurred)
     # What is wrong with single images has not harmed the others.
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
 
@@ -174,11 +169,11 @@ def test_what_cannot_be_kept_is_named_and_nothing_is_written(tmp_path: Path, tab
             (image, poses[1], "image 2: is the same as images/001.png, though the gripper moved by"),
             (image, poses[0], "image 2: repeats images/001.png, image and pose"),
         ):
-            with pytest.raises(jcr.InputError, match=words):
+            with refused(words):
                 live.add(wrong, pose)
-        with pytest.raises(jcr.InputError, match="bgr"):
+        with refused("bgr"):
             live.add(other, poses[1], color="grb")  # pyright: ignore[reportArgumentType]
-        with pytest.raises(jcr.InputError, match="image 2: joints: up to 90 rad; these look like degrees"):
+        with refused("image 2: joints: up to 90 rad; these look like degrees"):
             live.add(other, poses[1], joints=[90.0] * 6)
         assert (live.live.folder / "capture.json").read_bytes() == before
         assert [file.name for file in (live.live.folder / "images").iterdir()] == ["001.png"]
@@ -194,10 +189,10 @@ def test_grey_and_bgr_images_are_converted_lists_are_poses_all_can_be_removed(tm
         live.remove(live.live.names[1])
         assert live.remove(0).images == ()
         for missing in (0, -1, "images/005.png"):
-            with pytest.raises(jcr.InputError, match=f"no image {missing}; the capture has 0"):
+            with refused(f"no image {missing}; the capture has 0"):
                 live.remove(missing)
         assert len(live.add(still(tabletop, 2), poses[2]).images) == 1
     for change in (lambda: live.add(still(tabletop, 3), poses[3]), lambda: live.remove(0), live.undo):
-        with pytest.raises(jcr.InputError, match="is closed"):
+        with refused("is closed"):
             change()
     assert np.array_equal(kept[0], image) and np.array_equal(kept[1], np.dstack([grey] * 3))

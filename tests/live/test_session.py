@@ -4,7 +4,7 @@ import errno
 import json
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
 from jcr.live.folder import LiveFolder
 from jcr.live.robot import MOVED_ON, RobotState, next_rest
 from jcr.live.session import Answer, LiveSession, SessionOptions
+from refusal import refused
 from scripted_capture import RATE, Scripted, a_capture, poses, still, still_frames, take_all, video
 from simulation.ur import SimulatedUr
 
@@ -161,20 +162,12 @@ def test_a_full_disk_refuses_the_image_alone(tmp_path: Path, tabletop: Path, mon
     assert any("No space left" in lines[0] for answer, lines in heard) and len(again.folder.names) == 2
 
 
-@pytest.mark.parametrize(
-    ("camera", "why"),
-    [
-        (lambda first, k: first, "stream frozen"),
-        (
-            lambda first, k: cv2.resize(np.roll(first, 9, 0), (320, 160)),
-            "c of 640x480; set its old resolution",
-        ),
-        (lambda first, k: np.roll(first, 9, 0)[: 480 - k % 2], "size of the camera's images changes"),
-    ],
-)
-def test_a_camera_that_repeats_or_changes_its_size_is_named_and_nothing_is_kept(
-    tmp_path: Path, tabletop: Path, camera: Callable[[ndarray, int], ndarray], why: str
-):
+@pytest.mark.parametrize(("camera", "why"), [
+    (lambda first, k: first, "stream frozen"),
+    (lambda first, k: cv2.resize(np.roll(first, 9, 0), (320, 160)), "c of 640x480; set its old resolution"),
+    (lambda first, k: np.roll(first, 9, 0)[: 480 - k % 2], "size of the camera's images changes"),
+])  # fmt: skip
+def test_a_camera_that_repeats_or_changes_its_size_is_named(tmp_path, tabletop, camera, why):
     first, poses = still(tabletop, 0), list(jcr.read_capture(tabletop).base_from_gripper)
 
     def frames() -> Iterator[Frame]:
@@ -196,7 +189,7 @@ def test_poses_that_stop_end_the_capture_in_one_line_with_all_that_was_taken(tmp
         session.take(RobotState(0.0, poses[0]))
         raise jcr.InputError("--poses ur:192.168.0.2:30003: silent for 5 s")
 
-    with pytest.raises(jcr.InputError, match="silent"):
+    with refused("silent"):
         session.run(source)
     scripted.close()
     assert frames_in(tmp_path / "c") == ["images/001.png"]
@@ -236,9 +229,7 @@ def test_each_pose_gets_the_image_still_there_and_a_stopped_capture_resumes(tmp_
         assert np.allclose(capture.base_from_gripper[k], pose[k])
 
 
-def test_a_capture_without_an_image_ends_with_the_reason(
-    tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_capture_without_an_image_ends_with_the_reason(tmp_path, tabletop: Path, monkeypatch):
     swings = video(tmp_path / "a.avi", tabletop, range(5), rest_s=0)
     monkeypatch.setattr(LiveSession, "run", lambda self: self.take(RobotState(0.0, np.eye(4))))
     ended = run_jcr("capture", tmp_path / "c", "--camera", swings)
@@ -246,14 +237,11 @@ def test_a_capture_without_an_image_ends_with_the_reason(
     assert "no image was kept: the video has ended; an image needs two" in ended.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda image, k: np.roll(image, 3 * k, axis=1), "not still"),
-        (lambda image, k: cv2.GaussianBlur(image, (0, 0), 8), "blurred"),
-        (lambda image, k: image // 64, "nearly black"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda image, k: np.roll(image, 3 * k, axis=1), "not still"),
+    (lambda image, k: cv2.GaussianBlur(image, (0, 0), 8), "blurred"),
+    (lambda image, k: image // 64, "nearly black"),
+])  # fmt: skip
 def test_an_image_that_moves_is_blurred_or_dark_is_refused(tabletop: Path, spoil, words: str):
     rng, image = np.random.default_rng(0), still(tabletop, 0)
     noisy = [np.clip(image + rng.normal(0, 10, image.shape), 0, 255).astype(np.uint8) for _ in range(10)]
@@ -280,7 +268,7 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robot, "UR_TIMEOUT_S", 0.2)
     server = socket.create_server(("127.0.0.1", 0))
     states = lambda: robot.ur_states("127.0.0.1", server.getsockname()[1])  # noqa: E731
-    with pytest.raises(jcr.InputError, match="silent"):
+    with refused("silent"):
         next(states())
 
     def greet() -> None:
@@ -291,9 +279,9 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
 
     thread, closed = threading.Thread(target=greet), states()
     thread.start()
-    with pytest.raises(jcr.InputError, match="not come from a UR"):
+    with refused("not come from a UR"):
         next(states())
     thread.join(5)
     server.close()
-    with pytest.raises(jcr.InputError, match="check the address"):
+    with refused("check the address"):
         next(closed)

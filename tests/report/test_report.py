@@ -57,27 +57,17 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
     assert found.image_index[-1] == UNREGISTERED
     rows = np.arange(UNREGISTERED)
     reconstruction = replace(
-        found,
-        image_index=rows,
-        recon_from_camera=found.recon_from_camera[rows],
-        pointmaps=found.dense.of_rows(rows),
-        tracks=found.tracks.only(found.tracks.image < UNREGISTERED),
-        backend="cast",
-        notes=("a <note> & more",),
-        warnings=("a <pose> is off",),
-    )
+        found, image_index=rows, recon_from_camera=found.recon_from_camera[rows],
+        pointmaps=found.dense.of_rows(rows), tracks=found.tracks.only(found.tracks.image < UNREGISTERED),
+        backend="cast", notes=("a <note> & more",), warnings=("a <pose> is off",),
+    )  # fmt: skip
     hand_eye = calibrate_reconstruction(capture, reconstruction)
     cloud = label_tabletop(point_cloud(capture, reconstruction, hand_eye))
     cloud = replace(cloud, label_names=("none", *(f"<i>{name}" for name in cloud.label_names[1:])))
     return RunResult(
-        out=folder,
-        capture=capture,
-        calibration=hand_eye,
-        reconstruction=reconstruction,
-        measured=None,
-        cloud=cloud,
-        scene=build_scene(cloud, MapOptions(cell=0.02, max_seconds=4.0)),
-    )
+        out=folder, capture=capture, calibration=hand_eye, reconstruction=reconstruction, measured=None,
+        cloud=cloud, scene=build_scene(cloud, MapOptions(cell=0.02, max_seconds=4.0)),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +132,6 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     said = f"{significant(leave_one_out['translation_mm'])} mm, {significant(leave_one_out['rotation_deg'])}°"
     assert f"Leave-one-out error {said}" in elements.text
     required = run.calibration.requirement
-    assert required is not None
     within = (
         f"is placed within {significant(required.reached_mm)} mm and {significant(required.reached_deg)}°"
     )

@@ -20,6 +20,7 @@ from jcr.segments.measure import measure_objects
 from jcr.segments.options import SegmentOptions
 from jcr.segments.segmentation import label_cloud, read_labels
 from jcr.segments.tabletop import fit_support, label_tabletop
+from refusal import refused
 from scenes import capture_of, hand_eye_of, maps_of, reconstruction_of
 
 NOISE = 5e-4
@@ -145,9 +146,9 @@ def test_a_table_without_objects_and_a_scene_without_a_plane_are_reported(rng: n
     scatter = cloud_of(rng, 0.3 * ball / np.linalg.norm(ball, axis=1, keepdims=True))
     cloud, notes = label_cloud(scatter, SegmentOptions())
     assert cloud.label_names == ("none",) and "no plane" in notes[0]
-    with pytest.raises(InputError, match="no plane carries the scene"):
+    with refused("no plane carries the scene"):
         label_cloud(scatter, SegmentOptions(segments="tabletop"))
-    with pytest.raises(InputError, match="10 points"):
+    with refused("10 points"):
         fit_support(cloud_of(rng, ball[:10]))
 
 
@@ -229,16 +230,13 @@ def test_label_images_are_read_where_the_pointmap_looks_through_the_distortion(t
     assert labels is not None and labels[0][0, 0, 0] == 0 and labels[0][0, 15, 18] == 1
 
 
-@pytest.mark.parametrize(
-    ("label", "words"),
-    [
-        (None, "not found"),
-        (np.zeros((60, 79), np.uint8), "is .79, 60. pixels"),
-        (np.zeros((60, 80, 3), np.uint8), "one channel"),
-        (np.full((60, 80), 5000, np.uint16), "holds label 5000"),
-        (b"no picture", "not a readable image"),
-    ],
-)
+@pytest.mark.parametrize(("label", "words"), [
+    (None, "not found"),
+    (np.zeros((60, 79), np.uint8), "is .79, 60. pixels"),
+    (np.zeros((60, 80, 3), np.uint8), "one channel"),
+    (np.full((60, 80), 5000, np.uint16), "holds label 5000"),
+    (b"no picture", "not a readable image"),
+])  # fmt: skip
 def test_unusable_label_images_are_named(tmp_path: Path, label: ndarray | bytes | None, words: str):
     capture, reconstruction = labelled_capture(tmp_path)
     write_label(tmp_path, "a", np.ones((60, 80), np.uint8))
@@ -284,16 +282,11 @@ def tiny_sam(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     torch.manual_seed(0)
     backbone = {
-        "model_type": "sam2_hiera_det_model",
-        "hidden_size": 8,
-        "image_size": [128, 128],
-        "embed_dim_per_stage": [8, 16, 32, 64],
-        "num_attention_heads_per_stage": [1, 1, 1, 1],
-        "blocks_per_stage": [1, 1, 2, 1],
-        "window_size_per_stage": [4, 4, 4, 4],
-        "window_positional_embedding_background_size": [2, 2],
-        "global_attention_blocks": [3],
-    }
+        "model_type": "sam2_hiera_det_model", "hidden_size": 8, "image_size": [128, 128],
+        "embed_dim_per_stage": [8, 16, 32, 64], "num_attention_heads_per_stage": [1, 1, 1, 1],
+        "blocks_per_stage": [1, 1, 2, 1], "window_size_per_stage": [4, 4, 4, 4],
+        "window_positional_embedding_background_size": [2, 2], "global_attention_blocks": [3],
+    }  # fmt: skip
     config = transformers.Sam2Config(
         vision_config={
             "backbone_config": backbone,
@@ -315,9 +308,7 @@ def tiny_sam(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_segment_anything_gives_distinct_masks_of_the_image(
-    tiny_sam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-):
+def test_segment_anything_gives_distinct_masks_of_the_image(tiny_sam, tmp_path, monkeypatch, capfd):
     """A random network is sure of nothing: its masks pass once the thresholds are gone."""
     from jcr.segments.sam import image_masks, load_sam, sam_labels
 

@@ -11,6 +11,7 @@ import pytest
 
 from jcr.errors import InputError
 from places import ROOT
+from refusal import refused
 from simulation.capture import SimulateOptions, simulate
 from simulation.truth import read_truth, surface_in_workspace, true_depth, true_labels
 
@@ -70,7 +71,7 @@ def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
 def test_command_line(tmp_path):
     command = [sys.executable, "-m", "simulation", str(tmp_path / "out"), "--images", "2"]
     assert subprocess.run(command, cwd=ROOT).returncode == 0 and (tmp_path / "out/capture.json").is_file()
-    with pytest.raises(InputError, match="--vignetting 2.0: give 0 to 1"):
+    with refused("--vignetting 2.0: give 0 to 1"):
         simulate(tmp_path / "never", SimulateOptions(vignetting=2.0))
     # A machine without OpenGL: the remedy is named, and nothing is left behind.
     command[3] = str(tmp_path / "blind")

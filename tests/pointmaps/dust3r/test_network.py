@@ -32,7 +32,6 @@ if not FIXTURES.is_dir():
 @cache
 def seeded_weights() -> ModuleType:
     spec = importlib.util.spec_from_file_location("seeded_weights", OF_DUST3R / "seeded_weights.py")
-    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -100,14 +99,11 @@ def pointmaps(network: "Dust3r", truth: "dict[str, torch.Tensor]") -> "tuple[Poi
     )
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *sorted(path.stem for path in FIXTURES.glob("tiny_*.npz")),
-        pytest.param("vitl512dpt_48x64", marks=pytest.mark.long),
-        pytest.param("vitl512dpt_160x224", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("name", [
+    *sorted(path.stem for path in FIXTURES.glob("tiny_*.npz")),
+    pytest.param("vitl512dpt_48x64", marks=pytest.mark.long),
+    pytest.param("vitl512dpt_160x224", marks=pytest.mark.long),
+])  # fmt: skip
 @pytest.mark.usefixtures("inference_mode")
 def test_pointmaps_equal_the_published_network(name: str) -> None:
     import torch

@@ -110,7 +110,6 @@ def test_a_slip_is_named_beside_a_wrong_focal_length():
 def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool):
     made = case(6, 2, NOISE, PairErrors(focal=off))
     truth = made.capture.intrinsics
-    assert truth is not None
     if not given:
         images = replace(made.images, pinhole=None, intrinsics_of_capture=None)
         made = replace(made, capture=replace(made.capture, intrinsics=None), images=images)
@@ -121,7 +120,6 @@ def test_the_focal_length_of_a_network_is_a_measurement(off: float, given: bool)
     assert error @ np.linalg.solve(found.covariance, error) < 18.5
     used = reconstruction.intrinsics
     assert used.fx / truth.fx - 1 == pytest.approx(0 if given else off, abs=5e-3)
-    assert found.intrinsics is not None and found.intrinsics.std is not None
     std = found.intrinsics.std[0] / used.fx
     contradicts = [one for one in found.findings if one.kind is FindingKind.INTRINSICS]
     assert len(contradicts) == (given and off == -0.1)
