@@ -3,11 +3,13 @@
 import re
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from benchmarks.faults import calibrated, outcome
+import benchmarks.faults
+from benchmarks.faults import outcome
 from jcr.calibration.bundle_adjustment import adjusted
 from jcr.calibration.calibrate import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
 from jcr.calibration.checks.effects import _is_plausible, as_remark, check_effects, examined_case
@@ -27,6 +29,8 @@ from simulation.problems import INTRINSICS as OBSERVED_BY
 from simulation.problems import bent_problem, hand_eye_problem, observed
 
 pytestmark = pytest.mark.slow
+
+calibrated = cache(benchmarks.faults.calibrated)
 
 SLIPPED = r"moved on the gripper, or the TCP to have changed, by ([\d.]+) mm and ([\d.]+)° after 05.png"
 NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
@@ -112,10 +116,9 @@ def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot():
 
 def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_faults():
     """The same images, as of a fixed camera before which the gripper carries the scene; its zoom was moved."""
-    found = faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0])
+    found, moving = calibrated(NAMED["zoom"][0], 3)
     seen, reconstruction = reconstructed(found, estimated=False)
     capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
-    moving = calibrate_reconstruction(seen, reconstruction)
     hand_eye = calibrate_reconstruction(capture, reconstruction)
     assert hand_eye.converged and hand_eye.uncertainty.budget is not None
     parts = np.sum(list(vars(hand_eye.uncertainty.budget).values()), axis=0)

@@ -28,8 +28,8 @@ FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)
 
 
 @pytest.fixture(scope="module")
-def capture(tabletop: Path) -> Capture:
-    return jcr.read_capture(tabletop)
+def capture(half_capture: Path) -> Capture:
+    return jcr.read_capture(half_capture)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,6 @@ from jcr.estimation.pose_misfit import Misfit, pose_misfit
 from jcr.geometry import inverse, transform
 from jcr.pipeline.reading_decision import decide
 from jcr.records import Capture
-from places import ROOT
 from refusal import refused
 from scenes import capture_of
 from simulation.layouts import LAYOUTS, Layout
@@ -263,9 +262,9 @@ def test_pairs_with_an_inverse_are_never_accepted(inverted, write, way, tmp_path
 
 
 @pytest.mark.slow
-def test_the_images_decide_once_and_the_run_keeps_the_reading(tmp_path: Path):
+def test_the_images_decide_once_and_the_run_keeps_the_reading(half_capture: Path, tmp_path: Path):
     """Seven bundled images, and a listing in the notation of Doosan without any name."""
-    capture = jcr.read_capture(ROOT / "examples/tabletop")
+    capture = jcr.read_capture(half_capture)
     (tmp_path / "a").mkdir()
     for name in capture.images[:7]:
         shutil.copy(capture.folder / name, tmp_path / "a")

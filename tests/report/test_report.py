@@ -66,7 +66,7 @@ def run(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) ->
     cloud = replace(cloud, label_names=("none", *(f"<i>{name}" for name in cloud.label_names[1:])))
     return RunResult(
         out=folder, capture=capture, calibration=hand_eye, reconstruction=reconstruction, measured=None,
-        cloud=cloud, scene=build_scene(cloud, MapOptions(cell=0.02, max_seconds=4.0)),
+        cloud=cloud, scene=build_scene(cloud, MapOptions(cell=0.02, max_seconds=1.0)),
     )  # fmt: skip
 
 

@@ -263,7 +263,7 @@ def test_the_node_broadcasts_the_accepted_transform(
     monkeypatch: pytest.MonkeyPatch,
 ):
     played = Played(half_capture)
-    parameters = {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
+    parameters = {"folder": str(tmp_path / "c"), "images": 5, "depth_topic": "/depth"}
     parameters |= {"require_mm": 5.0, "require_deg": 1.0}
     monkeypatch.setattr(FakeNode, "parameters", parameters)
     node = node_module.CalibratorNode()
@@ -283,7 +283,7 @@ def test_the_node_broadcasts_the_accepted_transform(
     film.start()
     try:
         assert node.services["~/start"](None, Message()).success
-        for k in range(6):
+        for k in range(5):
             played.at = k
             until(lambda k=k: (tmp_path / f"c/images/{k + 1:03d}.png").exists())
     finally:
@@ -291,7 +291,7 @@ def test_the_node_broadcasts_the_accepted_transform(
         film.join()
     answer = node.services["~/finish"](None, Message())
     states = [json.loads(one.data) for one in node.status.messages]
-    assert states[-1]["done"] and len(states[-1]["images"]) == 6
+    assert states[-1]["done"] and len(states[-1]["images"]) == 5
     capture = jcr.read_capture(tmp_path / "c")
     depth_m = read_depth_images(capture.folder / str(capture.depths[0]), capture.image_size)
     assert np.median(depth_m) == 0.5

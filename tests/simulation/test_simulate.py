@@ -12,6 +12,7 @@ import pytest
 from jcr.errors import InputError
 from places import ROOT
 from refusal import refused
+from simulation.__main__ import main
 from simulation.capture import SimulateOptions, simulate
 from simulation.truth import read_truth, surface_in_workspace, true_depth, true_labels
 
@@ -68,9 +69,10 @@ def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("simulated")
-def test_command_line(tmp_path):
+def test_command_line(tmp_path, monkeypatch):
     command = [sys.executable, "-m", "simulation", str(tmp_path / "out"), "--images", "2"]
-    assert subprocess.run(command, cwd=ROOT).returncode == 0 and (tmp_path / "out/capture.json").is_file()
+    monkeypatch.setattr(sys, "argv", command[2:])
+    assert main() == 0 and (tmp_path / "out/capture.json").is_file()
     with refused("--vignetting 2.0: give 0 to 1"):
         simulate(tmp_path / "never", SimulateOptions(vignetting=2.0))
     # A machine without OpenGL: the remedy is named, and nothing is left behind.
