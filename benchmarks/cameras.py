@@ -30,7 +30,7 @@ from jcr.capture.read import read_capture
 from jcr.cell.place_cameras import place_cameras
 from jcr.errors import RejectedError
 from jcr.estimation.intrinsics_prior import camera_with_prior
-from jcr.estimation.problem import Problem, State, with_observations
+from jcr.estimation.problem import State, with_observations
 from jcr.estimation.solve import Solution, solve
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.records import CellCamera
@@ -102,21 +102,7 @@ def answered(problem: CellProblem, seed: int) -> Solution:
         off = free.directions @ (free.std * rng.normal(size=len(free.std)))
         free = camera_with_prior(with_parameters(camera, parameters(camera) + off))
         cameras.append(replace(free, mount_free=problem.kind == "wrists" and k > 0))
-    state = State(
-        x=np.stack([x for x, _ in problem.starts]),
-        scale=1.0,
-        z=np.stack([z for _, z in problem.starts]),
-        world_from_rig=problem.world_from_rig,
-        rig_from_camera=problem.rig_from_camera,
-        points_in_world=problem.points_in_world,
-    )
-    cell = Problem(
-        arms=tuple(problem.arms),
-        n_rigs=len(state.world_from_rig),
-        cameras=tuple(cameras),
-        observations=problem.observations,
-    )
-    return solve(*with_observations(cell, state))
+    return solve(*with_observations(*problem.unsolved(cameras)))
 
 
 FIXED = "fixed"

@@ -5,6 +5,7 @@ arms with a wrist camera each before one table; `carried`, a fixed camera that w
 those of arms with systematic errors, and the truth is the effective transform.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -13,7 +14,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.arms import arm_named
-from jcr.estimation.problem import Observations, ReportedPoses
+from jcr.estimation.intrinsics_prior import CameraPrior
+from jcr.estimation.problem import Observations, Problem, ReportedPoses, State
 from jcr.estimation.robot_noise import smooth_errors
 from jcr.geometry import Similarity, inverse, rotation_exp, scale_translation, transform
 from jcr.records import Intrinsics
@@ -74,6 +76,19 @@ class CellProblem:
             )
             for k, poses in enumerate(self.reported)
         ]
+
+    def unsolved(self, cameras: Sequence[CameraPrior], scale: float = 1.0) -> tuple[Problem, State]:
+        """Return the adjustment of the cell with priors of its cameras, and the state at the initial estimates.
+
+        `scale` is the initial estimate of the metres per unit of the world.
+        """
+        count = len(self.world_from_rig)
+        problem = Problem(
+            arms=tuple(self.arms), n_rigs=count, cameras=tuple(cameras), observations=self.observations
+        )
+        x, z = (np.stack(each) for each in zip(*self.starts, strict=True))
+        rigs = {"world_from_rig": self.world_from_rig, "rig_from_camera": self.rig_from_camera}
+        return problem, State(x=x, scale=scale, z=z, points_in_world=self.points_in_world, **rigs)
 
 
 def cell_problem(

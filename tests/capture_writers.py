@@ -42,13 +42,11 @@ def begin(folder: Path, capture: Capture) -> Path:
 def write_camera_info(capture: Capture, folder: Path) -> None:
     intrinsics = capture.intrinsics
     content = {
-        "image_width": intrinsics.width,
-        "image_height": intrinsics.height,
-        "camera_name": "wrist",
+        "image_width": intrinsics.width, "image_height": intrinsics.height, "camera_name": "wrist",
         "camera_matrix": {"rows": 3, "cols": 3, "data": intrinsics.matrix.ravel().tolist()},
         "distortion_model": "plumb_bob",
         "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(intrinsics.distortion)},
-    }
+    }  # fmt: skip
     (folder / "camera_info.yaml").write_text(yaml.safe_dump(content))
 
 

@@ -43,11 +43,9 @@ class Chromium:
         shell = f'exec "$0" "$@" 3<&{child_in} 4>&{child_out}'
         self._process = subprocess.Popen(
             ["bash", "-c", shell, binary, *flags, f"--user-data-dir={profile}", "about:blank"],
-            pass_fds=(child_in, child_out),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            pass_fds=(child_in, child_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True,
-        )
+        )  # fmt: skip
         os.close(child_in)
         os.close(child_out)
         self._numbers, self._received = itertools.count(1), b""

@@ -41,11 +41,9 @@ def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
         size = width, round(image.height * scale)
         image.resize(size, Image.Resampling.BOX).save(folder / frame["image"], quality=95)
     intrinsics = {
-        "fx": intrinsics["fx"] * scale,
-        "fy": intrinsics["fy"] * scale,
-        "cx": (size[0] - 1) / 2,
+        "fx": intrinsics["fx"] * scale, "fy": intrinsics["fy"] * scale, "cx": (size[0] - 1) / 2,
         "cy": (size[1] - 1) / 2,
-    }
+    }  # fmt: skip
     (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     return folder
 

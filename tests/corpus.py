@@ -69,11 +69,9 @@ def to_csv(rows: Any) -> str:
 
 
 STRUCTURES: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
-    ".json": (json.loads, to_json),
-    ".yaml": (yaml.safe_load, to_yaml),
-    ".samples": (yaml.safe_load, to_yaml),
+    ".json": (json.loads, to_json), ".yaml": (yaml.safe_load, to_yaml), ".samples": (yaml.safe_load, to_yaml),
     ".csv": (lambda text: list(csv.reader(io.StringIO(text))), to_csv),
-}
+}  # fmt: skip
 """Parser and writer of the files whose values are exchanged, by their endings."""
 
 

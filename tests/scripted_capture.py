@@ -34,12 +34,10 @@ def a_hand_eye(met: bool, reached_mm: float = 1.0) -> Calibration:
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
     found = solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
     required = Requirement(
-        translation_mm=REQUIRED[0],
-        rotation_deg=REQUIRED[1],
-        distance_mm=500.0,
+        translation_mm=REQUIRED[0], rotation_deg=REQUIRED[1], distance_mm=500.0,
         reached_mm=min(reached_mm, REQUIRED[0]) if met else max(reached_mm, 1.1 * REQUIRED[0]),
         reached_deg=0.1,
-    )
+    )  # fmt: skip
     seen = PointUncertainty(
         distance_mm=500.0, within_95_mm=required.reached_mm, lateral_95_mm=0.0, along_95_mm=0.0,
         ray_95_deg=0.0, rotation_95_deg=required.reached_deg,

@@ -73,15 +73,13 @@ STATES: dict[str, Change] = {
     "no fingerprints": lambda c: c.update(made=None),
 }
 CALIBRATIONS: dict[str, Change] = {
-    "scale NaN": lambda c: c.update(scale=float("nan")),
-    "scale null": lambda c: c.update(scale=None),
+    "scale NaN": lambda c: c.update(scale=float("nan")), "scale null": lambda c: c.update(scale=None),
     "covariance of six": lambda c: c["uncertainty"]["covariance"].pop(),
     "negative variance": lambda c: c["uncertainty"]["covariance"][0].__setitem__(0, -1.0),
     "mirrored transform": lambda c: c["gripper_from_camera"][0].__setitem__(0, 3.0),
     "two coefficients": lambda c: c["intrinsics"].update(distortion=[0.1, 0.2]),
-    "no reason": lambda c: c.update(converged=False, warnings=[]),
-    "unknown key": lambda c: c.update(magic=1),
-}
+    "no reason": lambda c: c.update(converged=False, warnings=[]), "unknown key": lambda c: c.update(magic=1),
+}  # fmt: skip
 FILES = [("run.json", STATES), ("calibration.json", CALIBRATIONS)]
 
 

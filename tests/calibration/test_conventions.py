@@ -84,11 +84,9 @@ def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():
     kinds = ("euler:XYZ", "euler:ZYZ", "rotvec")
     untaken = [(Reading(file="poses.csv", notation=one), poses_of(position, numbers, one)) for one in kinds]
     (found,) = better_reading(
-        poses_of(position, numbers, "euler:ZYX"),
-        problem.recon_from_camera,
-        rows=np.arange(10),
+        poses_of(position, numbers, "euler:ZYX"), problem.recon_from_camera, rows=np.arange(10),
         untaken=untaken,
-    )
+    )  # fmt: skip
     assert found.details["remedy"] == "give --pose-convention euler:ZYZ"
     assert found.details["pose_convention"] == "euler:ZYZ" and misfit(found.details["fits"]) < 1.0
 

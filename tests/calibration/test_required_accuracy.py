@@ -88,11 +88,9 @@ def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, se
     given, _ = pairs(12, 12)
     found = calibrate_pose_pairs(given)
     size = {
-        "value": 1e-3 * share * found.requirement.reached_mm,
-        "rotation": 0.0,
-        "count": 6.0,
+        "value": 1e-3 * share * found.requirement.reached_mm, "rotation": 0.0, "count": 6.0,
         "longer": "after",
-    }
+    }  # fmt: skip
     moved = found.with_findings(Finding.of(FindingKind.SLIP, "warns", "mount", *given.images[5:7], **size))
     again = advised(moved, given.base_from_gripper, CalibrateOptions())
     assert [one.severity for one in again.findings] == [severity]

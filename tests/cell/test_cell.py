@@ -23,7 +23,7 @@ from jcr.estimation.hypotheses import Examined
 from jcr.estimation.intrinsics_prior import camera_with_prior
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.pose_equations import fit_known_scale
-from jcr.estimation.problem import Problem, State, with_observations
+from jcr.estimation.problem import with_observations
 from jcr.estimation.solve import solve
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
@@ -106,19 +106,9 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
     arms, reported = cell.arms, cell.reported[1].copy()
     reported[:, 2, 3] *= 1.06
     arms[1] = replace(arms[1], base_from_gripper=reported)
-    problem = Problem(
-        arms=tuple(arms),
-        n_rigs=len(cell.world_from_rig),
-        cameras=tuple(camera_with_prior(one) for one in cell.cameras),
-        observations=cell.observations,
-    )
-    x, z = (np.stack(each) for each in zip(*cell.starts, strict=True))
-    start = State(
-        x=x, scale=cell.scale, z=z, world_from_rig=cell.world_from_rig, rig_from_camera=cell.rig_from_camera,
-        points_in_world=cell.points_in_world,
-    )  # fmt: skip
+    problem, start = cell.unsolved([camera_with_prior(one) for one in cell.cameras], cell.scale)
     names = png_names(count)
-    alone = solve(*with_observations(problem, start))
+    alone = solve(*with_observations(replace(problem, arms=tuple(arms)), start))
     tested = Examined(
         solution=alone, arm=1, names=names, is_given=True,
         std=np.sqrt(np.diag(alone.transform(lambda state: state.x[1])[1])), camera=1,
@@ -129,7 +119,7 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
     solution, adopted = _adopted(tested, confirmed, faults)
     assert not solution.problem.bent[: 6 * count].any() and adopted[0].shift is not None
     cameras = scale_translation(cell.world_from_rig[count : 2 * count], cell.scale)
-    best = fit_known_scale(reported, cameras, (x[1], z[1]), (1e-3, 2e-3)).gripper_from_camera
+    best = fit_known_scale(reported, cameras, (start.x[1], start.z[1]), (1e-3, 2e-3)).gripper_from_camera
     squared = []
     for one in (alone, solution):
         found, covariance = one.transform(lambda state: state.x[1])

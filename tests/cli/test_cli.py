@@ -105,11 +105,9 @@ def result(name: str, reached_mm: float) -> Any:
         missed = Finding.of(FindingKind.NOT_EXACT_ENOUGH, "warns", "none", **required.details)
         content = content.with_findings(missed)
     return SimpleNamespace(
-        converged=content.converged,
-        verdict=content.verdict,
-        calibration=content,
+        converged=content.converged, verdict=content.verdict, calibration=content,
         out=Path("captures/live/result"),
-    )
+    )  # fmt: skip
 
 
 CHECK, RUN = "jcr check captures/live", "jcr run captures/live out/live"

@@ -69,11 +69,9 @@ def test_the_95_percent_region_of_eight_images_of_a_bent_arm_contains_its_error(
         problem = bent_problem(arm_named("panda"), "poor", 14, seed)
         rows = np.random.default_rng(seed).permutation(14)[:8]
         found = solve_hand_eye(
-            problem.base_from_gripper[rows],
-            problem.recon_from_camera[rows],
-            joints=problem.joints[rows],
+            problem.base_from_gripper[rows], problem.recon_from_camera[rows], joints=problem.joints[rows],
             robot=problem.bent.arm,
-        )
+        )  # fmt: skip
         off = error(problem, found.gripper_from_camera, found.scale)[:6]
         squared.append(off @ np.linalg.solve(found.covariance[:6, :6], off))
     assert (np.array(squared) < chi2.ppf(0.95, 6)).sum() >= 11

@@ -33,8 +33,6 @@ from jcr.estimation.point_uncertainty import (
 from jcr.estimation.problem import (
     OF_IMAGE,
     PRISM,
-    Problem,
-    State,
     stepped,
     with_observations,
     wrist_arm,
@@ -44,7 +42,7 @@ from jcr.estimation.projection import derivatives, view_of
 from jcr.estimation.solve import Solution, solve, uncertainty_of
 from jcr.geometry import apply, inverse, retract
 from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
-from simulation.cells import CellProblem, Kind, cell_problem
+from simulation.cells import Kind, cell_problem
 from simulation.problems import INTRINSICS, HandEyeProblem, bent_problem, error, hand_eye_problem, observed
 
 EXACT_CAMERA = camera_with_prior(INTRINSICS, FIXED)
@@ -180,37 +178,16 @@ def test_the_error_that_the_model_leaves_is_not_taken_for_pixel_noise():
     assert noise is not None and noise.sigma_px[0] == pytest.approx(0.1, rel=0.15) and noise.inflation < 1.5
 
 
-COUNT = 6
-
-
-def two_cameras(nuisances: bool) -> tuple[CellProblem, Problem, State]:
-    """Two cameras on one wrist, whose intrinsics and mounts are free, and single images where `nuisances`."""
-    cell = cell_problem("wrists", "typical", COUNT, seed=1, points=60)
-    images = len(cell.observations.rig)
-    own, second = (camera_with_prior(camera, MEASURED) for camera in cell.cameras)
-    problem = Problem(
-        arms=tuple(cell.arms),
-        n_rigs=len(cell.world_from_rig),
-        cameras=(own, replace(second, mount_free=True)),
-        observations=cell.observations,
-    )
-    if nuisances:
-        problem = replace(
-            problem,
-            freed=np.eye(18 + OF_IMAGE * images + PRISM)[:, 18:],
-            freed_std=np.r_[np.repeat([0.05, 0.3], images), np.full(PRISM, 0.1)],
-        )
-    state = State(
-        x=np.stack([x for x, _ in cell.starts]), scale=1.0, z=np.stack([z for _, z in cell.starts]),
-        world_from_rig=cell.world_from_rig, rig_from_camera=cell.rig_from_camera,
-        points_in_world=cell.points_in_world,
-    )  # fmt: skip
-    return cell, *with_observations(problem, state)
-
-
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_residuals():
-    _, problem, state = two_cameras(nuisances=True)
+    """Two cameras on one wrist, whose intrinsics and mounts are free, and parameters of single images."""
+    cell = cell_problem("wrists", "typical", 6, seed=1, points=60)
+    images = len(cell.observations.rig)
+    own, second = (camera_with_prior(camera, MEASURED) for camera in cell.cameras)
+    problem, state = cell.unsolved([own, replace(second, mount_free=True)])
+    freed = np.eye(18 + OF_IMAGE * images + PRISM)[:, 18:]
+    std = np.r_[np.repeat([0.05, 0.3], images), np.full(PRISM, 0.1)]
+    problem, state = with_observations(replace(problem, freed=freed, freed_std=std), state)
     rng = np.random.default_rng(0)
     # Off the start, where images differ from their cameras and the cameras from their priors.
     begun = np.zeros(problem.columns.count)

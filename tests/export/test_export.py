@@ -322,10 +322,8 @@ def test_the_cameras_of_a_data_set_are_a_table_by_episode(done: Path, tmp_path: 
         for name in ("calibration.json", "uncertainty.npz"):
             (run / name).symlink_to(done / name)
         made_from = [
-            str(tmp_path / "set"),
-            "",
-            {"episode": [episode], "camera_topic": "observation.images.wrist"},
-        ]
+            str(tmp_path / "set"), "", {"episode": [episode], "camera_topic": "observation.images.wrist"},
+        ]  # fmt: skip
         (run / "capture/capture.json").write_text(json.dumps({"made_from": made_from}))
     table = parquet.read_table(export_run(tmp_path / "all", "lerobot"))
     rows = table.to_pylist()

@@ -13,7 +13,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -224,55 +224,35 @@ RESULTS = ("calibration.json", "log.txt")
 ODD = "a b'c\"d $HOME `x` *;&|<é>"
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What is unusual, and how the command must end."""
-
-    status: int = 0
-    said: str = ""
-    shell: str = '"$@"'
-    """How it is started."""
-    without: tuple[str, ...] = ()
-    environment: dict[str, str] = field(default_factory=dict)
-    folder: str = "place"
-    check: Callable[[Path], bool] = lambda out: True
-
-
-def private(out: Path) -> bool:
-    return all(stat.S_IMODE((out / name).stat().st_mode) == 0o600 for name in RESULTS)
-
-
-CASES = {
-    "no HOME in locale C": Surroundings(
-        without=("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME"),
-        environment={"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-    ),
-    "paths with spaces and quotes, umask 077 and closed stdin": Surroundings(
-        shell='umask 077; "$@" <&-', folder=ODD, check=private
-    ),
-    "full stdout": Surroundings(2, "No space left", shell='"$@" >/dev/full'),
-}
+CASES: dict[str, tuple[int, str, str, dict[str, str | None], str]] = {
+    "no HOME in locale C": (0, "", '"$@"', dict.fromkeys(("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME"))
+        | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, "place"),
+    "paths with spaces and quotes, umask 077 and closed stdin": (0, "", 'umask 077; "$@" <&-', {}, ODD),
+    "full stdout": (2, "No space left", '"$@" >/dev/full', {}, "place"),
+}  # fmt: skip
+"""Exit status, words of the error, start, changes of the environment (None: removed), and the folder's name."""
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path: Path):
-    case = CASES[name]
+    status, words, shell, changes, folder = CASES[name]
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=(3e-4, 1e-3))
     samples = write_easy_handeye2(
         tmp_path / ODD, problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale)
     )
-    out = tmp_path / case.folder / "out"
-    environment = {key: value for key, value in os.environ.items() if key not in case.without}
+    out = tmp_path / folder / "out"
+    environment = {key: value for key, value in (os.environ | changes).items() if value is not None}
     command = [sys.executable, "-m", "jcr", "calibrate", str(samples), str(out)]
     finished = subprocess.run(
-        ["sh", "-c", case.shell, "sh", *command], env=environment | case.environment, capture_output=True,
-        text=True, check=False, timeout=200,
+        ["sh", "-c", shell, "sh", *command], env=environment, capture_output=True, text=True, timeout=200
     )  # fmt: skip
-    assert finished.returncode == case.status, finished.stderr
-    assert "Traceback" not in finished.stderr and case.said in finished.stderr
+    assert finished.returncode == status, finished.stderr
+    assert "Traceback" not in finished.stderr and words in finished.stderr
     # What was found is kept, whatever became of the words about it.
     assert read_calibration(out).converged and all((out / name).is_file() for name in RESULTS)
-    assert case.check(out) and not list(out.glob("*.part*"))
+    assert not list(out.glob("*.part*"))
+    modes = {stat.S_IMODE((out / name).stat().st_mode) for name in RESULTS}
+    assert modes == {0o600} or "umask" not in name
 
 
 def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(small_capture: Path, tmp_path):

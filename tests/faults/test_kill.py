@@ -79,13 +79,11 @@ READERS = {
     "calibration.json": read_calibration,
     "uncertainty.npz": lambda path: [np.load(path)[name] for name in np.load(path).files],
     "reconstruction.npz": read_reconstruction,
-    "depth.npz": lambda path: RunResult(path.parent).reconstruction,
-    "cloud.ply": read_cloud,
-    "map.safetensors": load_map,
-    "run.json": lambda path: json.loads(path.read_text()),
+    "depth.npz": lambda path: RunResult(path.parent).reconstruction, "cloud.ply": read_cloud,
+    "map.safetensors": load_map, "run.json": lambda path: json.loads(path.read_text()),
     "report.html": lambda path: path.read_text().rindex("</html>"),
     "log.txt": lambda path: path.read_text().rindex("\n"),
-}
+}  # fmt: skip
 
 
 def check_whole(out: Path) -> None:

@@ -36,10 +36,8 @@ def four_permuted(poses: np.ndarray) -> np.ndarray:
 
 
 CONTRADICT: dict[str, Change] = {
-    "permuted": permuted(2),
-    "second half permuted": half_permuted,
-    "four permuted": four_permuted,
-}
+    "permuted": permuted(2), "second half permuted": half_permuted, "four permuted": four_permuted,
+}  # fmt: skip
 """Poses that no other reading explains."""
 OF_POSES = (FindingKind.POSES_CONTRADICT_IMAGES, FindingKind.FEW_AGREE, FindingKind.POSES_SWAPPED)
 CONSEQUENCES = kinds_of("camera", "order", "strain", "robot")

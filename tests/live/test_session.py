@@ -38,12 +38,10 @@ class Stepped:
         self.at = 0
         self.heard: list[tuple[Answer, list[str]]] = []
         self.session, self.scripted = a_capture(
-            folder,
-            still_frames(lambda: still(tabletop, self.at)),
+            folder, still_frames(lambda: still(tabletop, self.at)),
             lambda answer, lines: self.heard.append((answer, lines)),
-            (lambda: RobotState(0.0, self.poses[self.at])) if has_gripper else None,
-            **options,
-        )
+            (lambda: RobotState(0.0, self.poses[self.at])) if has_gripper else None, **options,
+        )  # fmt: skip
         self.folder = self.session.folder
 
     def run(self, steps: list[Step]) -> list[tuple[Answer, list[str]]]:

@@ -113,10 +113,8 @@ def predicted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_one_switch_runs_the_published_method_from_images_to_the_map(predicted: tuple[Path, Path], tmp_path):
     made, pairs = predicted
     options = {
-        "method": "paper",
-        "reconstruct": {"predictions": str(pairs)},
-        "map": {"steps": 10, "cell": 0.04},
-    }
+        "method": "paper", "reconstruct": {"predictions": str(pairs)}, "map": {"steps": 10, "cell": 0.04},
+    }  # fmt: skip
     result = jcr.run(made, tmp_path / "out", options)
     reference = json.loads((made / "reference.json").read_text())["gripper_from_camera"]
     step = step_between(result.gripper_from_camera, np.array(reference))

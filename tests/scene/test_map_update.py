@@ -87,10 +87,8 @@ def known_reconstruction(truth: Truth, rendered: list[View]) -> tuple[Reconstruc
     maps = maps_of(points_in_recon, pinhole, confidence=np.stack(confidence), colors=np.stack(colors))
     facts = {"intrinsics": truth.intrinsics, "tracks": tracks, "backend": "truth", "pointmaps": maps}
     known = {
-        "scale": SCALE,
-        "resting": base_from_recon,
-        "uncertainty": Uncertainty(covariance=1e-10 * np.eye(7)),
-    }
+        "scale": SCALE, "resting": base_from_recon, "uncertainty": Uncertainty(covariance=1e-10 * np.eye(7)),
+    }  # fmt: skip
     return reconstruction_of(recon_from_camera, **facts), hand_eye_of(truth.gripper_from_camera, **known)
 
 

@@ -195,11 +195,9 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
     points = np.concatenate([grid, np.full((30, 40, 1), 0.5)], -1)
     reconstruction = reconstruction_of(
-        np.stack([np.eye(4)] * m),
-        intrinsics=INTRINSICS,
-        image_index=np.array(rows),
+        np.stack([np.eye(4)] * m), intrinsics=INTRINSICS, image_index=np.array(rows),
         pointmaps=maps_of(np.stack([points] * m), PINHOLE),
-    )
+    )  # fmt: skip
     (folder / "labels").mkdir(exist_ok=True)
     return capture, reconstruction
 

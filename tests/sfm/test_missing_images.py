@@ -195,11 +195,9 @@ def exact() -> Tracks:
     n = int(whole.sum())
     assert n > 100
     return Tracks(
-        image=np.repeat(np.arange(3), n),
-        x_px=seen[:, whole].reshape(-1, 2),
-        point=np.tile(np.arange(n), 3),
+        image=np.repeat(np.arange(3), n), x_px=seen[:, whole].reshape(-1, 2), point=np.tile(np.arange(n), 3),
         points_in_recon=points[whole],
-    )
+    )  # fmt: skip
 
 
 def disturbed(tracks: Tracks, px: float) -> Tracks:
