@@ -87,8 +87,14 @@ class CellProblem:
             arms=tuple(self.arms), n_rigs=count, cameras=tuple(cameras), observations=self.observations
         )
         x, z = (np.stack(each) for each in zip(*self.starts, strict=True))
-        rigs = {"world_from_rig": self.world_from_rig, "rig_from_camera": self.rig_from_camera}
-        return problem, State(x=x, scale=scale, z=z, points_in_world=self.points_in_world, **rigs)
+        return problem, State(
+            x=x,
+            scale=scale,
+            z=z,
+            world_from_rig=self.world_from_rig,
+            rig_from_camera=self.rig_from_camera,
+            points_in_world=self.points_in_world,
+        )
 
 
 def cell_problem(
