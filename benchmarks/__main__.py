@@ -203,8 +203,11 @@ def heading(arguments: Arguments) -> str:
         *(word for pair in options.values() for word in pair),
     ]
     share = f" One case in {arguments.every}; without `--every` all." if arguments.every > 1 else ""
-    git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
-    done = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True)
+    git, root = ["git", "-C", str(Path(__file__).parents[1])], ["--", ".", ":!docs/results"]
+    done = subprocess.run([*git, "describe", "--always", "--exclude=*"], capture_output=True, text=True)
+    # Pages that were written before this one are no change of what is measured.
+    is_changed = subprocess.run([*git, "diff", "--quiet", "HEAD", *root], capture_output=True).returncode == 1
+    commit = (done.stdout.strip() or "unknown") + "+" * is_changed
     names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
     versions = [f"{name} {version(name)}" for name in names if name == DISTRIBUTION or is_installed(name)]
     cpuinfo = Path("/proc/cpuinfo")
@@ -214,7 +217,7 @@ def heading(arguments: Arguments) -> str:
     title = next(titles[arguments.name] for _, titles in PAGES.values() if arguments.name in titles)
     return (
         f"# {title}\n\n{subject_of(arguments.name)}{share}\n\n    {shlex.join(command)}\n\n"
-        f"{date.today().isoformat()}, commit `{done.stdout.strip() or 'unknown'}`. {processor}, {os.cpu_count()} "
+        f"{date.today().isoformat()}, commit `{commit}`. {processor}, {os.cpu_count()} "
         f"cores, Python {platform.python_version()}, {', '.join(versions)}.\n\n"
     )
 
