@@ -1,8 +1,8 @@
 """Exceptions for invalid input and rejected results, and functions that format parts of their messages."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from itertools import islice
+from reprlib import Repr
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -41,62 +41,28 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(name[:LONGEST_NAME] for name in names[:NAMED]) + more
 
 
+class _ShortRepr(Repr):
+    """Repr of plain data without most of its parts: that of a small file can have gigabytes, or no end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxother = 3, LONGEST_SHOWN + 1
+        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdict = 30
+
+    def repr_str(self, x: str | bytes, level: int) -> str:
+        """Return the repr of the first part of a text."""
+        return repr(x[: LONGEST_SHOWN + 1])
+
+    repr_bytes = repr_bytearray = repr_str
+
+
 def shown(value: object) -> str:
-    """Return the repr of a value for a message, cut after 80 characters.
-
-    The rest of the repr is never built: that of a small file can have gigabytes, or no end.
-    """
-    text = ""
-    for piece in _pieces(value):
-        text += piece
-        if len(text) > LONGEST_SHOWN:
-            return f"{text[:LONGEST_SHOWN]}…"
-    return text
-
-
-def _pieces(value: object) -> Iterator[str]:
-    """Yield the repr of plain data piece by piece; a piece has a few hundred characters at most.
-
-    Containers inside of a container follow without a limit of depth, so that a container may contain itself.
-    """
-    begun: list[tuple[Iterator[object], str]] = []
-    item: object = value
-    while True:
-        if isinstance(item, dict):
-            yield "{"
-            pairs = (part for key, one in item.items() for part in (_Text(", "), key, _Text(": "), one))
-            begun.append((islice(pairs, 1, None), "}"))
-        elif isinstance(item, list | tuple | set | frozenset):
-            first, last = (
-                ("[", "]")
-                if isinstance(item, list)
-                else ("(", ")")
-                if isinstance(item, tuple)
-                else ("{", "}")
-            )
-            yield first
-            begun.append((islice((part for one in item for part in (_Text(", "), one)), 1, None), last))
-        else:
-            yield _short(item)
-        while begun and (item := next(begun[-1][0], begun)) is begun:
-            yield begun.pop()[1]
-        if not begun:
-            return
-
-
-class _Text(str):
-    """Text between the items of a container, which is no item."""
-
-
-def _short(item: object) -> str:
-    """Return the repr of a value that is no container; of a text or number that is too long, the first part."""
-    if isinstance(item, _Text):
-        return str(item)
-    if isinstance(item, str | bytes | bytearray):
-        return repr(item[: LONGEST_SHOWN + 1])
-    if isinstance(item, int) and item.bit_length() > 4 * LONGEST_SHOWN:
-        return f"a number of {item.bit_length()} bits"
-    return repr(item)
+    """Return the repr of a value for a message, cut after 80 characters."""
+    try:
+        text = _ShortRepr().repr(value)
+    except ValueError:
+        return "a number of thousands of digits"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}…"
 
 
 def first_fault(error: "ValidationError") -> str:

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, PlainSerializer, computed_field
 from jcr.errors import InputError
 from jcr.findings import Finding, unobservable
 from jcr.records.capture import Intrinsics
-from jcr.records.field_checks import require_fields
+from jcr.records.field_checks import Checked
 from jcr.records.json_fields import (
     Covariance7,
     Matrix,
@@ -34,7 +34,7 @@ Radians = Annotated[float, in_unit(180 / np.pi)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageVerdict:
+class ImageVerdict(Checked):
     """Verdict on one image of the capture: whether the calibration uses it, why not, and its residuals."""
 
     image: str
@@ -49,8 +49,6 @@ class ImageVerdict:
     """Angle between reported and predicted gripper orientation (degrees); None for an image that is not registered."""
     reprojection_px: Spread | None = None
     """Median reprojection error (px); None for an image that was not adjusted."""
-
-    __post_init__ = require_fields
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class Observability:
 
 
 @dataclass(frozen=True)
-class Excitation:
+class Excitation(Checked):
     """Directions of translation, rotation and scale, sorted by how strongly the motions excite (determine) each."""
 
     value: Float[ndarray, "7"]
@@ -90,11 +88,9 @@ class Excitation:
     spread: float
     """Root mean square distance (m) of the camera centres from their mean."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
-class RobotNoise:
+class RobotNoise(Checked):
     """Robot errors: random noise of the gripper poses, one sigma per axis, and systematic errors."""
 
     translation: Annotated[Metres, Field(alias="translation_mm")]
@@ -111,8 +107,7 @@ class RobotNoise:
     """Systematic errors of the poses per axis (m, rad), without the part that the hand-eye transform absorbs."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the errors are finite and not negative."""
-        require_fields(self)
+        super().__post_init__()
         sizes = self.translation, self.rotation, self.systematic, *self.systematic_left, *(self.given or ())
         if not all(np.isfinite(sizes)) or min(sizes) < 0:
             raise InputError("RobotNoise: an error that is negative or not finite; give standard deviations")
@@ -128,7 +123,7 @@ class RobotNoise:
 
 
 @dataclass(frozen=True)
-class JointOffsets:
+class JointOffsets(Checked):
     """Estimated offsets of the arm's joint angles, one for each joint, from the base to the gripper."""
 
     offset: Numbers
@@ -138,19 +133,15 @@ class JointOffsets:
     prior_std: float
     """Standard deviation of a joint's offset in the prior (rad), the same for all joints."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
-class Share:
+class Share(Checked):
     """Part of the uncertainty due to one cause: its covariance, and its standard deviations as the rms over the axes."""
 
     translation_mm: Spread
     rotation_deg: Spread
     covariance: PartCovariance7
     """Covariance in COVARIANCE_ORDER; the sum over all causes is the covariance of the calibration."""
-
-    __post_init__ = require_fields
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
@@ -196,7 +187,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class LeaveOneOut:
+class LeaveOneOut(Checked):
     """Mean leave-one-out error: difference of each reported gripper pose from its prediction by the other images."""
 
     translation_mm: Spread
@@ -207,8 +198,6 @@ class LeaveOneOut:
     """Median reprojection error with the predicted poses (px); None if the images were not adjusted."""
     how: str
     """Method of the prediction, in words."""
-
-    __post_init__ = require_fields
 
     @property
     def length_m(self) -> float:
@@ -224,7 +213,7 @@ gripper_from_camera to the true one, R_true = exp(r)·R; and s of the scale, sca
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthCheck:
+class DepthCheck(Checked):
     """Scale error and noise of a depth camera, measured at features whose depth the calibrated images determine."""
 
     off_percent: float
@@ -242,8 +231,6 @@ class DepthCheck:
     features: int
     """Number of features that were compared."""
 
-    __post_init__ = require_fields
-
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
         """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
 
@@ -255,7 +242,7 @@ class DepthCheck:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointUncertainty:
+class PointUncertainty(Checked):
     """Uncertainty of a point that the camera sees: bounds on 95 % of its errors, for exact gripper poses."""
 
     distance_mm: Spread
@@ -271,8 +258,6 @@ class PointUncertainty:
     rotation_95_deg: Spread
     """Bound on the orientation error at the point (degrees), including the rotation about the ray."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
 class PointUncertaintyOverImage(PointUncertainty):
@@ -283,7 +268,7 @@ class PointUncertaintyOverImage(PointUncertainty):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneUncertainty:
+class SceneUncertainty(Checked):
     """Uncertainty of the reconstructed scene in the base frame, with each point triangulated from all its images."""
 
     middle_in_base: Numbers3
@@ -294,8 +279,6 @@ class SceneUncertainty:
     """Standard deviation per axis of a point's remaining error, the deformation of the scene (m)."""
     within_95_m: Spread
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
-
-    __post_init__ = require_fields
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
         """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors.
@@ -309,7 +292,7 @@ class SceneUncertainty:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GivenIntrinsicsResult:
+class GivenIntrinsicsResult(Checked):
     """Most likely transform, and its covariance, for a user who keeps the given instead of the estimated intrinsics."""
 
     gripper_from_camera: Matrix
@@ -322,11 +305,9 @@ class GivenIntrinsicsResult:
     differs_mm: Spread
     """Distance (mm) of one central point's positions by given and estimated intrinsics, each with its transform."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
-class ModelError:
+class ModelError(Checked):
     """Camera-model error: distortion that the model cannot express, as a sum of e polynomials of the pixel."""
 
     likeliest: Numbers
@@ -339,11 +320,9 @@ class ModelError:
     """Distance (px) from the principal point within which the images show points; beyond it, distortion is
     extrapolated."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
-class JointCovariance:
+class JointCovariance(Checked):
     """Joint covariance of transform, scale and intrinsics, from which the uncertainty of any pixel's point follows."""
 
     covariance: Square
@@ -352,8 +331,7 @@ class JointCovariance:
     """Names of the rows: COVARIANCE_ORDER, then fx, fy, cx, cy and the distortion."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the covariance has a row and a column for each name in `order`."""
-        require_fields(self)
+        super().__post_init__()
         if self.covariance.shape != 2 * (len(self.order),):
             raise InputError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
 
@@ -449,7 +427,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
-class PaperResiduals:
+class PaperResiduals(Checked):
     """Mean residuals of AX = XB, where A and B are gripper and camera motions between consecutive used images."""
 
     translation: Spread
@@ -457,11 +435,9 @@ class PaperResiduals:
     rotation: Spread
     """Mean rotation residual δ_R, the Frobenius norm of a difference of rotation matrices."""
 
-    __post_init__ = require_fields
-
 
 @dataclass(frozen=True, kw_only=True)
-class LengthCheck:
+class LengthCheck(Checked):
     """Comparison of a known length, such as a board's size, with its value in the scale of the robot's positions."""
 
     name: Literal["robot", "board", "depth camera", "network"]
@@ -472,8 +448,6 @@ class LengthCheck:
     """Standard deviation of the stated length in percent, without that of the robot."""
     used: bool = False
     """Whether the length is a prior of the scale; none is if two lengths contradict each other."""
-
-    __post_init__ = require_fields
 
     @property
     def off(self) -> float:
@@ -487,7 +461,7 @@ class LengthCheck:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attempt:
+class Attempt(Checked):
     """One attempt to reconstruct and calibrate a capture with one back end: registered images, failure and times."""
 
     backend: str
@@ -501,5 +475,3 @@ class Attempt:
     """Reason why the run does not keep this attempt; None if it does."""
     features: str | None = None
     """Features that were matched between images; None for back ends without a choice of features."""
-
-    __post_init__ = require_fields

@@ -12,7 +12,7 @@ from numpy import ndarray
 from pydantic import ConfigDict, Field, StringConstraints
 
 from jcr.errors import InputError, count_of
-from jcr.records.field_checks import require_counts, require_fields, require_finite, require_rows
+from jcr.records.field_checks import Checked, require_counts, require_finite, require_rows
 from jcr.records.json_fields import Positive, Spread
 
 DistortionModel = Literal["pinhole", "rational", "thin_prism", "fisheye"]
@@ -42,7 +42,7 @@ FrameName = Annotated[str, StringConstraints(pattern=f"^{FRAME_NAME.pattern}$", 
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class Intrinsics(Checked):
     """Intrinsics of a camera (px) for images of `width` x `height` pixels, with one of OpenCV's distortion models."""
 
     __pydantic_config__ = ConfigDict(allow_inf_nan=False)
@@ -70,8 +70,7 @@ class Intrinsics:
         return IntrinsicsAndStd(**values)
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the numbers are possible, with as many distortion coefficients as the model has."""
-        require_fields(self)
+        super().__post_init__()
         names = COEFFICIENTS[self.model]
         if len(self.distortion) != len(names):
             raise InputError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
@@ -85,7 +84,6 @@ class IntrinsicsAndStd(Intrinsics):
     """Standard deviations of fx, fy, cx, cy (px) and the distortion; None where the intrinsics were not estimated."""
 
     def __post_init__(self) -> None:
-        """Raise InputError as for Intrinsics, and unless each parameter or none has a standard deviation."""
         super().__post_init__()
         if self.std is not None and len(self.std) != 4 + len(self.distortion):
             raise InputError(
@@ -99,7 +97,7 @@ Mount = Literal["gripper", "base"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellCamera:
+class CellCamera(Checked):
     """Camera of the robot's cell in addition to the one whose calibration is wanted, with its images."""
 
     name: str
@@ -123,8 +121,7 @@ class CellCamera:
     """Gripper poses of the other arm in its own base frame, one for each image; None without another arm."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless there is a row of each array for each image."""
-        require_fields(self)
+        super().__post_init__()
         require_counts(
             "CellCamera", len(self.images), frame=self.frame, base_from_gripper=self.base_from_gripper
         )
@@ -132,7 +129,7 @@ class CellCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class Reading(Checked):
     """Meaning of the numbers of a pose file: columns, notation of the rotation, units, direction, and who decided it."""
 
     file: _Words
@@ -154,13 +151,9 @@ class Reading:
     next_misfit_mm: float | None = None
     """Misfit (mm) of `next_best`."""
 
-    def __post_init__(self) -> None:
-        """Raise InputError unless notation and units are known, and texts short."""
-        require_fields(self)
-
 
 @dataclass(frozen=True, kw_only=True)
-class FrameNames:
+class FrameNames(Checked):
     """Names of the frames in the user's robot software, as tf names or URDF links; None where unknown."""
 
     base: FrameName | None = None
@@ -170,10 +163,6 @@ class FrameNames:
     camera: FrameName | None = None
     """Optical frame of the images: x right, y down, z forward."""
 
-    def __post_init__(self) -> None:
-        """Raise InputError for a name that tf2 or XML would not accept."""
-        require_fields(self)
-
     def replaced(self, **names: Any) -> "FrameNames":
         """Return the record with those of `names` replaced that are valid; others, and None, change nothing."""
         valid = (name for name, text in names.items() if isinstance(text, str) and FRAME_NAME.fullmatch(text))
@@ -181,7 +170,7 @@ class FrameNames:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capture:
+class Capture(Checked):
     """Images of one scene with the gripper pose at each, after the checks of the reader."""
 
     folder: Path
@@ -225,8 +214,7 @@ class Capture:
     """Readings of the same numbers that a name or an option ruled out, for the diagnosis of a rejected calibration."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless there is a finite gripper pose, and a row of each other array, for each image."""
-        require_fields(self)
+        super().__post_init__()
         require_counts(
             "Capture", len(self.images), base_from_gripper=self.base_from_gripper, depths=self.depths
         )
@@ -238,7 +226,6 @@ class Capture:
                 require_rows("Capture", f"frame of camera {camera.name}", camera.frame, len(self.images))
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return len(self.images)
 
     def __repr__(self) -> str:
@@ -266,7 +253,7 @@ class Capture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosePairs:
+class PosePairs(Checked):
     """Pairs of gripper and camera poses at the same instants, for a calibration without images."""
 
     source: Path
@@ -285,14 +272,12 @@ class PosePairs:
     """Whether the gripper poses were inverted on reading, as `--pose-inverted` asks."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless there is a name for each pair of finite poses."""
-        require_fields(self)
+        super().__post_init__()
         require_counts("PosePairs", len(self.images), base_from_gripper=self.base_from_gripper)
         poses = {"base_from_gripper": self.base_from_gripper, "recon_from_camera": self.recon_from_camera}
         require_finite("PosePairs", **poses)
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
         return len(self.images)
 
     @property

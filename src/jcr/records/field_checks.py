@@ -45,6 +45,13 @@ def require_fields(record: Any) -> None:
                 )
 
 
+class Checked:
+    """Base of the dataclasses whose fields are checked by their annotations when a record is made."""
+
+    def __post_init__(self) -> None:
+        require_fields(self)
+
+
 def require_finite(kind: str, **arrays: ndarray | None) -> None:
     """Raise InputError, begun with the name `kind` of a record, if an array holds NaN or infinity."""
     for name, array in arrays.items():

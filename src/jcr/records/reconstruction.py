@@ -8,12 +8,12 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.records.capture import Intrinsics
-from jcr.records.field_checks import require_fields, require_finite, require_rows
+from jcr.records.field_checks import Checked, require_finite, require_rows
 from jcr.records.json_fields import Positive
 
 
 @dataclass(frozen=True)
-class Body:
+class Body(Checked):
     """Rigid board, or single tag, whose corners are points of the tracks."""
 
     number: int
@@ -24,8 +24,7 @@ class Body:
     """Corners as printed, with z = 0, in metres; in units of the side if the side is unknown."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless there is a finite corner for each point."""
-        require_fields(self)
+        super().__post_init__()
         require_finite("Body", x_in_body=self.x_in_body)
         if len(self.point) != len(self.x_in_body):
             raise InputError(
@@ -34,7 +33,7 @@ class Body:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Boards:
+class Boards(Checked):
     """Board or tags of one `--board` option, as found in the images."""
 
     spec: str
@@ -53,13 +52,9 @@ class Boards:
     is_stretched: bool = False
     """Whether a calibration found the print stretched, so that its stretch and size have no prior; not stored."""
 
-    def __post_init__(self) -> None:
-        """Raise InputError unless the numbers are possible."""
-        require_fields(self)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Tracks:
+class Tracks(Checked):
     """Points of a reconstruction and their k observations in the images, for bundle adjustment."""
 
     image: Int[ndarray, " k"]
@@ -79,8 +74,7 @@ class Tracks:
     """Boards or tags whose corners are among the points; None without the option `--board`."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless each observation is finite and of a point that is there."""
-        require_fields(self)
+        super().__post_init__()
         require_finite("Tracks", x_px=self.x_px, points_in_recon=self.points_in_recon)
         require_rows("Tracks", "point", self.point, len(self.points_in_recon))
         if self.std_px is not None and not (self.std_px > 0).all():
@@ -118,7 +112,7 @@ network. PRIOR: a plane supported by the colours and the matched depths around i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pointmaps:
+class Pointmaps(Checked):
     """Surface point of each pixel (h,w) of the m registered images, in the recon frame."""
 
     intrinsics: Intrinsics
@@ -134,8 +128,7 @@ class Pointmaps:
     """Standard deviation of each depth z (recon units), 0 without a depth; None: unknown."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless all arrays are on the pixel grid of the intrinsics, with confidences of 0 or more."""
-        require_fields(self)
+        super().__post_init__()
         if self.confidence.shape[1:] != (self.intrinsics.height, self.intrinsics.width):
             size = f"{self.intrinsics.width}x{self.intrinsics.height}"
             raise InputError(
@@ -164,7 +157,7 @@ class Pointmaps:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruction:
+class Reconstruction(Checked):
     """Reconstruction of a capture: camera poses, tracks and pointmaps in one frame (recon) of any origin and unit."""
 
     image_index: Int[ndarray, " m"]
@@ -193,8 +186,7 @@ class Reconstruction:
     images determine the focal length, or nothing was predicted."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the cameras are finite, their rows ascend, and the tracks are of these images."""
-        require_fields(self)
+        super().__post_init__()
         m = len(self.image_index)
         require_finite("Reconstruction", recon_from_camera=self.recon_from_camera)
         if len(self.recon_from_camera) != m or (
@@ -218,7 +210,7 @@ class Reconstruction:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointCloud:
+class PointCloud(Checked):
     """Point cloud in the base frame: confident points of the pointmaps, with the centre of the camera that saw each."""
 
     points_in_base: Float[ndarray, "n 3"]
@@ -240,8 +232,7 @@ class PointCloud:
     """Mask of points whose ray from the camera counts as free space; None: all points but those of reason PRIOR."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the numbers are finite, and labels and images are within their tables."""
-        require_fields(self)
+        super().__post_init__()
         numbers = "points_in_base", "confidence", "margin", "depth_std", "camera_centers_in_base"
         require_finite("PointCloud", **{name: getattr(self, name) for name in numbers})
         for name in ("margin", "depth_std"):
