@@ -18,7 +18,7 @@ import tyro
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed, xfeat_is_installed
 from jcr.hub import HUB_ID, Weights, cached_files
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
@@ -47,9 +47,7 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
     as the weights found on this machine, and `device` as "cpu" or "cuda".
     """
 
-    def reconstruct(
-        capture: Capture, options: "ReconstructOptions", progress: Progress | None
-    ) -> Reconstruction:
+    def reconstruct(capture: Capture, options: "ReconstructOptions", progress: Progress) -> Reconstruction:
         """Run the back end with its options."""
         if "device" in arguments:
             extra("torch", "networks", f"backend {options.backend}")
@@ -242,7 +240,7 @@ class ReconstructOptions:
 
 
 def reconstruct(
-    capture: Capture, options: ReconstructOptions | None = None, progress: Progress | None = None
+    capture: Capture, options: ReconstructOptions | None = None, progress: Progress = silent
 ) -> Reconstruction:
     """Reconstruct a capture with the back end that `options` select; for `auto`, the first candidate.
 

@@ -80,7 +80,10 @@ def first_fault(error: "ValidationError") -> str:
 
 
 class InputError(ValueError):
-    """Error for invalid input (exit status 2); the message states the fault, its place, and the remedy."""
+    """Error for invalid input (exit status 2); the message states the fault, its place, and the remedy.
+
+    Messages of functions with an argument `where`, which is the place in words, begin with it.
+    """
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))

@@ -29,7 +29,7 @@ MOST_PAIRS = 100
 
 
 def with_boards(
-    capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress | None = None
+    capture: Capture, reconstruction: Reconstruction, spec: str, progress: Progress = silent
 ) -> Reconstruction:
     """Add the corners of the board or tags that `spec` (the value of --board) names to the tracks of a reconstruction.
 
@@ -37,12 +37,11 @@ def with_boards(
     and finished fraction; None: no display. Without any detected corner, the tracks only record that no board was
     found. Raises InputError for a name that means no board.
     """
-    report = progress or silent
     readings = boards(spec)
-    report("board", 0.0)
+    progress("board", 0.0)
     images = [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index]
     board, sightings = most_seen(readings, images)
-    report("board", 1.0)
+    progress("board", 1.0)
     bodies, elsewhere = [], set[int]()
     tracks, cameras = reconstruction.tracks, reconstruction.recon_from_camera
     for number in sorted({s.body for shown in sightings for s in shown}):

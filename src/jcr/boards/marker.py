@@ -36,7 +36,7 @@ Pose = tuple[float, Float[ndarray, "4 4"]]
 """Pose of a body in one image: rms reprojection error (px) of its points, and camera_from_body."""
 
 
-def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_marker(capture: Capture, look_for: str, progress: Progress = silent) -> Reconstruction:
     """Reconstruct cameras from a board or tags, in metres, or in sides of a square or tag if its size is unknown.
 
     The recon frame is that of the board or tag that most images show. `look_for` names the board in a form of
@@ -44,12 +44,11 @@ def reconstruct_marker(capture: Capture, look_for: str, progress: Progress | Non
     calibrated from the board. Raises InputError for a name that means no board, and RejectedError when fewer than three
     images show it (four, if intrinsics are unknown).
     """
-    report = progress or silent
     readings = boards(look_for)
     images = [read_image(capture.folder / name) for name in capture.images]
-    report("board", 0.0)
+    progress("board", 0.0)
     board, seen = most_seen(readings, images)
-    report("board", 1.0)
+    progress("board", 1.0)
     seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
     notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
     given, warnings = usable_intrinsics(capture.intrinsics)

@@ -33,7 +33,7 @@ def checked_capture(
     A frame is an image (path relative to `folder`) with its pose. The frames in `faults` (index to message) and
     positions over 10 m from the base are left out with a note. So are images that are missing, damaged, duplicated or
     of another size than most. Raises InputError if more frames are faulty than `tolerated` permits, or if they leave
-    fewer than three. Messages begin with `where`, the file that names the images.
+    fewer than three.
     """
     require_frames(len(images), where, at_least=1)
     for k, name in enumerate(images):
@@ -73,7 +73,7 @@ def checked_capture(
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
-    """Raise InputError, begun with `where`, if `count` frames are fewer than `at_least` or more than 1000."""
+    """Raise InputError if `count` frames are fewer than `at_least` or more than 1000."""
     if count > MAX_FRAMES:
         raise InputError(
             f"{where}: {count_of(count, 'frame')}; choose {MAX_FRAMES} at most; 5 to 15 are usual"
@@ -83,7 +83,7 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
-    """Raise InputError, begun with `where`, if there are three or more gripper poses and all equal the first.
+    """Raise InputError if there are three or more gripper poses and all equal the first.
 
     Equal means within 0.5 mm and 0.05° in each component of the translation and the rotation vector.
     """
@@ -100,8 +100,8 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
 def far_faults(position: Float[ndarray, "n 3"], where: str, names: list[str]) -> dict[int, str]:
     """Return a message for each position (m, base frame) that is more than 10 m from the base, by the index of its row.
 
-    Raises InputError, begun with `where`, if more rows are that far than `tolerated` permits, or the only row is. Wrong
-    units or a far base frame are then the cause. `names` are the names of the rows in the messages. NaN counts as 0.
+    Raises InputError if more rows are that far than `tolerated` permits, or the only row is. Wrong units or a far base
+    frame are then the cause. NaN counts as 0.
     """
     distance = np.linalg.norm(np.nan_to_num(position), axis=1)
     rows = np.flatnonzero(distance > METRES_LIMIT).tolist()

@@ -101,10 +101,7 @@ def _slowest(moving: list[Rows], speed: Float[ndarray, " n"], count: int) -> lis
 
 
 def _frames_of_views(views: Rows, base_from_gripper: Poses, at_rest: Bool[ndarray, " n"], count: int) -> Rows:
-    """Return the rows of up to `count` of n `views` that minimise the predicted uncertainty; those at rest come first.
-
-    `base_from_gripper` and `at_rest` are those of the views.
-    """
+    """Return the rows of up to `count` of n `views` that minimise the predicted uncertainty, those at rest first."""
     information = _pose_information(base_from_gripper)
     frames, known = np.zeros(0, int), WEAK * np.eye(13)
     for of_kind in (at_rest, ~at_rest):

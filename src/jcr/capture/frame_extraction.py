@@ -51,8 +51,8 @@ class Recording:
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
     """Write the best frames of a recording, at most `options.frames`, to the folder `into`; return them as a capture.
 
-    `report` receives the progress. Raises InputError if no frame has pose samples around it within
-    `options.max_gap_ms`. It also raises InputError if images are missing, or if too few frames are still and sharp.
+    Raises InputError if no frame has pose samples around it within `options.max_gap_ms`. It also raises InputError if
+    images are missing, or if too few frames are still and sharp.
     """
     options, (fresh, stale) = recording.options, _fresh_frames(recording)
     faults, looked = dict[int, str](), 0
@@ -126,7 +126,7 @@ def _fresh_frames(recording: Recording) -> tuple[Bool[ndarray, " n"], tuple[str,
 def _written(recording: Recording, rows: Rows, into: Path, report: Progress) -> list[str]:
     """Write the images of the frames `rows` to the folder `into`; return their paths relative to it.
 
-    `report` receives the progress. Raises InputError for an image that cannot be read.
+    Raises InputError for an image that cannot be read.
     """
     images = list[str]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):

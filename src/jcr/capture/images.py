@@ -54,8 +54,8 @@ DARK, BRIGHT = 12, 243
 def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
     """Open an image file, or the bytes of one, and yield it with its header read and its pixels not yet decoded.
 
-    Raises InputError, begun with `where`, if it is no image, has more than MAX_PIXELS pixels or several images, or if
-    decoding it under `with` fails.
+    Raises InputError if it is no image, has more than MAX_PIXELS pixels or several images, or if decoding it under
+    `with` fails.
     """
     if isinstance(source, Path):
         require_file(source)
@@ -91,7 +91,7 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
 
 
 def require_pixels(size: tuple[int, int], where: str) -> None:
-    """Raise InputError, begun with `where`, if a `size` (width, height) is empty or has more than MAX_PIXELS pixels."""
+    """Raise InputError if a `size` (width, height) is empty or has more than MAX_PIXELS pixels."""
     if min(size) < 1:
         raise InputError(f"{where}: {size[0]}x{size[1]} pixels, an empty image; take it again")
     if size[0] * size[1] > MAX_PIXELS:
@@ -119,7 +119,7 @@ def read_image(source: Path | bytes, where: str | None = None) -> UInt8[ndarray,
 def read_one_channel(source: Path | bytes, where: str) -> UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"]:
     """Read the values of a grey image of 8 or 16 bits: labels, or depth (mm).
 
-    `source` is a file or the bytes of one. Raises InputError, begun with `where`, for any other file.
+    `source` is a file or the bytes of one. Raises InputError for any other file.
     """
     with opened_image(source, where) as opened:
         kind = ONE_CHANNEL.get(opened.mode)
@@ -150,7 +150,7 @@ def read_depth_images(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h 
 def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, int]:
     """Return the size (width, height in px) that all images share; raise InputError if one has another size.
 
-    `sizes` maps the name of each image to its size. The message begins with `where`.
+    `sizes` maps the name of each image to its size.
     """
     (first, size), *others = sizes.items()
     if other := [one for one in others if one[1] != size]:
@@ -184,9 +184,8 @@ def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
 def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:
     """Test whether two RGB images show the same view, as from a camera at rest: their details differ little.
 
-    Details are structures of a few pixels, normalised by their contrast. The result is True if their mean squared
-    difference is below a quarter of the sum of both mean squares. After a motion by a few pixels, the details of two
-    images have nothing in common.
+    Details are structures of a few pixels, normalised by their contrast. After a motion by a few pixels, the details of
+    two images have nothing in common.
     """
     details = []
     for image in (first, other):

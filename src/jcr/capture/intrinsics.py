@@ -103,7 +103,7 @@ def read_intrinsics(file: Path) -> IntrinsicsEntry | None:
 def intrinsics_entry(stated: dict[str, Any], where: str) -> IntrinsicsEntry:
     """Return the entry of stated fx, fy, cx, cy, skew, distortion, model by the name of a tool, width, height.
 
-    Raises InputError, begun with `where`, for what jcr's camera models cannot express.
+    Raises InputError for what jcr's camera models cannot express.
     """
     model, coefficients = (
         str(stated.get("model") or "").lower(),

@@ -172,10 +172,10 @@ def poses_of(
 def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str) -> str:
     """Return the unit (m, mm or cm) of positions as written, by their size; `stated` is the one that was given, if any.
 
-    Raises InputError, begun with `where`, if the size contradicts the stated unit, or if the base frame is far from
-    all positions. Positions further from the origin than 10 are no metres, and positions that are all within 10 of each
-    other are no millimetres, because a calibration needs motions above 10 mm. Raises InputError, too, for several
-    positions below NEAR_BASE that may be millimetres or centimetres.
+    Raises InputError if the size contradicts the stated unit, or if the base frame is far from all positions. Positions
+    further from the origin than 10 are no metres, and positions that are all within 10 of each other are no
+    millimetres, because a calibration needs motions above 10 mm. Raises InputError, too, for several positions below
+    NEAR_BASE that may be millimetres or centimetres.
     """
     position = position[np.isfinite(position).all(1)]
     if not len(position):
@@ -217,7 +217,7 @@ def angle_unit(numbers: Float[ndarray, "n k"], notation: str, stated: str | None
     """Return the unit (rad or deg) of a rotation's numbers, by their size; `stated` is the one that was given, if any.
 
     Angles beyond 2π are degrees. Angles that are all within 2π are radians: as degrees they would turn the gripper by
-    less than 7°. Raises InputError, begun with `where`, if the size contradicts the stated unit.
+    less than 7°. Raises InputError if the size contradicts the stated unit.
     """
     if NUMBERS[notation] != 3:
         return "rad"
@@ -240,7 +240,7 @@ def poses_of_rows(
     """Return the transforms (m) of rows of numbers in a known notation: a position and a rotation, or 12 or 16 numbers.
 
     `convention` is a value of `--pose-convention`; `units` are such as "mm-deg", or "auto" for those that the sizes of
-    the numbers show. Raises InputError, begun with `where`, for a row that is no transform.
+    the numbers show. Raises InputError for a row that is no transform.
     """
     notation, numbers = notation_of(convention), np.asarray(rows, dtype=np.float64)
     width = 12 if notation.startswith("matrix") else 3 + NUMBERS[notation]

@@ -207,7 +207,7 @@ def stamp_ns(text: str, where: str = "") -> int:
     """Convert a time stamp from text to nanoseconds: a number whose size tells s, ms, µs or ns, or a date with a time.
 
     Numbers below 1e11 are in s, below 1e14 in ms, below 1e17 in µs, others in ns. The result is exact. A date counts as
-    UTC. Raises InputError, begun with `where`, if the text is no time stamp.
+    UTC. Raises InputError if the text is no time stamp.
     """
     with suppress(ArithmeticError, ValueError):  # errors of Decimal and int
         if (date := DATE.search(text)) is not None:
@@ -297,9 +297,9 @@ def poses_at_images(
 ) -> tuple[Float[ndarray, "n 4 4"], Bool[ndarray, " n"], str | None]:
     """Return the poses at the images by row or by time, a mask of images whose poses are stale, and a note or None.
 
-    An image without a row or with a stale pose gets NaN. A stale pose is interpolated between samples that are more than
-    `max_gap_ms` apart. Where no image lies within the times, a difference of time zones is tried: a multiple of a
-    quarter of an hour with which the arm is at rest at the images. Raises InputError, begun with `where`, if none fits.
+    An image without a row or with a stale pose gets NaN. A stale pose is interpolated between samples that are more
+    than `max_gap_ms` apart. Where no image lies within the times, a difference of time zones is tried: a multiple of a
+    quarter of an hour with which the arm is at rest at the images. Raises InputError if none fits.
     """
     if paired.stamp_ns is None or paired.image_ns is None:
         assert paired.row is not None
@@ -357,10 +357,7 @@ FARTHEST = 2
 
 
 def other_orders(names: Sequence[str]) -> Iterator[tuple[str, Int[ndarray, " n"]]]:
-    """Yield other orders of the poses of n named images: words for each, and the pose's index of each image, or -1.
-
-    The orders are the reverse one, shifts by one and two images, and the names sorted as text and as numbers.
-    """
+    """Yield other orders of the poses of n named images: words for each, and the pose's index of each image, or -1."""
     n = len(names)
     yield "listed in reverse order of the images", np.arange(n)[::-1]
     for shift in range(1, min(FARTHEST, n - 5) + 1):

@@ -33,8 +33,7 @@ def interpolated_poses(
     """Return poses interpolated at n time stamps (ns), and the time (ns) between the two samples around each.
 
     `a_from_b` are the samples at the times `sample_ns`; of samples with equal times, the first is used. Positions are
-    interpolated linearly, rotations by slerp. Outside of the samples the nearest one is returned. The time between is 0
-    at a sample, and the largest int64 outside of the samples.
+    interpolated linearly, rotations by slerp. Outside of the samples the nearest one is returned.
     """
     times, first = np.unique(sample_ns, return_index=True)
     before, share, gap = bracket(times, stamp_ns)
@@ -67,15 +66,14 @@ def bracket(
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     """Return the speed (m/s) of a moving frame at n time stamps (ns), averaged over 0.1 s around each.
 
-    The speed is that of the translation plus 0.3 m times the angular speed (rad/s). `poses_at` is a function from time
-    stamps to poses and gaps.
+    The speed is that of the translation plus 0.3 m times the angular speed (rad/s).
     """
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     return np.asarray(motion_length(inverse(start[0]) @ end[0])) / (2e-9 * SPEED_OVER_NS)
 
 
 def poses_of_numbers(numbers: Float[ndarray, "n 7"], where: str) -> Float[ndarray, "n 4 4"]:
-    """Return transforms from x, y, z, qx, qy, qz, qw; raise InputError, begun with `where`, if one is no transform."""
+    """Return transforms from x, y, z, qx, qy, qz, qw; raise InputError if one is no transform."""
     if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
         raise InputError(f"{where}: holds a transform that is none; record again")
     return transform(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
@@ -112,8 +110,7 @@ class TfTree:
         """Return a function from time stamps (ns) to base_from_gripper and the gaps (ns) between samples around each.
 
         A gap is the largest of all transforms between the frames; static transforms have none. `base` and `gripper` are
-        names of frames. Raises InputError, begun with `source`, if one is None or unknown, or if they are not
-        connected.
+        names of frames. Raises InputError if one is None or unknown, or if they are not connected.
         """
         frames, chains = sorted(self._parent.keys() | set(self._parent.values())), list[list[str]]()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
@@ -142,10 +139,7 @@ class TfTree:
         return poses_at
 
     def _poses_of(self, child: str, source: Path) -> PosesAt:
-        """Return the function from time stamps (ns) to parent_from_child of a frame and the gaps (ns) of its samples.
-
-        Raises InputError, begun with `source`, for numbers that are no transform.
-        """
+        """Return the function from time stamps (ns) to parent_from_child of a frame and the gaps (ns) of its samples."""
         of_stamps, of_numbers = self._samples[child]
         stamps, numbers = np.frombuffer(of_stamps, np.int64), np.frombuffer(of_numbers).reshape(-1, 7)
         poses = poses_of_numbers(numbers, f"{source}: tf from {self._parent[child]} to {child}")

@@ -37,7 +37,7 @@ def read_capture(
     options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     at_least: int = MIN_FRAMES,
 ) -> Capture:
     """Read the capture at a path, in any format of the manual's page `captures`.
@@ -57,7 +57,7 @@ def read_source(
     options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
     """Return the capture at a path, or PosePairs if the file has camera poses but no images.
@@ -83,7 +83,7 @@ def read_source(
         extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
         if extra.get("made_from") == origin:
             return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
-        found = FORMATS[name].read(path, options, folder, progress or silent)
+        found = FORMATS[name].read(path, options, folder, progress)
     if (
         options.pose_inverted
         and isinstance(found, Capture)

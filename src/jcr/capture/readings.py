@@ -330,8 +330,8 @@ def readings_of(
     """Return the readings of a table that names, numbers and options leave possible, each with its poses (m).
 
     The first result is the `relevance` of the columns that were read. The list is empty if no columns hold a pose.
-    `skipped` are columns that are not part of a pose. Raises InputError, begun with `where`, if the numbers contradict
-    the units that an option or a name states, or have no columns for the notation in `options.pose_convention`.
+    `skipped` are columns that are not part of a pose. Raises InputError if the numbers contradict the units that an
+    option or a name states, or have no columns for the notation in `options.pose_convention`.
     """
     numbers, found, errors = numbers_of_table(table), list[Candidate](), list[InputError]()
     sets = pose_columns(table, skipped)

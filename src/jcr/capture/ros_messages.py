@@ -38,9 +38,9 @@ def intrinsics_of_ros(
 ) -> Intrinsics | None:
     """Return the intrinsics of images of `size` (width, height); None if the camera was never calibrated.
 
-    `content` is a CameraInfo message; an uncalibrated camera has a matrix of zeros.
-    Rectified images (`is_rectified`) have the intrinsics of the projection matrix P and no distortion. Raises
-    InputError, begun with `where`, for an unknown distortion model, or intrinsics of another resolution.
+    `content` is a CameraInfo message; an uncalibrated camera has a matrix of zeros. Rectified images (`is_rectified`)
+    have the intrinsics of the projection matrix P and no distortion. Raises InputError for an unknown distortion model,
+    or intrinsics of another resolution.
     """
     info: CameraInfo = validated_content(CameraInfo, content, where)
     matrix, model, coefficients = info.k, info.distortion_model, info.d
@@ -87,7 +87,7 @@ def read_ros_camera_info(message: Any) -> Intrinsics | None:
 
 @contextmanager
 def _as_message(where: str) -> Iterator[None]:
-    """Raise InputError, begun with `where`, where a message has other fields than the message of ROS.
+    """Raise InputError where a message has other fields than the message of ROS.
 
     A bag holds the definitions of its messages, so that a field may be missing, or be of any type.
     """
@@ -105,8 +105,8 @@ def _as_message(where: str) -> Iterator[None]:
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """Return the image in a message, as the bytes of a JPEG or PNG file or as RGB pixels, and the file ending for it.
 
-    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError, begun with `where`, for depth, for encodings
-    that jcr does not read, and for damaged messages. The bytes of a file are not decoded.
+    `message` is a sensor_msgs/Image or CompressedImage. Raises InputError for depth, for encodings that jcr does not
+    read, and for damaged messages. The bytes of a file are not decoded.
     """
     with _as_message(where):
         if hasattr(message, "format"):
@@ -132,7 +132,7 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
 def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]:
     """Return the depth (mm) of a sensor_msgs/Image or CompressedImage; 0 where none was measured.
 
-    Depths in metres are rounded to mm. Raises InputError, begun with `where`, if the message is not a depth image.
+    Depths in metres are rounded to mm. Raises InputError if the message is not a depth image.
     """
     with _as_message(where):
         if hasattr(message, "format"):
@@ -157,11 +157,7 @@ def read_ros_depth(message: Any, where: str = "depth") -> UInt16[ndarray, "h w"]
 
 
 def _rows(message: Any, channels: int, kind: np.dtype, what: str, where: str) -> ndarray:
-    """Return the values of an image message without the padding of its rows, shape (h, w·channels) and type `kind`.
-
-    Raises InputError, begun with `where` and the name `what` of the data, if the image is empty, too large, or if bytes
-    are missing.
-    """
+    """Return the values of an image message without the padding of its rows, shape (h, w·channels) and type `kind`."""
     width, height, step = (int(index(number)) for number in (message.width, message.height, message.step))
     require_pixels((width, height), where)
     data, used = (

@@ -82,10 +82,7 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
 
 
 def _arm_of(chain: "Sequence[yourdfpy.Joint]", where: object) -> Arm:
-    """Return the arm of a URDF's joints, from the base to the gripper, fixed ones too.
-
-    Raises InputError, begun with `where`, if a moving joint does not rotate, or follows another one.
-    """
+    """Return the arm of a URDF's joints, from the base to the gripper, fixed ones too."""
     frames, frame, moving = [], np.eye(4), [joint for joint in chain if joint.type != "fixed"]
     for joint in chain:
         frame = frame @ (np.eye(4) if joint.origin is None else joint.origin)
@@ -152,11 +149,7 @@ class RecordedArm:
         return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"], where: str) -> Float[ndarray, "n 4 4"]:
-        """Compute base_from_gripper (m) from recorded angles, one column per joint in order of `joints`.
-
-        Raises InputError, begun with `where`, if the angles are so large that they are degrees, although the unit is
-        radians.
-        """
+        """Compute base_from_gripper (m) from recorded angles, one column per joint in order of `joints`."""
         angles = recorded * self.unit
         if (largest := float(np.abs(angles).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(

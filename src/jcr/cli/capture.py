@@ -132,9 +132,8 @@ def _conclude(
     """Print the result of a capture and the next command; return the exit status.
 
     The status is 3 if the calibration failed, is rejected or is not as exact as needed, or if `--until-accurate` is
-    given and the leave-one-out error does not confirm the accuracy; else 0.
-    `facts` is the content of --json, to which the result is added. `result` None: there is no calibration.
-    `requirement_met`: the last live calibration met the requirement, and its leave-one-out error confirms this.
+    given and the leave-one-out error does not confirm the accuracy; else 0. `requirement_met`: the last live
+    calibration met the requirement, and its leave-one-out error confirms this.
     """
     from jcr.calibration.summary import summary
 

@@ -240,10 +240,7 @@ class CompareCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print the difference of two calibrations, whether the reported errors explain it, and its possible causes.
-
-        Return the exit status: 3 if the reported errors do not explain it or a calibration is rejected, else 0.
-        """
+        """Print the difference of two calibrations, whether the reported errors explain it, and its possible causes."""
         from jcr.calibration.difference import compare
         from jcr.calibration.likely_cause import UNLIKELY
 
@@ -326,10 +323,7 @@ class VerifyCommand:
     output: VerboseOutput = field(default_factory=VerboseOutput)
 
     def main(self) -> int:
-        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status.
-
-        The status is 3 if a camera has moved, else 0.
-        """
+        """Print for each camera whether it has moved since the calibration, and the remedy; return the exit status."""
         from jcr.calibration.summary import summary
         from jcr.pipeline.recalibrate import recalibrate
         from jcr.pipeline.verify import verify_run
@@ -481,10 +475,7 @@ class TouchCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Print the verdict, then the error at each touched point and its expected standard deviation.
-
-        Return the exit status: 3 if the errors are larger than the reported uncertainty explains, else 0.
-        """
+        """Print the verdict, then the error at each touched point and its expected standard deviation."""
         from jcr.calibration.likely_cause import UNLIKELY
         from jcr.pipeline.touch import touch
 

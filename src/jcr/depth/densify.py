@@ -29,7 +29,7 @@ def densify(
     capture: Capture,
     reconstruction: Reconstruction,
     options: DepthOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """Return the reconstruction with pointmaps estimated from its images, or unchanged if it has pointmaps.
 
@@ -62,7 +62,7 @@ def densify(
         pinhole,
         choose_neighbours(tracks, cameras, options.neighbours),
         sweep_planes(searched, cameras),
-        progress or silent,
+        progress,
         priors=options.priors,
     )
     return replace(reconstruction, pointmaps=pointmaps.of_rows(place))

@@ -30,10 +30,9 @@ _SIGN = "positive outside of what is solid, negative inside, metres"
 def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write a binary OctoMap (.bt) in the base frame with cubic voxels.
 
-    The side of a voxel is `options.voxel_size` m, by default the map's cell. A voxel is occupied if its inscribed
-    sphere touches a seen surface, and free if the sphere touches neither a surface nor unseen space. All other voxels
-    are left out, so OctoMap treats them as unknown. `notes` become comments. Raises InputError without pyoctomap, and
-    if there would be too many voxels.
+    A voxel is occupied if its inscribed sphere touches a seen surface, and free if the sphere touches neither a surface
+    nor unseen space. All other voxels are left out, so OctoMap treats them as unknown. `notes` become comments. Raises
+    InputError without pyoctomap, and if there would be too many voxels.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, options.voxel_size)
@@ -53,10 +52,9 @@ def write_octomap(path: Path, scene: SceneMap, notes: dict[str, str], options: E
 def write_esdf(path: Path, scene: SceneMap, notes: dict[str, str], options: ExportOptions) -> None:
     """Write the signed distance (m) at the centres of voxels in the base frame as .npz, positive outside of solids.
 
-    The side of a voxel is `options.voxel_size` m, by default the map's cell. Unseen space counts as occupied by
-    default. The arrays follow cuRobo's VoxelGrid: `values` (nx,ny,nz), x slowest; `origin` (3,), the centre of
-    the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its centre and quaternion w x y z.
-    The texts `sign` and `unknown` follow, and those of `notes` (frame, unit and others).
+    Unseen space counts as occupied by default. The arrays follow cuRobo's VoxelGrid: `values` (nx,ny,nz), x slowest;
+    `origin` (3,), the centre of the first voxel; `voxel_size`; `dims` (3,), the grid's sides (m); `pose` (7,), its
+    centre and quaternion w x y z. The texts `sign` and `unknown` follow, and those of `notes` (frame, unit and others).
     """
     voxel, unknown = _voxel(scene, options.voxel_size), options.unknown or "occupied"
     count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
@@ -150,11 +148,7 @@ def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x 
 
 
 def _voxel(scene: SceneMap, side: float | None) -> float:
-    """Return the side (m) of voxels: `side` or, if None, the map's cell.
-
-    Raises InputError if it is not positive, exceeds the shortest side of the workspace, or gives over 50 million
-    voxels.
-    """
+    """Return the side (m) of voxels: `side` or, if None, the map's cell."""
     side = scene.cell if side is None else side
     extent = scene.box[1] - scene.box[0]
     if not 0 < side <= extent.min():

@@ -236,7 +236,7 @@ def _joint(parent: str, child: str, origin: str | None = None) -> str:
 def easy_handeye2(mount: CameraMount, name: str) -> str:
     """Return the text of a .calib file, which easy_handeye2 reads as ~/.ros2/easy_handeye2/calibrations/NAME.calib.
 
-    `name` is the name of the calibration, NAME. Its transform is parent_from_child of the mount.
+    Its transform is parent_from_child of the mount.
     """
     content = {
         "parameters": {
@@ -323,9 +323,6 @@ def xml_comment(*lines: str) -> str:
 
 
 def _yaml(mount: CameraMount, content: Mapping[str, Any], *more: str, flow: bool | None = None) -> str:
-    """Return YAML text: the notes of a mount (frames, units, rejection) and `more` as comments, then the content.
-
-    `flow` is the default_flow_style of yaml.safe_dump.
-    """
+    """Return YAML text: the notes of a mount (frames, units, rejection) and `more` as comments, then the content."""
     body = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=flow, width=110)
     return f"{_comments(mount, *more)}\n{body}"

@@ -21,7 +21,7 @@ RESIDUAL_POINTS = 25
 def mjcf(mount: CameraMount) -> str:
     """Return an MJCF model with the camera on a body that stands for its parent, the gripper or the base.
 
-    The element `camera` belongs into the body of the robot's own model. Raises InputError if the intrinsics are unknown.
+    The element `camera` belongs into the body of the robot's own model.
     """
     camera, pose = _pinhole(mount), mount.parent_from_child @ OPTICAL_FROM_GL
     fovy = np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))
@@ -51,10 +51,7 @@ def mjcf(mount: CameraMount) -> str:
 
 
 def usd(mount: CameraMount) -> str:
-    """Return a USD layer (usda, metres, z up) with a camera prim in an Xform that stands for its parent.
-
-    Raises InputError if the intrinsics are unknown.
-    """
+    """Return a USD layer (usda, metres, z up) with a camera prim in an Xform that stands for its parent."""
     camera, pose = _pinhole(mount), mount.parent_from_child @ OPTICAL_FROM_GL
     # A layer in metres states apertures and focal length in tenths of its unit, and only their ratios count.
     focal = PITCH_MM * camera.fx

@@ -84,8 +84,7 @@ class Matcher:
     ) -> Geometries:
         """Return the two-view geometries of those of the p `pairs` that match.
 
-        The two images of a pair are first rotated by `rolls` (rad), clockwise on the screen. `repeats` marks pairs of
-        images between which the gripper did not move.
+        `repeats` marks pairs of images between which the gripper did not move.
         """
         new = [k for k, key in enumerate(pairs) if self.features.needs_upright or key not in self.raw]
         some = [pairs[k] for k in new]
@@ -121,10 +120,7 @@ class Matcher:
         return found if shown.all() else self.verified(key, rows[usable], moved)
 
     def pair(self, intrinsics: Intrinsics, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
-        """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached.
-
-        `intrinsics` are those at the size of matching, and `geometry` is the result of `verified`.
-        """
+        """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached."""
         depends = key, id(geometry), intrinsics
         if depends not in self._pairs:
             rows = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
@@ -160,9 +156,7 @@ def estimate_geometry(
 ) -> pycolmap.TwoViewGeometry | None:
     """Return the two-view geometry of the matches of image pair `key`; None for fewer than MIN_INLIERS inliers.
 
-    `rows` has a match in each row: the rows of its keypoints in the first and in the second image. `x_px` has the
-    keypoints of each image in pixels of the images of `camera`. `known` is true if the intrinsics of `camera` are
-    given, false if they are a guess. `seed` is that of RANSAC.
+    `rows` has a match in each row: the rows of its keypoints in the first and in the second image.
     """
     if len(rows) < MIN_INLIERS:
         return None
@@ -204,9 +198,8 @@ def still_cells(
     """Return a mask of the image cells with matches that keep their pixel in many pairs although the gripper moves.
 
     Such cells show the gripper's own fingers, a logo, or text drawn into the images. The cells have sides of CELL_PX,
-    and many means LEAST_PAIRS and the share LEAST_SHARE. `x_px` are the keypoints of each image, and `raw` the matches
-    of each pair as rows of keypoints. `moving` are the pairs between which the gripper moved, and `size` is width and
-    height, px.
+    and many means LEAST_PAIRS and the share LEAST_SHARE. `moving` are the pairs between which the gripper moved, and
+    `size` is width and height, px.
     """
     shape = -(-size[1] // CELL_PX), -(-size[0] // CELL_PX)
     kept, seen = np.zeros(shape), np.zeros(shape)

@@ -138,8 +138,7 @@ class _Search:
     def match_upright(self, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
         """Match pairs with each image rotated by its angle `upright` (rad); classify all pairs by the gripper's motion.
 
-        The angles are those of `rolls`. `found` is the classification before, whose hand-eye rotation is used if
-        the pairs do not determine one.
+        `found` is the classification before, whose hand-eye rotation is used if the pairs do not determine one.
         """
         self.match({(i, j): (float(upright[i]), float(upright[j])) for i, j in pairs})
         return self.classify(found.of_x)
@@ -221,8 +220,8 @@ def match_with_robot(
     """Match pairs of images and return those that the gripper poses do not contradict.
 
     `intrinsics` are at the size in which images are matched; they are an initial estimate unless the matcher's are
-    known. `names` are the images' names for messages. If the hand-eye rotation cannot be found from the pairs, the
-    pairs are not checked against the robot poses, which may be of another convention.
+    known. If the hand-eye rotation cannot be found from the pairs, the pairs are not checked against the robot poses,
+    which may be of another convention.
     """
     report("matching", 0.0)
     n, features = len(base_from_gripper), matcher.features

@@ -80,9 +80,8 @@ def starting_motions(
 ) -> list[tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]]:
     """Return rotations i_from_j and unit directions from camera i to j that an essential matrix or a homography allows.
 
-    The directions are in the frame of camera i. Both matrices map rays (x/z, y/z) of image i to image j. An essential
-    matrix gives the one decomposition of four that has most points in front of both cameras. A homography gives those
-    whose plane lies in front of camera i at nearly every match.
+    An essential matrix gives the one decomposition of four that has most points in front of both cameras. A homography
+    gives those whose plane lies in front of camera i at nearly every match.
     """
     found = []
     if essential is not None:

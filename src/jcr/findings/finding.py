@@ -271,10 +271,7 @@ def is_explained(findings: Sequence[Finding]) -> bool:
 
 
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return sorted findings; if the first one rejects, the findings that it explains are left out.
-
-    `findings` must be sorted by `strongest_first`.
-    """
+    """Return sorted findings; if the first one rejects, the findings that it explains are left out."""
     if not is_explained(findings):
         return tuple(findings)
     first, *others = findings

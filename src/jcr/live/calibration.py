@@ -62,8 +62,7 @@ class LiveCalibration:
     ) -> None:
         """Open or begin a capture; raise InputError if the capture cannot be continued or an option is wrong.
 
-        The docstring of the class explains the arguments. `exclusive`: lock the folder against other processes until
-        `close`; InputError if another one holds the lock.
+        `exclusive`: lock the folder against other processes until `close`; InputError if another one holds the lock.
         """
         self._opened = ExitStack()
         if exclusive:
@@ -92,11 +91,11 @@ class LiveCalibration:
     ) -> LiveProgress:
         """Add an image (h,w,3) uint8 and its gripper pose (4,4) to the capture, and calibrate all images again.
 
-        Returns the new state of the calibration. `joints` are the joint angles of the arm (rad), `time_s` is the time
-        of the image (s). `depth_mm` (h,w) is the depth of its pixels along the optical axis (0: unknown). `color` is
-        the order of the channels ("bgr" for OpenCV). Grey images are valid. Raises InputError for an array that is no
-        image or no rigid pose, a pose that is not in metres, an image of another size than the others, and an image
-        that repeats another. The capture is then unchanged. Several threads may call this at the same time.
+        `joints` are the joint angles of the arm (rad), `time_s` is the time of the image (s). `depth_mm` (h,w) is the
+        depth of its pixels along the optical axis (0: unknown). `color` is the order of the channels ("bgr" for
+        OpenCV). Grey images are valid. Raises InputError for an array that is no image or no rigid pose, a pose that is
+        not in metres, an image of another size than the others, and an image that repeats another. The capture is then
+        unchanged. Several threads may call this at the same time.
         """
         with self._changing():
             self.live.add(image, base_from_gripper, joints, time_s, depth_mm, color)
@@ -105,8 +104,8 @@ class LiveCalibration:
     def remove(self, image: int | str) -> LiveProgress:
         """Remove an image from the capture, and calibrate without it.
 
-        `image` is its name, or its index, which counts from 0, and from the end if it is negative. Returns the new state
-        of the calibration. Raises InputError if there is no such image.
+        `image` is its name, or its index, which counts from 0, and from the end if it is negative. Raises InputError if
+        there is no such image.
         """
         with self._changing():
             names = self.live.names

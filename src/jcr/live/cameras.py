@@ -110,7 +110,7 @@ def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Ca
     """Open a camera: a V4L2 device (number), a stream (address with ://), `realsense[:SERIAL]`, or else a video file.
 
     `size` is the width and height (px) of the images; None: the default of the device (RealSense: 1280x720). Raises
-    InputError if the camera cannot be opened or does not accept the size. The `with` statement closes it.
+    InputError if the camera cannot be opened or does not accept the size.
     """
     if source.partition(":")[0] == REALSENSE:
         with _open_realsense(source.partition(":")[2], size) as camera:
@@ -165,7 +165,6 @@ def set_up(video: Any, size: tuple[int, int] | None, source: str) -> None:
     """Set the size of a cv2.VideoCapture and switch autofocus off; raise InputError if the camera keeps another size.
 
     The size is read back, because a driver may accept a value without applying it (OpenCV, VideoCaptureProperties).
-    `source` is the camera's name in messages.
     """
     if size is not None:
         video.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
@@ -185,11 +184,7 @@ def set_up(video: Any, size: tuple[int, int] | None, source: str) -> None:
 
 @contextmanager
 def _open_realsense(serial: str, size: tuple[int, int] | None) -> Iterator[Camera]:
-    """Open a RealSense: `serial` is a serial number, empty for the first camera, or a recording (.bag, .db3).
-
-    `size` is the width and height (px) of the images; None: 1280x720. Raises InputError if the package or the camera is
-    missing, or the camera does not accept the size.
-    """
+    """Open a RealSense: `serial` is a serial number, empty for the first camera, or a recording (.bag, .db3)."""
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
     pipeline, config, is_file = rs.pipeline(), rs.config(), serial.endswith((".bag", ".db3"))
@@ -234,8 +229,7 @@ def _realsense_reader(
 ) -> Callable[[], Frame | None]:
     """Return a function that reads the next frame, with depth if the camera measures it, and returns None at the end.
 
-    `rs` is the module pyrealsense2; `pipeline` and `profile` are its objects for the opened camera. `is_file`: the
-    camera is a recording, whose time stamps are used.
+    `is_file`: the camera is a recording, whose time stamps are used.
     """
     aligned, has_depth = rs.align(rs.stream.color), False
     with suppress(RuntimeError):
@@ -286,21 +280,14 @@ class ImageSummary:
 
     @staticmethod
     def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":
-        """Return the summary of an RGB image: grey levels at low resolution, and sharpness.
-
-        The grey levels are those of the image reduced to a width of 160 px, minus their mean. The sharpness is the
-        variance of the Laplacian of the full image.
-        """
+        """Return the summary of an RGB image: grey levels at low resolution, and sharpness."""
         size = GRID_PX, max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         return ImageSummary(coarse - coarse.mean(), sharpness(image))
 
     def is_like(self, other: "ImageSummary") -> bool:
-        """Test whether two images are the same view: equal size, and grey levels that differ by noise only.
-
-        The mean absolute difference of the reduced images must be below 2.5 of 255 grey levels.
-        """
+        """Test whether two images are the same view: equal size, and grey levels that differ by noise only."""
         return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
 
 

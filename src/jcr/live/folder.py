@@ -161,10 +161,7 @@ class LiveFolder:
     def _refuse_repeated(
         self, new: ImageSummary, base_from_gripper: ndarray, number: str, others: tuple[FrameEntry, ...]
     ) -> None:
-        """Raise InputError if the image `new` is the same as one of the `others`, whether the gripper moved or not.
-
-        `base_from_gripper` (4,4) is the gripper pose (m) of the new image; `number` names the image in the message.
-        """
+        """Raise InputError if the image `new` is the same as one of the `others`, whether the gripper moved or not."""
         for one in others:
             if not new.is_like(self.summary(one.image)):
                 continue
@@ -210,8 +207,7 @@ class LiveFolder:
 def checked_image(image: ArrayLike, color: str, number: str) -> UInt8[ndarray, "h w 3"]:
     """Return an image in RGB, (h,w,3) uint8; grey images (h,w) or (h,w,1) are converted.
 
-    `color` is the order of the channels, "rgb" or "bgr". Raises InputError for any other array or a path; its message
-    starts with `number`, the image's name for the user.
+    Raises InputError for any other array or a path; its message starts with `number`, the image's name for the user.
     """
     if isinstance(image, str | Path):
         raise InputError(

@@ -70,8 +70,8 @@ States = Callable[[], Iterator[RobotState]]
 def next_rest(states: States, last: Float[ndarray, "4 4"] | None, limit: tuple[float, float]) -> RobotState:
     """Wait until the arm rests at a pose that differs from `last` by more than `limit` (m, rad); return its state.
 
-    The arm is at rest if it moves less than 0.2 mm and 0.03° in 0.5 s. `states` connects to the arm. `last` is a
-    gripper pose (4,4); None: any pose at rest is returned. Raises InputError if the states end before.
+    The arm is at rest if it moves less than 0.2 mm and 0.03° in 0.5 s. `last` is a gripper pose (4,4); None: any pose
+    at rest is returned. Raises InputError if the states end before.
     """
     recent: deque[RobotState] = deque()
     for state in states():
@@ -95,7 +95,7 @@ def is_farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[
 
 
 def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
-    """Return base_from_gripper (4,4) from the numbers of one pose (m, rad); raise InputError, begun with `where`, else.
+    """Return base_from_gripper (4,4) from the numbers of one pose (m, rad); raise InputError else.
 
     6 numbers are x y z and a rotation vector, 7 are x y z qx qy qz qw, 16 are a matrix by rows.
     """

@@ -324,18 +324,12 @@ class LiveSession:
         self._tell({"calibration": progress.as_json()}, progress_lines(progress))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
-        """Publish an event (text) on the page, and with `answer` (JSON) through `tell`.
-
-        `changes` are new values of fields of SessionState.
-        """
+        """Publish an event (text) on the page, and with `answer` (JSON) through `tell`."""
         self._show(event, is_refusal=not answer.get("accepted", True), **changes)
         self._tell(answer, [event])
 
     def _show(self, event: str = "", *, is_refusal: bool = False, **changes: Any) -> None:
-        """Replace `state` by a copy with this event and the fields `changes`, and notify waiting threads.
-
-        `is_refusal`: the event is the reason why a request was refused.
-        """
+        """Replace `state` by a copy with this event and the fields `changes`, and notify waiting threads."""
         with self._changed:
             changes["is_over"] = self.state.is_over or changes.get("is_over", False)
             waiting = changes.get("replaces", self.state.replaces)

@@ -30,13 +30,13 @@ PAIRS_AT_ONCE = 16  # in one forward and backward pass, which bounds the memory
 
 
 def align(
-    predictions: PairPredictions, steps: int = STEPS, device: str = "cpu", progress: Progress | None = None
+    predictions: PairPredictions, steps: int = STEPS, device: str = "cpu", progress: Progress = silent
 ) -> Alignment:
     """Return camera poses, depths and pair scales that minimise eq. 1 by `steps` steps of Adam; covariance is NaN.
 
     The initial estimate chains the pairs along a spanning tree. `device` is the torch device of the descent.
     """
-    problem, report = AlignmentProblem.of(predictions), progress or silent
+    problem = AlignmentProblem.of(predictions)
     count = predictions.image_count
     start = initial_state(problem.observe_all(PIXELS), predictions.edges)
     everything = (observe(problem, k, slice(None)) for k in range(count))
@@ -53,7 +53,7 @@ def align(
             sum(model.loss(collected, group, view) for view in (0, 1)).backward()  # pyright: ignore[reportAttributeAccessIssue]
         points.backward(collected.grad)
         optimizer.step()
-        report("align pairs as published", (step + 1) / steps)
+        progress("align pairs as published", (step + 1) / steps)
     return _alignment(model, problem, groups)
 
 

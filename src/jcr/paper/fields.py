@@ -27,7 +27,7 @@ def train_fields(
     options: MapOptions | None = None,
     box: Float[ndarray, "2 3"] | None = None,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[dict[str, Field], int]:
     """Return trained networks f_θ by property ("occupancy", "color", of several labels "label"), and number of steps.
 
@@ -37,7 +37,7 @@ def train_fields(
     binary cross-entropy of occupancy (eq. 13), the cross-entropy of labels (eq. 14) and the squared error of colours
     (eq. 15). The points are occupied, and as many positions drawn uniformly from the box are free.
     """
-    options, report = options or MapOptions(), progress or silent
+    options = options or MapOptions()
     box = workspace_box(cloud, options.workspace) if box is None else box
     inside, start = rows_inside(cloud, box), time.perf_counter()
     generator = torch.Generator().manual_seed(options.map_seed)
@@ -64,14 +64,14 @@ def train_fields(
         optimizer.zero_grad()
         (error.mean() + free).backward()
         optimizer.step()
-        report("map: published networks", taken / options.steps)
+        progress("map: published networks", taken / options.steps)
     return {name: field.requires_grad_(False).eval() for name, field in fields.items()}, taken
 
 
 def published_scene(
     cloud: PointCloud,
     options: MapOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     device: str = "cpu",
 ) -> SceneMap:
     """Return the map of a cloud with the published networks, whose queries are the networks' outputs everywhere.

@@ -20,7 +20,7 @@ from jcr.pointmaps.pair_predictions import complete_pairs, read_arrays
 from jcr.pointmaps.posed_pointmaps import PosedPointmaps
 from jcr.pointmaps.predictions import predicted_pairs, reconstruct_predictions
 from jcr.pointmaps.reconstruction import reconstruct_pointmaps
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, ImageVerdict, PaperResiduals, PosePairs, Reconstruction
 from jcr.sfm.given import reconstruct_given
 from jcr.sfm.model import quiet_colmap
@@ -31,7 +31,7 @@ predictions."""
 
 
 def reconstruct_published(
-    capture: Capture, options: ReconstructOptions, progress: Progress | None = None
+    capture: Capture, options: ReconstructOptions, progress: Progress = silent
 ) -> Reconstruction:
     """Return camera poses P_i, pointmaps X̂_i and confidences C_i of a capture (line 1 of Algorithm 1).
 

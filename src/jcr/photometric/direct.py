@@ -73,7 +73,7 @@ REGION = 0.05
 """Side, m, of the cubes within which points share their errors: they are pixels of one edge seen from many sides."""
 
 
-def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_direct(capture: Capture, progress: Progress = silent) -> Reconstruction:
     """Reconstruct camera poses by photometric alignment, initialised from the gripper poses.
 
     Known intrinsics are kept; otherwise a focal length is estimated. The recon frame is the first camera's, and its
@@ -83,14 +83,13 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
-    report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_intrinsics(capture.intrinsics)
     notes = ()
     intrinsics = given or guessed_intrinsics(capture.image_size)
     levels = pyramid(images, intrinsics)
     known = given is not None
-    found = search(levels, capture.base_from_gripper, known, report)
+    found = search(levels, capture.base_from_gripper, known, progress)
     factor = exposure_gains(levels[FREED[0].height], found)
     levels = {height: level.times(factor) for height, level in levels.items()}
     rows, cameras = images_that_fit(levels[FREED[0].height], found, known)
@@ -99,13 +98,13 @@ def reconstruct_direct(capture: Capture, progress: Progress | None = None) -> Re
         notes = (f"direct alignment: left out, for they fit nowhere near their poses: {names}",)
         levels = {height: level.rows(rows) for height, level in levels.items()}
     for k, stage in enumerate(FREED):
-        report("direct alignment", 0.7 + 0.1 * k)
+        progress("direct alignment", 0.7 + 0.1 * k)
         cameras, _ = align_photometrically(
             levels[stage.height], cameras, stage, free_directions(cameras, known)
         )
     level = levels[FINEST.height]
     cameras, points = align_photometrically(level, cameras, FINEST, free_directions(cameras, known))
-    report("direct alignment", 1.0)
+    progress("direct alignment", 1.0)
     if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
         raise RejectedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few",

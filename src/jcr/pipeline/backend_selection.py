@@ -115,7 +115,7 @@ class Trial:
     def is_textured(self, images: int) -> bool:
         """Test whether COLMAP found at least 50 SIFT features per image, so that a lack of texture is excluded.
 
-        `images` is the number of images of the capture. Learned features do not count: they are found without texture.
+        Learned features do not count: they are found without texture.
         """
         if self.account.backend != "colmap" or self.account.features not in (None, "sift"):
             return False
@@ -127,7 +127,7 @@ class Trial:
 def select_reconstruction(
     capture: Capture,
     options: RunOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     keep: Callable[[Reconstruction], None] | None = None,
     before: Reconstruction | None = None,
     goes_on: bool = False,
@@ -194,7 +194,7 @@ def require_published(options: CalibrateOptions) -> None:
 def select_published(
     capture: Capture,
     options: RunOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     before: Reconstruction | None = None,
 ) -> tuple[Reconstruction, PublishedCalibration]:
     """Reconstruct and calibrate a capture by the published method, with one back end and without checks.
@@ -220,11 +220,10 @@ def _why_untried(
 ) -> tuple[str | None, bool]:
     """Return the reason why the next back end is not tried, and whether the back ends after it may be tried.
 
-    `options` are those of the next back end, `images` is the number of images, and `of_images` returns the findings of
-    the images alone. The reason is None if the back end is tried, or if there is nothing to report. No other back end
-    is tried if the best trial is accepted, if its rejection does not depend on the back end, or if `of_images` reject.
-    Other features are not tried if SIFT registers 90 % or more of the images. A back end that does not test the camera's
-    intrinsics is not tried if SIFT finds enough features (`is_textured`), because it could accept a wrong calibration.
+    The reason is None if the back end is tried, or if there is nothing to report. No other back end is tried if the
+    best trial is accepted, if its rejection does not depend on the back end, or if `of_images` reject. Other features
+    are not tried if SIFT registers 90 % or more of the images. A back end that does not test the camera's intrinsics is
+    not tried if SIFT finds enough features (`is_textured`), because it could accept a wrong calibration.
     """
     best = max(trials, key=lambda one: one.rank)
     if best.hand_eye is not None:
@@ -296,16 +295,15 @@ def _try(
     source: ReconstructOptions | Reconstruction,
     reconstructing: Callable[..., Reconstruction],
     calibrating: Callable[..., Calibration | PublishedCalibration],
-    progress: Progress | None,
+    progress: Progress,
     keep: Callable[[Reconstruction], None] | None = None,
 ) -> Trial:
     """Return the trial of one back end: a reconstruction and its calibration, or the error of either.
 
-    `source` is the options of the back end, or a reconstruction made before. `reconstructing` and `calibrating` are the
-    functions of the method. `keep` receives the reconstruction before the calibration. An InputError of the calibration
-    is raised, because it would occur with every back end.
+    `keep` receives the reconstruction before the calibration. An InputError of the calibration is raised, because it
+    would occur with every back end.
     """
-    start, report = time.perf_counter(), progress or silent
+    start = time.perf_counter()
     own = source if isinstance(source, ReconstructOptions) else None
     made = failure = hand_eye = why_not = None
     try:
@@ -317,14 +315,14 @@ def _try(
         keep(made)
     reconstructed = time.perf_counter()
     if made is not None:
-        report("calibrate", 0.0)
+        progress("calibrate", 0.0)
         try:
             hand_eye = calibrating(capture, made)
             why_not = f"rejected: {hand_eye.doubt}"
         except RejectedError as error:
             failure = error.with_traceback(None)
         give_back()
-        report("calibrate", 1.0)
+        progress("calibrate", 1.0)
     account = Attempt(
         backend=made.backend if made is not None else own.backend if own is not None else "",
         images_registered=None if made is None else len(made.image_index),

@@ -108,7 +108,7 @@ def batch(
     out: Path,
     run_options: RunOptions,
     options: BatchOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     read: ReadOptions | None = None,
 ) -> list[BatchRow]:
     """Run every capture into its own folder inside `out`; write summary.csv and summary.html, best calibration first.
@@ -120,7 +120,7 @@ def batch(
         raise InputError(f"--processes {options.processes}: give 1 or more")
     if not captures:
         raise InputError("batch: no captures; name one or more")
-    report, read = progress or silent, read or ReadOptions()
+    read = read or ReadOptions()
     run_options = replace(run_options, map=None) if options.calibrate_only else run_options
     tasks, names, notes = list[Task](), set[str](), list[str]()
     for path in captures:
@@ -134,14 +134,14 @@ def batch(
             folder = out.resolve() / (name if len(episodes) == 1 else f"{name}-episode-{episode}")
             tasks.append((path.resolve(), folder, run_options, replace(read, episode=(episode,))))
     out.mkdir(parents=True, exist_ok=True)
-    report("captures", 0.0)
+    progress("captures", 0.0)
     rows: list[BatchRow] = []
     order = (*get_args(Verdict), "failed")
     for new in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
         rows.append(new)
         rows.sort(key=lambda row: (order.index(row.status), row.point_95_mm or np.inf, row.capture))
         _write_summary(out, rows, notes)
-        report("captures", len(rows) / len(tasks))
+        progress("captures", len(rows) / len(tasks))
     rows, sentences = _with_compared_cameras(rows)
     _write_summary(out, rows, [*notes, *sentences])
     return rows

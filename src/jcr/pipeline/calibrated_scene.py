@@ -109,10 +109,7 @@ def name_of(capture: Capture) -> str:
 
 
 def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages) -> None:
-    """Raise InputError if new images have another size than those of the calibration, or if one of them is one of those.
-
-    `old` are the images of the camera `then` in the calibration.
-    """
+    """Raise InputError if new images have another size than those of the calibration, or if one is among `old`."""
     for name, image in zip(new.images, new.pixels, strict=True):
         if image.shape[1::-1] != then.image_size:
             (height, width), (wide, high) = image.shape[:2], then.image_size

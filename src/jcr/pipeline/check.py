@@ -42,7 +42,7 @@ from jcr.findings import (
 from jcr.geometry import largest_motion
 from jcr.number_format import significant
 from jcr.pipeline.reading_decision import decided_by_images, first_reading
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.sfm.colmap import reconstruct_colmap
 
@@ -113,7 +113,7 @@ def check_capture(
     capture: Capture | PosePairs | str | Path,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     thorough: bool = False,
     require: RequiredAccuracy = GRASPING,
 ) -> Examination:
@@ -174,10 +174,7 @@ def check_capture(
 def _missed(
     shown: _Comparison, expected: Uncertainty, found: list[Finding], images: int, options: CalibrateOptions
 ) -> tuple[Finding, ...]:
-    """Return the finding that the expected accuracy misses the required one; empty without assumptions from images.
-
-    `found` are the other findings, `images` is the number of images that are expected to register.
-    """
+    """Return the finding that the expected accuracy misses the required one; empty without assumptions from images."""
     if (assumptions := shown.assumptions) is None or (hand_eye := shown.hand_eye) is None:
         return ()
     # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
@@ -195,10 +192,7 @@ def _unit_doubt(move_m: float, rotation_rad: float) -> list[str]:
 
 
 def _look(capture: Capture, views: tuple[Finding, ...]) -> tuple[Int[ndarray, " c"], list[str]]:
-    """Return the indices of well exposed sharp images, and remarks on the exposure of the others.
-
-    `views` are the findings of `view_findings`, which name the blurred images.
-    """
+    """Return the indices of well exposed sharp images, and remarks on the exposure of the others."""
     blurred = {name for one in views if one.kind is FindingKind.BLURRED for name in one.images}
     clear, remarks = list[int](), list[str]()
     for row, name in enumerate(capture.images):
@@ -213,14 +207,14 @@ def _compare(
     capture: Capture | PosePairs,
     robot: RobotErrorPrior,
     options: CalibrateOptions,
-    progress: Progress | None,
+    progress: Progress,
     thorough: bool,
 ) -> _Comparison:
     """Calibrate from gripper and camera poses, and return whether and how well both agree.
 
-    `robot` is the prior of the robot errors of all images. The camera poses of
-    PosePairs are given, others are reconstructed from features: first those of QUICK images of reduced size; then those
-    of all images if `thorough` is set, or if the first comparison fails, is rejected or leaves an image out.
+    The camera poses of PosePairs are given, others are reconstructed from features: first those of QUICK images of
+    reduced size; then those of all images if `thorough` is set, or if the first comparison fails, is rejected or leaves
+    an image out.
     """
     rows = np.arange(len(capture))
     if isinstance(capture, PosePairs):

@@ -30,7 +30,7 @@ from jcr.estimation.pose_misfit import (
 )
 from jcr.geometry import Poses, rotation_angle
 from jcr.number_format import significant
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, Reading, Reconstruction
 
 LEAST_MISFIT = 0.3
@@ -63,7 +63,7 @@ class _Fit(NamedTuple):
 
 
 def decided_by_images(
-    capture: Capture, seed: int = 0, progress: Progress | None = None
+    capture: Capture, seed: int = 0, progress: Progress = silent
 ) -> tuple[Capture, Reconstruction | None]:
     """Return a capture whose reading is decided, and the reconstruction without poses if that decided it.
 

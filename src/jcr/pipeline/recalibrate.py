@@ -16,7 +16,7 @@ from jcr.pipeline.options import TOLERANCE
 from jcr.pipeline.run import calibrate
 from jcr.pipeline.stages import write_state
 from jcr.pipeline.verify import Move, Verification, of_two_poses
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture
 from jcr.result import RunResult
 
@@ -26,7 +26,7 @@ def verify_by_new_scene(
     name: str,
     new: Capture,
     tolerance: tuple[float, float] = TOLERANCE,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Verification:
     """Test with images of another scene whether the camera of the run folder `out` has moved since its calibration.
 
@@ -53,7 +53,7 @@ def recalibrate(
     captures: Mapping[str, Capture],
     into: str | Path,
     found: Verification,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RunResult:
     """Calibrate again after the verification `found` of the run folder `out`, into the new run folder `into`.
 

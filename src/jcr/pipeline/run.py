@@ -57,7 +57,7 @@ def run(
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: BackendName | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
     """Calibrate a capture, or the capture at a path; write calibration, cloud, map and report to the folder `out`.
@@ -67,7 +67,7 @@ def run(
     `calibrated` is called with the calibrated result before depth and map are computed. Raises InputError if the input
     cannot be used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
-    out, report = Path(out), progress or silent
+    out = Path(out)
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
     if options.reconstruct.board is not None:
@@ -82,7 +82,7 @@ def run(
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
     options, missing = _possible(replace(options, reconstruct=own), capture, out)
     with locked(out):
-        capture, alone = _decided(capture, out, own.seed, report)
+        capture, alone = _decided(capture, out, own.seed, progress)
         result = begun(out, kept(capture, out / CAPTURE), options)
         if alone is not None and own.backend in ("auto", "colmap") and own.features in ("auto", "sift"):
             keep_reconstruction(result, alone)
@@ -96,11 +96,11 @@ def run(
             threading.Thread(target=_load_map_code, daemon=True).start()
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
-        result = make(result, FIRST, report)
+        result = make(result, FIRST, progress)
         result = result.with_parts(calibration=result.calibration.with_notes(*missing))
         if calibrated is not None:
             calibrated(result)
-        return finished(result, REST, report)
+        return finished(result, REST, progress)
 
 
 def calibrate(
@@ -109,7 +109,7 @@ def calibrate(
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: BackendName | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RunResult:
     """Calibrate a capture without a map; write calibration and report to the folder `out`; raises as `run` does.
 
@@ -153,14 +153,14 @@ def build_map(
     *,
     add: Sequence[str | Path] = (),
     read: ReadOptions | Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RunResult:
     """Build cloud, map and report of the run folder `out` again, from its capture and calibration.
 
     `add` are captures of later images of the scene, oldest first, which are read with the options `read`. They change
     the map of this and later calls, but not the calibration. Dense depth is estimated if the folder has none.
     """
-    before, report = RunResult(out), progress or silent
+    before = RunResult(out)
     options = replace(
         before.state.options,
         cloud=checked_options(cloud, CloudOptions),
@@ -173,7 +173,7 @@ def build_map(
         for path in add:
             added = with_added_images(result.added, Path(path), checked_options(read, ReadOptions))
             result = result.with_parts(added=added)
-        return finished(make(result, FIRST, report), REST, report)
+        return finished(make(result, FIRST, progress), REST, progress)
 
 
 def add_camera(
@@ -182,7 +182,7 @@ def add_camera(
     images: Sequence[str | Path] | str | Path = (),
     intrinsics: str | Path | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> RunResult:
     """Locate a fixed camera in the base frame, from its images of the scene of the run folder `out`.
 
@@ -194,7 +194,7 @@ def add_camera(
     files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
     if not files:
         raise InputError(f"{name}: no images; give one or more that the camera took")
-    before, report = RunResult(out), progress or silent
+    before = RunResult(out)
     if before.capture.mount == "base":
         raise InputError(
             f"{out}: its camera watches the gripper; list the others beside it under cameras in capture.json, with an "
@@ -211,14 +211,14 @@ def add_camera(
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
         with TemporaryDirectory() as scratch:
             camera = added_camera(name, files, file, taken, Path(scratch))
-            result = make(known.with_parts(others=(*known.others, camera)), FIRST, report)
-            located = place(result, report)
+            result = make(known.with_parts(others=(*known.others, camera)), FIRST, progress)
+            located = place(result, progress)
             if (found := located.cameras[-1]).doubt is not None:
                 raise RejectedError(f"{name}: {found.doubt}")
             keep_camera(before.out, known.capture, camera)
         write_cameras(before.out, located)
         others = RunResult(before.out, capture=known.capture).others
-        return finished(result.with_parts(others=others, cameras=located), ["report"], report)
+        return finished(result.with_parts(others=others, cameras=located), ["report"], progress)
 
 
 def measure(out: str | Path) -> "Measurement":

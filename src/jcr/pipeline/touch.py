@@ -65,9 +65,8 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
     `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
     run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The surface point is that
-    of the nearest pixel of the image's pointmap. The expected errors are those of
-    `error_covariance`. Raises InputError for fewer than three points, an image that is
-    not in the run, or a pixel without a surface.
+    of the nearest pixel of the image's pointmap. Raises InputError for fewer than three points, an image that is not in
+    the run, or a pixel without a surface.
     """
     points = Path(points)
     run = RunResult(out)
@@ -142,8 +141,7 @@ def surface_at(
     Both come from the pointmaps; the standard deviation is 0 where they do not state it.
 
     `image` is a name of the capture, `x_px` a pixel (x, y) of its distorted image; the nearest pixel of the pointmap is
-    read. Raises InputError if the image is not registered or the pixel has no depth. The message begins with
-    `asked_by`, the file that states the pixel.
+    read. Raises InputError if the image is not registered or the pixel has no depth.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
@@ -163,10 +161,7 @@ def surface_at(
 
 
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
-    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m.
-
-    Raises InputError for a missing column or fewer than three points.
-    """
+    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()

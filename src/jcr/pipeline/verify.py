@@ -178,7 +178,7 @@ def verify_run(
     out: str | Path,
     new: Capture | str | Path | Mapping[str, Capture | NewImages],
     tolerance: tuple[float, float] = TOLERANCE,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Verification:
     """Test with new images whether the cameras of the run folder `out` have moved since its calibration.
 
@@ -188,7 +188,7 @@ def verify_run(
     accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
     with the scene.
     """
-    report, run = progress or silent, RunResult(out)
+    run = RunResult(out)
     if isinstance(new, str | Path):
         new = read_capture(new, at_least=1)
     captures = {name_of(new): new} if isinstance(new, Capture) else new
@@ -203,7 +203,7 @@ def verify_run(
         digest = fingerprint(run.found.gripper_from_camera, capture.base_from_gripper, capture.images)
         scene, history, row = old_scene(run.out, digest), read_history(run.out, digest), 0
         for k, (name, one) in enumerate(captures.items()):
-            report("find the old scene", k / len(captures))
+            progress("find the old scene", k / len(captures))
             images = one if isinstance(one, NewImages) else new_images(one)
             known = [k for k, past in enumerate(history.captures) if set(images.digests) <= set(past.digests)]
             if not known:
@@ -213,7 +213,7 @@ def verify_run(
                 )
                 write_history(run.out, history)
             row = known[0] if known else len(history.captures) - 1
-    report("find the old scene", 1.0)
+    progress("find the old scene", 1.0)
     found, last = _judged(run, history, row, tolerance), list(captures.values())[-1]
     fixed = [] if isinstance(last, NewImages) else _fixed_cameras(run, last, tolerance, progress)
     return replace(found, others=tuple(fixed))
@@ -274,7 +274,7 @@ def _blindness(noticed: tuple[float, float]) -> list[str]:
 
 
 def _fixed_cameras(
-    run: RunResult, new: Capture, tolerance: tuple[float, float], progress: Progress | None
+    run: RunResult, new: Capture, tolerance: tuple[float, float], progress: Progress
 ) -> Iterator[Verification]:
     """Yield the drift of each fixed camera of the run that has images in `new`.
 
@@ -329,9 +329,9 @@ def of_two_poses(
 ) -> Verification:
     """Return the verification by the step of a camera from its old to its new pose; its χ² is tested at ALPHA.
 
-    `offset` is that step (translation in m, then rotation vector in rad; axes of the gripper, or of the base for a fixed
-    camera), `covariance` its covariance. The camera moved if the step is significant and exceeds `tolerance` (mm,
-    degrees). `notes` are warnings to include, and `images` are the new images that were used.
+    `offset` is that step (translation in m, then rotation vector in rad; axes of the gripper, or of the base for a
+    fixed camera), `covariance` its covariance. The camera moved if the step is significant and exceeds `tolerance` (mm,
+    degrees).
     """
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     noticed = detectable(covariance, chi2.isf(ALPHA, 6))

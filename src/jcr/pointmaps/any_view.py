@@ -49,21 +49,19 @@ def reconstruct_any_view(
     weights: Weights,
     device: str,
     backend: str,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """Reconstruct a capture by a network that predicts all images at once, and refine it by matches.
 
-    `load` returns the network of a folder of weights on a torch device. `backend` is the name in the result and in
-    messages. The unit is that of the prediction. Pixels whose point or confidence is not finite, or whose point lies
-    behind the camera, get confidence 0. Raises InputError for weights that are missing or damaged, and for a prediction
-    without usable depth or cameras.
+    `load` returns the network of a folder of weights on a torch device. The unit is that of the prediction. Pixels
+    whose point or confidence is not finite, or whose point lies behind the camera, get confidence 0. Raises InputError
+    for weights that are missing or damaged, and for a prediction without usable depth or cameras.
     """
-    report = progress or silent
     images = prepare_images(capture, lambda size: ImageGrid.uncropped(size, size))
-    report("reconstruct", 0.0)
+    progress("reconstruct", 0.0)
     with redirect_stdout(sys.stderr):  # packages print to stdout, which is for the command's result
         maps = load(weights.path, device)(Views(images.colors, images.pinhole))
-    report("reconstruct", 1.0)
+    progress("reconstruct", 1.0)
     there = np.isfinite(maps.x_in_camera).all(-1) & (maps.x_in_camera[..., 2] > 0)
     there &= np.isfinite(maps.confidence) & (maps.confidence > 0)
     if not there.any() or not np.isfinite(maps.recon_from_camera).all():

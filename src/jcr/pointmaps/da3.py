@@ -24,14 +24,14 @@ from jcr.hub import Weights
 from jcr.pointmaps.any_view import Predict, Views, normalised, output, reconstruct_any_view, rigid
 from jcr.pointmaps.image_grid import ImageGrid
 from jcr.pointmaps.posed_pointmaps import PosedPointmaps
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
 
 LONG_EDGE, PATCH = 504, 14
 
 
 def reconstruct_da3(
-    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress | None = None
+    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress = silent
 ) -> Reconstruction:
     """Reconstruct a capture by Depth Anything 3; raise InputError for weights that are missing or damaged."""
     return reconstruct_any_view(capture, load, weights, device, backend, progress)
@@ -70,8 +70,7 @@ def build(name: str) -> nn.Module:
 def predict_views(network: nn.Module, views: Views) -> PosedPointmaps:
     """Return the pointmaps and camera poses of all images, predicted in one pass.
 
-    `network` is Depth Anything 3 with its weights. The images are resized so that their long edge has about LONG_EDGE
-    px (`grid_of`). Frame and unit are arbitrary.
+    The images are resized so that their long edge has about LONG_EDGE px (`grid_of`). Frame and unit are arbitrary.
     """
     grid = grid_of(views.size)
     colors = np.stack([resized_for_grid(image, grid) for image in views.colors])

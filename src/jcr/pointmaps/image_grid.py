@@ -124,8 +124,7 @@ def prepare_images(
 ) -> PreparedImages:
     """Read the images of a capture, undistort them if the intrinsics are known, and resize and crop them.
 
-    `grid_of` returns the resize and crop for an image's width and height. Raises InputError for an image that cannot be
-    read.
+    `grid_of` returns the resize and crop for an image's width and height.
     """
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics
@@ -147,7 +146,7 @@ def read_colors(
     """Read the images of a capture (RGB), resized and cropped to `grid`.
 
     `intrinsics` are those of the capture's images. If they have distortion and `pinhole` is given, the images are first
-    undistorted to those of `pinhole`. Raises InputError for an image that cannot be read.
+    undistorted to those of `pinhole`.
     """
     width, height = grid.size
     colors = np.empty((len(capture), height, width, 3), np.uint8)

@@ -124,8 +124,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
 def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: str) -> None:
     """Check that arrays exist, are finite and have the `shapes`, such as "N H W 3" with equal sizes for equal letters.
 
-    `shapes` maps the names of the required arrays to their shapes; `source` is the file named in messages. Raises
-    InputError for the first wrong array, and for a confidence below 0 (arrays named conf…).
+    Raises InputError for the first wrong array, and for a confidence below 0 (arrays named conf…).
     """
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():

@@ -20,7 +20,7 @@ from jcr.pointmaps.pair_predictions import (
 )
 from jcr.pointmaps.posed_pointmaps import PosedPointmaps, fit_pinhole
 from jcr.pointmaps.reconstruction import align_pairs, reconstruct_pointmaps
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, Reconstruction
 
 POINTMAPS = {"confidence": "N H W", "recon_from_camera": "N 4 4", "points_in_recon": "N H W 3"}
@@ -30,7 +30,7 @@ LARGEST_MISFIT = 0.02
 
 
 def reconstruct_predictions(
-    capture: Capture, path: Path, progress: Progress | None = None, refining: bool = True
+    capture: Capture, path: Path, progress: Progress = silent, refining: bool = True
 ) -> Reconstruction:
     """Return camera poses, pointmaps and tracks from the predictions in an npz file.
 
@@ -60,7 +60,7 @@ def predicted_pairs(
 ) -> tuple[PairPredictions, PreparedImages, Int[ndarray, " m"]]:
     """Return the pairs of a file with `arrays`, the images on their grid, and the row of each in the capture.
 
-    The images are renumbered in the order of the capture. `source` is the file named in messages.
+    The images are renumbered in the order of the capture.
     """
     predictions = pairs_from_arrays(arrays, source)
     rows = _rows(predictions.images, predictions.image_count, capture, source)

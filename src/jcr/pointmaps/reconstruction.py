@@ -35,7 +35,7 @@ BEND_STD = 0.03
 
 
 def align_pairs(
-    predictions: PairPredictions, images: PreparedImages, progress: Progress | None = None
+    predictions: PairPredictions, images: PreparedImages, progress: Progress = silent
 ) -> PosedPointmaps:
     """Return pointmaps and camera poses in the first image's camera frame, from pairwise pointmaps by global alignment.
 
@@ -60,17 +60,15 @@ def reconstruct_pointmaps(
     images: PreparedImages,
     maps: PosedPointmaps,
     backend: str,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     image_index: Int[ndarray, " m"] | None = None,
     refining: bool = True,
 ) -> Reconstruction:
     """Return the reconstruction of the capture's images `image_index` (None: all) from their pointmaps and matches.
 
-    `images` has colours on the grid of `maps`; `backend` is the name in the result. If the images have too few matches
-    (`refine`), or without `refining`, the predicted cameras are kept, and their covariance is in `evidence`. Raises
-    InputError where the points fit no pinhole camera.
+    If the images have too few matches (`refine`), or without `refining`, the predicted cameras are kept, and their
+    covariance is in `evidence`. Raises InputError where the points fit no pinhole camera.
     """
-    report = progress or silent
     rows = np.arange(len(capture)) if image_index is None else image_index
     part = capture.of_rows(rows)
     found, misfit_px = fit_pinhole(maps)
@@ -78,7 +76,7 @@ def reconstruct_pointmaps(
     if (pinhole := images.pinhole or predicted) is None:
         raise InputError(f"backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
     maps = maps.on_rays(maps.grid.grid_intrinsics(pinhole))
-    refined = refine(part, images, maps, pinhole, report) if refining else None
+    refined = refine(part, images, maps, pinhole, progress) if refining else None
     if refined is None:
         intrinsics = images.intrinsics_of_capture or pinhole
         covariance = published_covariance(maps) if maps.covariance is None else maps.covariance

@@ -114,10 +114,7 @@ class RobotNoise(Checked):
 
     @property
     def together(self) -> tuple[float, float]:
-        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined.
-
-        It is the root of the summed squares of both; the systematic error is `systematic_left`.
-        """
+        """Standard deviation per axis (m, rad) of a gripper pose: random and remaining systematic error combined."""
         metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
         return float(metres), float(radians)
 
@@ -145,10 +142,7 @@ class Share(Checked):
 
 
 def share_of(covariance: Float[ndarray, "7 7"]) -> Share:
-    """Return the share of one cause, with standard deviations in mm and degrees, from its covariance.
-
-    The covariance is in COVARIANCE_ORDER. The standard deviations are the root mean squares over the three axes.
-    """
+    """Return the share of one cause, with standard deviations in mm and degrees, from its covariance."""
     metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1)).tolist()
     degrees = float(np.degrees(radians))
     return Share(translation_mm=1e3 * metres, rotation_deg=degrees, covariance=covariance)
@@ -232,11 +226,7 @@ class DepthCheck(Checked):
     """Number of features that were compared."""
 
     def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
-        """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale.
-
-        It is the root of the summed squares of `noise_m`, `noise_per_m`·z² and the error of the scale, which is
-        `std_percent` of z.
-        """
+        """Return the standard deviation (m) of depths z (m, along the optical axis) with corrected scale."""
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
@@ -281,10 +271,7 @@ class SceneUncertainty(Checked):
     """Bound on 95 % of the errors of the median point, including its triangulation (m)."""
 
     def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-        """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors.
-
-        They include the errors of the scene's similarity (`covariance`) and of its shape (`shape_m`).
-        """
+        """Return the covariances (m², base axes) of n scene points (m, base frame), without triangulation errors."""
         from jcr.geometry import by_similarity  # SciPy, which help need not wait for
 
         by = by_similarity(x_in_base - self.middle_in_base)
@@ -380,10 +367,7 @@ class Uncertainty:
     @computed_field
     @property
     def scene_95_mm(self) -> float | None:
-        """Bound (mm) on 95 % of the errors of the median reconstructed point in the base frame.
-
-        The bound is None where no image was adjusted.
-        """
+        """Bound (mm) on 95 % of the errors of the median reconstructed point in the base frame."""
         return None if self.scene is None else 1e3 * self.scene.within_95_m
 
     @property
@@ -400,7 +384,7 @@ class Uncertainty:
     def whole(self) -> Float[ndarray, "j j"]:
         """Covariance (j,j) of transform and scale in COVARIANCE_ORDER, then of the intrinsics if estimated.
 
-        The intrinsics are fx, fy, cx, cy and the distortion coefficients. Without these, j is 7.
+        Without these, j is 7.
         """
         return self.covariance if self.joint is None else self.joint.covariance
 

@@ -89,7 +89,7 @@ class IntrinsicsEntry(Entry, extra="allow"):
     def record(self, size: tuple[int, int], where: str) -> Intrinsics:
         """Return the intrinsics for images of `size` (width, height).
 
-        Raises InputError, whose message begins with `where`, if they do not fit the images or the distortion model.
+        Raises InputError if they do not fit the images or the distortion model.
         """
         names = COEFFICIENTS[self.model]
         distortion = self.distortion or [0.0] * len(names)

@@ -49,7 +49,7 @@ def read_json(file: Path) -> Any:
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:
     """Return the content of a file, converted by the pydantic model or type adapter `schema`.
 
-    Raises InputError, begun with `where`, if the content does not fit.
+    Raises InputError if the content does not fit.
     """
     validate = schema.validate_python if isinstance(schema, TypeAdapter) else schema.model_validate
     try:

@@ -127,10 +127,7 @@ def read_npz(path: Path, expected: str) -> Iterator[tuple[str, Mapping[str, np.n
 
 
 def require_shapes(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
-    """Raise ValueError if an array does not have its expected shape or holds values that are not finite.
-
-    `shapes` maps the name of an array to the array and its expected shape.
-    """
+    """Raise ValueError if an array does not have its expected shape or holds values that are not finite."""
     for name, (array, shape) in shapes.items():
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, not {shape}")

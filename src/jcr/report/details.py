@@ -26,10 +26,7 @@ PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
 def details_section(
     calibration: AnyCalibration, options: StageOptions, map_history: Mapping[str, str] | None = None
 ) -> Content:
-    """Return tables of names and values: calibration, map (`map_history`), options of each stage, and versions.
-
-    `map_history` are names and values stored with the map; it is None without a map.
-    """
+    """Return tables of names and values: calibration, map (`map_history`), options of each stage, and versions."""
     blocks = facts(calibration) | {"Map": map_history or {}}
     for stage, chosen in options.items():
         blocks[f"Options: {stage}"] = {
@@ -44,7 +41,7 @@ def details_section(
 def objects_section(measured: Measurement, label_names: tuple[str, ...]) -> Content:
     """Return a row for each object: name, RGB of its label, height, length, width (mm, ± one sigma), and place.
 
-    The place is the centre x, y of the object's box (m, base frame). `label_names` are the names of all labels.
+    The place is the centre x, y of the object's box (m, base frame).
     """
     colors = label_colors(len(label_names)).tolist()
     rows = []

@@ -55,9 +55,8 @@ def motion_section(result: RunResult) -> Content:
 def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
     """Yield a bar (CSS class, name, length in percent, number) for each direction of the seven parameters.
 
-    The parameters are translation, rotation and scale of the hand-eye transform. The direction that the motions
-    determine least comes first. The name lists the direction's components above 0.4, the number is its excitation, and
-    an excitation of 0.4 or more has length 100.
+    The direction that the motions determine least comes first. The name lists the direction's components above 0.4, the
+    number is its excitation, and an excitation of 0.4 or more has length 100.
     """
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
@@ -67,11 +66,7 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
 
 
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:
-    """Yield a bar for each axis x, y, z, as wide as ± its standard deviation in `std` relative to the largest of them.
-
-    A bar is (text beside it, left end and width in percent of the chart, number as text). The text is `name` with the
-    axis; `unit` is that of `std`.
-    """
+    """Yield a bar for each axis x, y, z, as wide as ± its standard deviation in `std` relative to the largest."""
     for axis, value in zip("xyz", std, strict=True):
         half = 50 * value / (max(std) or 1.0)
         yield f"{name} {axis}", 50 - half, 2 * half, f"±{significant(value)}{unit}"

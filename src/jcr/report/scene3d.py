@@ -108,8 +108,8 @@ def scene_data(
 ) -> dict[str, Any]:
     """Return the data of the 3D view for scene3d.js: layers of points, images, and intrinsics.
 
-    `views` are results of `scene_view`. Coordinates of points are 16-bit fractions of a box (m, base frame), which
-    encloses most points of the layers and of `shown_in_base`.
+    Coordinates of points are 16-bit fractions of a box (m, base frame), which encloses most points of the layers and of
+    `shown_in_base`.
     """
     everything = np.vstack([points for _, points, *_ in layers] + [shown_in_base])
     # A few distant outliers must not enlarge the box, which sets the resolution and the view.

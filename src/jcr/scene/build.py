@@ -29,7 +29,7 @@ features per node)."""
 def build_scene(
     cloud: PointCloud,
     options: MapOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     device: str = "cpu",
 ) -> SceneMap:
     """Return the map of a cloud: a grid of the seen space, and networks for occupancy, colour and label at a position.
@@ -39,9 +39,9 @@ def build_scene(
     """
     options = options or MapOptions()
     assert options.preset == "default", "paper.fields.published_scene trains the published networks"
-    report, start = progress or silent, time.perf_counter()
+    start = time.perf_counter()
     with threads_of_one_core(torch.device(device)) as pool:
-        seen, cell, box = carved_workspace(cloud, options, report, device)
+        seen, cell, box = carved_workspace(cloud, options, progress, device)
         carved = time.perf_counter()
         rays = workspace_rays(cloud, box, cell, device)
         heads = {"color": 3} | ({"label": len(cloud.label_names)} if "label" in rays.targets else {})
@@ -55,7 +55,7 @@ def build_scene(
         def fit(field: Field) -> int:
             """Train the network `field` on the rays of the cloud, and return the number of training steps."""
             stage = f"map: {', '.join(field.heads)}"
-            return train(field, rays, seen, options.map_seed, options.max_seconds, partial(report, stage))
+            return train(field, rays, seen, options.map_seed, options.max_seconds, partial(progress, stage))
 
         steps = " + ".join(map(str, pool.map(fit, fields.of)))
     history = {"preset": "default", "carving_s": f"{carved - start:.3f}", "steps": steps}
@@ -64,7 +64,7 @@ def build_scene(
 
 
 def carved_workspace(
-    cloud: PointCloud, options: MapOptions, progress: Progress | None, device: str
+    cloud: PointCloud, options: MapOptions, progress: Progress, device: str
 ) -> tuple[SeenGrid, float, Float[ndarray, "2 3"]]:
     """Return the grid of seen space of a cloud, the side (m) of a map cell, and the corners (m) of the workspace.
 
@@ -74,7 +74,7 @@ def carved_workspace(
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
     rows_inside(cloud, box)
-    (progress or silent)("what was seen", 0.0)
+    progress("what was seen", 0.0)
     # All points are used, because rays that end outside of the workspace may cross it.
     ends = cloud.points_in_base, cloud.image, cloud.camera_centers_in_base
     return carve(*ends, box, cell / 2, cloud.cleared, device), cell, box

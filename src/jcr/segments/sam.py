@@ -78,7 +78,7 @@ def sam_labels(
     model: "Sam2Model",
     reconstruction: Reconstruction,
     hand_eye: Calibration | PublishedCalibration,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> LabelImages:
     """Return label images of the registered images, on the pixel grid of the pointmaps, and label names.
 
@@ -86,7 +86,7 @@ def sam_labels(
     is needed.
     """
     dense = reconstruction.dense
-    images = steps(progress or silent, "segment anything", list(dense.colors))
+    images = steps(progress, "segment anything", list(dense.colors))
     masks = [image_masks(model, image) for image in images]
     x_in_base = hand_eye.base_from_recon(dense.points_in_recon.astype(np.float64))
     return merged(masks, x_in_base, dense.confidence > 0)

@@ -14,7 +14,7 @@ from jcr.camera import project, rays
 from jcr.capture.images import read_one_channel
 from jcr.errors import InputError
 from jcr.files import IMAGES, capture_file
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, PointCloud, Reconstruction
 from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
@@ -97,7 +97,7 @@ def image_labels(
     reconstruction: Reconstruction,
     hand_eye: Calibration | PublishedCalibration,
     options: SegmentOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> LabelImages | None:
     """Return a label per pixel of the pointmaps, and label names; None for methods that label the cloud.
 

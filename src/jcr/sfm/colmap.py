@@ -87,7 +87,7 @@ def reconstruct_colmap(
     capture: Capture,
     features: FeatureName = "sift",
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     working_size_px: int = WORKING_SIZE_PX,
 ) -> Reconstruction:
     """Reconstruct camera poses and tracks of a capture; frame and unit are arbitrary, and a seed fixes every bit.
@@ -98,19 +98,18 @@ def reconstruct_colmap(
     points are half as far off. Raises RejectedError when fewer than three images register, with their number, the
     likely reason and a remedy.
     """
-    report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     all_intrinsics, known, warnings = starting_intrinsics(capture)
     with quiet_colmap():
         camera = working_cameras(all_intrinsics, known, working_size_px)[0]
-        matcher = matcher_of(images, camera, known, features, seed, report)
+        matcher = matcher_of(images, camera, known, features, seed, progress)
 
         def mapped(
             start: list[Intrinsics], matcher: Matcher
         ) -> tuple[MatchedPairs, pycolmap.Reconstruction | None]:
             """Match and map the images with the intrinsics `start`, which are tried in turn."""
             cameras = working_cameras(start, matcher.known, working_size_px)
-            return map_images(matcher, capture.base_from_gripper, start[0], cameras, capture.images, report)
+            return map_images(matcher, capture.base_from_gripper, start[0], cameras, capture.images, progress)
 
         matched, model = mapped(all_intrinsics, matcher)
         like, registered = all_intrinsics[0], 0 if model is None else model.num_reg_images()
@@ -134,35 +133,34 @@ def reconstruct_colmap(
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
         made = _adjusted(model, images, like, known, seed)
-    report("mapping", 1.0)
+    progress("mapping", 1.0)
     notes = matched.notes + made.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
         notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {first_few(missing)}",)
     return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
 
 
-def reconstruct_alone(capture: Capture, seed: int = 0, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_alone(capture: Capture, seed: int = 0, progress: Progress = silent) -> Reconstruction:
     """Reconstruct camera poses and tracks of a capture from its images alone, without its gripper poses.
 
     More images than MOST_ALONE are reconstructed in part: that many, spread over their order. The rest is as in
     `reconstruct_colmap`.
     """
-    report = progress or silent
     rows = np.unique(np.linspace(0, len(capture) - 1, min(len(capture), MOST_ALONE)).round().astype(int))
     images = [read_image(capture.folder / capture.images[row]) for row in rows]
     all_intrinsics, known, warnings = starting_intrinsics(capture)
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         cameras = working_cameras(all_intrinsics, known)
-        matcher = matcher_of(images, cameras[0], known, "sift", seed, report)
+        matcher = matcher_of(images, cameras[0], known, "sift", seed, progress)
         working = resized(all_intrinsics[0], cameras[0].width, cameras[0].height)
-        matched = match_alone(matcher, working, len(images), report)
+        matched = match_alone(matcher, working, len(images), progress)
         matched = replace(matched, geometries=_thinned(matched.geometries, len(images), seed))
         database = write_database(Path(folder), cameras[0], matcher.features.x_px, matched.geometries)
-        model = _map_incrementally(database, cameras, matcher, report, None)
+        model = _map_incrementally(database, cameras, matcher, progress, None)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
         made = _adjusted(model, images, all_intrinsics[0], known, seed)
-    report("mapping", 1.0)
+    progress("mapping", 1.0)
     return replace(made, image_index=rows[made.image_index], warnings=warnings)
 
 
@@ -176,9 +174,8 @@ def reconstruct_near_cameras(
 ) -> Reconstruction | None:
     """Return cameras and tracks adjusted from predicted poses of all images, by matches of the images.
 
-    The result is None where an image has too few points (missing_images.LEAST_POINTS). `recon_from_camera` are the
-    predicted poses of the capture's images. `intrinsics` are held if `known`, and otherwise are the initial estimate.
-    The images are matched with `features`.
+    The result is None where an image has too few points (missing_images.LEAST_POINTS). `intrinsics` are held if
+    `known`, and otherwise are the initial estimate.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
     with matched_database(capture, images, intrinsics, known, features, 0, report) as (database, camera):
@@ -200,9 +197,8 @@ def matched_database(
 ) -> Iterator[tuple[Path, pycolmap.Camera]]:
     """Match a capture's images; yield the path of a COLMAP database of the verified matches, and its camera.
 
-    `images` are those of the capture, in its order. The camera is for images of the working size (`working_cameras`).
-    The database exists, and COLMAP's log is silent, within the context. `intrinsics` are given if `known`, else an
-    initial estimate. `seed` is that of RANSAC.
+    The camera is for images of the working size (`working_cameras`). The database exists, and COLMAP's log is silent,
+    within the context. `intrinsics` are given if `known`, else an initial estimate.
     """
     with quiet_colmap(), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         (camera,) = working_cameras([intrinsics], known)
@@ -222,8 +218,7 @@ def _adjusted(
     """Return the reconstruction of COLMAP's model after its observations are refined by least-squares matching.
 
     All cameras and points are adjusted before and after; `model` is changed. Points beyond _MOST_OBSERVATIONS, chosen
-    at random by `seed`, are deleted first. `images` are all images by row. `like` are the intrinsics at the images'
-    size, held if `known`.
+    at random by `seed`, are deleted first. `like` are the intrinsics at the images' size, held if `known`.
     """
     if model.compute_num_observations() > _MOST_OBSERVATIONS:
         order = np.random.default_rng(seed).permutation(sorted(model.point3D_ids()))
@@ -310,8 +305,7 @@ def matcher_of(
 ) -> Matcher:
     """Return a matcher of the images by SIFT or XFeat (`features`); SIFT keypoints are found now, XFeat's later.
 
-    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`. `seed` is
-    that of RANSAC.
+    `camera` is COLMAP's camera of the images at the size of matching; its intrinsics are given if `known`.
     """
     size = camera.width, camera.height
     if features != "xfeat":
@@ -328,8 +322,7 @@ def matcher_of(
 def _thinned(geometries: Geometries, images: int, seed: int) -> Geometries:
     """Return the matches of features chosen at random by `seed`, so that at most _MOST_MATCHED keypoints remain.
 
-    A feature is a set of keypoints that matches connect; either all its matches are kept or none. `images` is the
-    number of images.
+    A feature is a set of keypoints that matches connect; either all its matches are kept or none.
     """
     rows = [np.asarray(one.inlier_matches, dtype=np.int64).reshape(-1, 2) for one in geometries.values()]
     ends = [of_pair * images + key for key, of_pair in zip(geometries, rows, strict=True)]
@@ -378,9 +371,8 @@ def _map_incrementally(
 ) -> pycolmap.Reconstruction | None:
     """Map the images once with each initial camera; return the model with most images, or None if there is none.
 
-    `matcher` gives the number of images, the seed, and whether the intrinsics are known. COLMAP's thresholds are
-    relaxed if the model lacks more than half of the images. A model `begun` is continued with the images that it lacks.
-    The progress is the share of images in the model; it falls when another camera is tried.
+    COLMAP's thresholds are relaxed if the model lacks more than half of the images. A model `begun` is continued with
+    the images that it lacks. The progress is the share of images in the model; it falls when another camera is tried.
     """
     n_images, folder = len(matcher.features.x_px), database.parent
     pipeline = _incremental_options(matcher)
@@ -425,10 +417,7 @@ def _map_incrementally(
 def _not_registered(
     matcher: Matcher, matched: MatchedPairs, model: pycolmap.Reconstruction | None
 ) -> RejectedError:
-    """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy.
-
-    `matched` are the pairs that were mapped, and `model` is the largest model, None if there is none.
-    """
+    """Return the error that too few images have a camera pose, with their number, the likely reason and a remedy."""
     x_px, pairs = matcher.features.x_px, len(matched.geometries)
     features = int(np.median([len(x) for x in x_px]))
     if features < _FEW_FEATURES:

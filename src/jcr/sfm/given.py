@@ -19,7 +19,7 @@ MIN_POINTS = 50
 
 
 def reconstruct_given(
-    capture: Capture, cameras: Path, seed: int = 0, progress: Progress | None = None
+    capture: Capture, cameras: Path, seed: int = 0, progress: Progress = silent
 ) -> Reconstruction:
     """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
@@ -27,7 +27,6 @@ def reconstruct_given(
     the model, or with fewer than MIN_POINTS are triangulated from SIFT matches. Raises InputError when the model
     contains fewer than three of the images, RejectedError when too few points can be triangulated.
     """
-    report = progress or silent
     model = read_model(cameras)
     names = {model.image(image_id).name: image_id for image_id in sorted(model.reg_image_ids())}
     found = _images_of(names, capture.images, str(cameras))
@@ -40,7 +39,7 @@ def reconstruct_given(
     if len(tracks.points_in_recon) < MIN_POINTS:
         some = capture.of_rows(np.array(known))
         images = [read_image(some.folder / name) for name in some.images]
-        with matched_database(some, images, intrinsics, True, "sift", seed, report) as (database, camera):
+        with matched_database(some, images, intrinsics, True, "sift", seed, progress) as (database, camera):
             model = triangulated_model(database, camera, dict(enumerate(recon_from_camera)))
             tracks = tracks_of(model, range(1, len(images) + 1), capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
@@ -64,8 +63,8 @@ def _images_of(names: Mapping[str, int], images: Sequence[str], where: str) -> d
     """Return the id of the model's image for each image of the capture that the model has, by index in the capture.
 
     `names` are the ids of the model's images by name. The longest name that is the end of an image's path is its own;
-    otherwise an image and a name with the same file name belong together. Raises InputError, begun with `where`, if
-    a name fits several images, or an image several names.
+    otherwise an image and a name with the same file name belong together. Raises InputError if a name fits several
+    images, or an image several names.
     """
     by_path = {Path(name).parts: name for name in names}
     if len(by_path) < len(names):
@@ -111,9 +110,8 @@ def shared_intrinsics(
 ) -> Intrinsics:
     """Return the intrinsics that the images of a COLMAP model with these ids share.
 
-    Pixel (0, 0) is the centre of the top-left pixel, unlike in the model. Raises InputError, begun with `where`, if
-    intrinsics differ, are for images of another size than `size` (width, height), or have a distortion model that jcr
-    does not support.
+    Pixel (0, 0) is the centre of the top-left pixel, unlike in the model. Raises InputError if intrinsics differ, are
+    for images of another size than `size` (width, height), or have a distortion model that jcr does not support.
     """
     cameras = [model.camera(model.image(image_id).camera_id) for image_id in image_ids]
     kinds = {(c.model.name, *map(float, (c.width, c.height, *c.params))) for c in cameras}

@@ -86,10 +86,7 @@ class LiveMap:
         return [] if self._model is None or self._model.num_reg_images() < 2 else rows_of(self._model)
 
     def reconstruction(self) -> Reconstruction | None:
-        """Return the map as a reconstruction; None with fewer than two registered images.
-
-        The `image_index` of the result has rows of the capture.
-        """
+        """Return the map as a reconstruction; None with fewer than two registered images."""
         rows = sorted(self._rows(), key=lambda row: self._places[row])
         if self._model is None or not rows:
             return None

@@ -279,7 +279,6 @@ def _align_used(
     `track` is the row of each observation in `template`, `pull` and `deviation`, which come from `_templates`. A step
     is Σ (grey − template)·pull. The correlation is that of patch and template, weighted by _WEIGHTS. It does not change
     without convergence, if the patch leaves the image, or if its centre moves more than `most_px` from `keypoint_px`.
-    Other arguments are those of `_align_all`.
     """
     patch, step = np.empty(len(_WEIGHTS)), np.empty(_FREE)
     for o in used:

@@ -47,8 +47,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture.
 
     Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones). It
-    also raises InputError if every image is more than `options.max_gap_ms` away from pose samples. `report` receives
-    the progress.
+    also raises InputError if every image is more than `options.max_gap_ms` away from pose samples.
     """
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
@@ -92,8 +91,7 @@ class _Bag:
     def __init__(self, reader: Any, path: Path, options: ReadOptions, report: Progress) -> None:
         """Read transforms, joint states, CameraInfo and image time stamps of the bag `path`.
 
-        `reader` is the open bag (AnyReader); `report` receives the progress. Raises InputError for a missing topic or
-        message content that is not ROS's.
+        Raises InputError for a missing topic or message content that is not ROS's.
         """
         self.reader, self.path, self.tree = reader, path, TfTree()
         stamps, recorded = list[int](), list[int]()
@@ -157,8 +155,7 @@ class _Bag:
     def messages(self, connections: list[Any], **span: int) -> Iterator[tuple[Any, int, Any]]:
         """Yield the connection, time of recording (ns) and decoded content of each message of `connections`.
 
-        `connections` are those of the bag's reader. `span` may limit the times of recording: `start` (included) and
-        `stop` (excluded), in ns. Raises InputError if a message is damaged.
+        `span` may limit the times of recording: `start` (included) and `stop` (excluded), in ns.
         """
         try:
             for connection, at, raw in self.reader.messages(connections, **span):
@@ -234,8 +231,7 @@ def _opened(path: Path) -> Iterator[Any]:
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
     """Return the topic of --camera-topic, or without that option the only topic with colour images.
 
-    `reader` is the open bag (AnyReader), `path` its path for messages. Raises InputError that lists the topics if that
-    one does not exist, or if several have colour images.
+    Raises InputError that lists the topics if that one does not exist, or if several have colour images.
     """
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
     videos = {c.topic: VIDEOS[c.msgtype] for c in reader.connections if c.msgtype in VIDEOS}
@@ -256,9 +252,8 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
     """Return the reader's connections (topics) with the robot's poses: tf, a PoseStamped topic, or joint states.
 
-    Joint states are read if `options.urdf` is given; a topic of poses if the options name it, or without tf.
-    `reader` is the open bag (AnyReader), `path` its path for messages. Raises InputError if there are none, or if
-    several topics have joint states and the options choose none.
+    Joint states are read if `options.urdf` is given; a topic of poses if the options name it, or without tf. Raises
+    InputError if there are none, or if several topics have joint states and the options choose none.
     """
     if options.urdf is None:
         found = [c for c in reader.connections if c.msgtype in TF]

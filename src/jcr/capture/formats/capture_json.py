@@ -123,8 +123,7 @@ def stated_fields(
 ) -> dict[str, Any]:
     """Return the optional fields of Capture from a capture.json, as keyword arguments: intrinsics, joints, robot, ….
 
-    `size` is the width and height of the images (px); `frames` are the entries of the images in the capture. The
-    cameras of the entry "cameras" are not included (see `with_cameras`).
+    The cameras of the entry "cameras" are not included (see `with_cameras`).
     """
     angles = [frame.joints for frame in frames if frame.joints is not None]
     joints = np.array(angles) if angles and len(angles) == len(frames) else None
@@ -150,8 +149,8 @@ def stated_fields(
 def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool] | None = None) -> Capture:
     """Return the capture with the other cameras from `cameras`, the entry "cameras" of a capture.json.
 
-    `used` is True for each frame of the file that the capture contains; None: it contains all. Raises InputError,
-    begun with `where`, if the entry is invalid.
+    `used` is True for each frame of the file that the capture contains; None: it contains all. Raises InputError if the
+    entry is invalid.
     """
     entries: dict[str, CameraEntry] = validated_content(_CAMERAS, cameras, f"{where}: cameras")
     own = next((name for name, entry in entries.items() if entry.is_own), None)
@@ -165,10 +164,7 @@ def with_cameras(capture: Capture, cameras: Any, where: str, used: Sequence[bool
 
 
 def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: Sequence[bool]) -> CellCamera:
-    """Return the camera `name` from its entry in "cameras" of capture.json; raise InputError if its image sizes differ.
-
-    `used` is True for each frame of the file that `capture` contains. Messages begin with `where`.
-    """
+    """Return the camera `name` from its entry in "cameras"; raise InputError if its image sizes differ."""
     poses, frame, watches = None, None, capture.mount == "base"
     if watches is not (entry.watches == "gripper" or (watches and entry.watches is None)):
         raise InputError(
@@ -214,8 +210,7 @@ def _stated_intrinsics(
 ) -> dict[str, Any]:
     """Return the intrinsics of an entry in a capture.json as the fields `intrinsics` and `intrinsics_std` of Capture.
 
-    `size` is the width and height of the images (px). `intrinsics` is None, and `intrinsics_std` is missing, where the
-    entry `stated` has none. Raises InputError, begun with `where`, for invalid intrinsics.
+    `intrinsics` is None, and `intrinsics_std` is missing, where the entry `stated` has none.
     """
     given, std = stated.intrinsics, stated.intrinsics_std
     intrinsics = None if given is None else given.record(size, f"{where}: intrinsics")
@@ -319,7 +314,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
-    """Return the path `folder/name`; raise InputError, begun with `where`, if the folder has no such file."""
+    """Return the path `folder/name`; raise InputError if the folder has no such file."""
     if not (file := capture_file(folder, name, where)).is_file():
         raise InputError(f"{where}: {name} is not there; add it, or remove the key")
     return file

@@ -112,8 +112,8 @@ def episodes_of(path: Path, options: ReadOptions) -> tuple[list[int], int]:
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
     """Extract the sharpest frames at rest from the episode that the options name; return them as a capture.
 
-    Images are written to the folder `into`; `report` receives the progress. Raises InputError that lists the existing
-    cameras, states or episodes if the options name others, or more than one episode.
+    Raises InputError that lists the existing cameras, states or episodes if the options name others, or more than one
+    episode.
     """
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
@@ -149,7 +149,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """Read the episode number `index` (from 0) of the data set at `path`, whose meta/info.json is `info`.
 
-    `camera` and `key` name the columns of images and robot states. Raises InputError for a missing or damaged episode.
+    Raises InputError for a missing or damaged episode.
     """
     has_video = info.features[camera].dtype == "video"
     fields: dict[str, Any] = {"episode_chunk": index // info.chunks_size, "episode_index": index}
@@ -194,7 +194,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
 
 
 def _seconds(values: Sequence[Any], where: str) -> Float[ndarray, " n"]:
-    """Return times (s) from the cells of a table; raise InputError, begun with `where`, if one is no time."""
+    """Return times (s) from the cells of a table; raise InputError if one is no time."""
     for row, value in enumerate(values):
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not abs(value) <= LATEST_S:
@@ -253,7 +253,7 @@ def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
 def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) -> Iterator[Picture]:
     """Yield row, image (encoded bytes or RGB pixels) and file ending for each of k ascending rows of an episode.
 
-    The images are from its video or table. `key` is the image column, `fps` the frame rate of the video (1/s).
+    The images are from its video or table.
     """
     if episode.video is not None:
         frames = _video_frames(episode.video, episode.video_start_s + episode.time_s[rows], 0.5 / fps)
@@ -312,8 +312,7 @@ def _poses(
     """Return base_from_gripper (m) and joint angles (rad) of n frames from `state`, k numbers per frame.
 
     With an `arm` the numbers are positions of its joints, else poses. The joint angles, in the order of the arm's
-    chain, are None without an arm, or if a sliding joint moves the gripper. `key` and `feature` are the name and
-    description of the data set's column, `path` is that of the data set. Raises InputError if the numbers are neither.
+    chain, are None without an arm, or if a sliding joint moves the gripper.
     """
     where, names, width = f"{path}: {key}", feature.numbers(), state.shape[1]
     if key == CARTESIAN and not names:

@@ -34,12 +34,12 @@ _ANNOUNCED = set[str]()
 
 
 def reconstruct_dust3r(
-    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress | None = None
+    capture: Capture, weights: Weights, device: str, backend: str, progress: Progress = silent
 ) -> Reconstruction:
     """Return camera poses and pointmaps of a capture, in metres with MASt3R and in an arbitrary unit with DUSt3R.
 
-    `weights` decide which of both networks runs, on the torch device `device`. `backend` is the name that the result
-    states, "dust3r" or "mast3r". Raises InputError for images or weights that cannot be used.
+    `weights` decide which of both networks runs, on the torch device `device`. Raises InputError for images or weights
+    that cannot be used.
     """
     edges = pairs_to_predict(capture.base_from_gripper)
     predictions, images, notes = predict_capture(capture, edges, weights, device, progress)
@@ -56,7 +56,7 @@ def predict_capture(
     edges: Int[ndarray, "e 2"],
     weights: Weights,
     device: str,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[PairPredictions, PreparedImages, tuple[str, ...]]:
     """Predict the pointmaps of the pairs `edges` of a capture's images (rows); return them, the images and notes.
 
@@ -89,7 +89,7 @@ def predict_pairs(
     images: PreparedImages,
     names: tuple[str, ...],
     edges: Int[ndarray, "e 2"],
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
     """Predict the pointmaps of the ordered image pairs `edges`; return them with notes for the user.
 
@@ -97,7 +97,6 @@ def predict_pairs(
     images. The encoder runs once per image, and the decoder once per pair. The batch is halved when CUDA runs out of
     memory; InputError is raised when one pair does not fit.
     """
-    report = progress or silent
     features, sizes = dict[int, EncodedImages](), [MAX_BATCH[network.device.type]]
     height, width = images.colors.shape[1:3]
     arrays = [np.empty((len(edges), height, width, *point), np.float32) for point in ((3,), ()) * 2]
@@ -116,8 +115,8 @@ def predict_pairs(
         for array, values in zip(arrays, (*view1, *view2), strict=True):
             array[rows] = values.cpu().numpy()
 
-    _in_batches(encode, len(images.colors), sizes, lambda share: report("encode images", share))
-    _in_batches(decode, len(edges), sizes, lambda share: report("predict pairs", share))
+    _in_batches(encode, len(images.colors), sizes, lambda share: progress("encode images", share))
+    _in_batches(decode, len(edges), sizes, lambda share: progress("predict pairs", share))
     notes = tuple(f"out of memory on the {network.device}: {size} pairs at a time" for size in sizes[1:])
     pts3d, conf, pts3d_in_other_view, conf2 = arrays
     predictions = PairPredictions(
@@ -141,7 +140,7 @@ def _in_batches(
     """Call `work` on batches of the integers 0 to `count` − 1; the batch size is the last number in `sizes`.
 
     When CUDA runs out of memory, half of this size is appended to `sizes`, and the batch is repeated. Raises InputError
-    if a batch of one does not fit. `report` receives the finished fraction, 0 to 1, after each batch.
+    if a batch of one does not fit.
     """
     done = 0
     while done < count:
@@ -195,10 +194,7 @@ def load_weights(weights: Weights, device: str = "cpu") -> Dust3r:
 
 
 def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> Dust3r:
-    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit.
-
-    `config` is the content of config.json, `state` contains the tensors by name, and `path` is named in messages.
-    """
+    """Return the network of a configuration with the weights `state`; raise InputError for `path` if they do not fit."""
     mast3r_only = ("two_confs", "desc_conf_mode", "desc_mode", "local_feat_dim")
     config = {key: value for key, value in config.items() if key not in mast3r_only}
     config["head_type"] = str(config.get("head_type", "linear")).removeprefix("catmlp+")

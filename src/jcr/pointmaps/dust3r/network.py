@@ -135,10 +135,7 @@ class Dust3r(nn.Module):
         return EncodedImages(self.enc_norm(x), grid)
 
     def decode(self, features1: EncodedImages, features2: EncodedImages) -> tuple[Pointmap, Pointmap]:
-        """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame.
-
-        Swapped arguments give other predictions.
-        """
+        """Return the pointmaps of the first and the second image of each pair, both in the first camera's frame."""
         rotary1, rotary2 = (
             rotary_embedding(f.grid, self.head_dims[1], self.rope_base, f.tokens.device)
             for f in (features1, features2)
@@ -166,7 +163,7 @@ def rotary_embedding(grid: tuple[int, int], head_dim: int, base: float, device: 
     """Return cosines and sines (RoPE, Su et al. 2021) of the angle p · base^(−2k/D), shape (2, n, 2, D/2).
 
     The axes are cosine and sine; the n tokens, row by row; the coordinate p (row, then column) of the token; the
-    frequency k. `grid` is rows and columns of tokens. An attention head has `head_dim` = 2 D channels.
+    frequency k. An attention head has `head_dim` = 2 D channels.
     """
     position = torch.cartesian_prod(*(torch.arange(size, device=device) for size in grid))
     exponent = torch.arange(0, head_dim // 2, 2, device=device).float() / (head_dim // 2)
@@ -225,10 +222,7 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the attention of tokens x to tokens y of the other image, with the shape of x.
-
-        `rotary_x` and `rotary_y` are the position embeddings of the tokens (`rotary_embedding`).
-        """
+        """Return the attention of tokens x to tokens y of the other image, with the shape of x."""
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
@@ -276,10 +270,7 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(dim, mlp_ratio)
 
     def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
-        """Return the tokens x after self-attention, cross-attention to the other image's tokens y, and perceptron.
-
-        `rotary_x` and `rotary_y` are the position embeddings of the tokens.
-        """
+        """Return the tokens x after self-attention, cross-attention to the other image's tokens y, and perceptron."""
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
@@ -303,10 +294,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps of images from the tokens (b,n,c) in the last entry of `layers`.
-
-        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
-        """
+        """Return the pointmaps of images from the tokens (b,n,c) in the last entry of `layers`."""
         tokens = self.proj(layers[-1])
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
 
@@ -320,10 +308,7 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
-        """Return the pointmaps of images from the tokens (b,n,c) in four entries of `layers`.
-
-        `layers` has the encoder's tokens, then those after each decoder block. `grid` is rows and columns of tokens.
-        """
+        """Return the pointmaps of images from the tokens (b,n,c) in four entries of `layers`."""
         return pointmap(self.dpt([layers[layer].mT.unflatten(-1, grid) for layer in self.layers]))
 
 

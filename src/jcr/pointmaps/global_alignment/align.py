@@ -64,7 +64,7 @@ class Alignment:
         return rays(pinhole).astype(np.float32) * self.depth[..., None]
 
 
-def global_align(pairs: Path | str | PairPredictions, progress: Progress | None = None) -> Alignment:
+def global_align(pairs: Path | str | PairPredictions, progress: Progress = silent) -> Alignment:
     """Estimate camera poses, focal length, depths and pair scales from pairwise pointmaps, or from their npz file.
 
     The focal length is estimated from the pointmaps. The principal point and the ratio fy / fx are those of the
@@ -83,14 +83,11 @@ def global_align(pairs: Path | str | PairPredictions, progress: Progress | None 
             f"no chain of pairs joins {names} to the other images; predict pairs between them, or leave these out"
         )
     problem = AlignmentProblem.of(predictions)
-    return _dense_alignment(problem, solve(problem, PIXELS), progress or silent)
+    return _dense_alignment(problem, solve(problem, PIXELS), progress)
 
 
 def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, progress: Progress) -> Alignment:
-    """Return the result of the alignment with depth and confidence of every pixel, not only of those used to solve it.
-
-    The poses, focal length and pair scales of `solution` do not change.
-    """
+    """Return the result of the alignment with depth and confidence of every pixel, not only of those that solved it."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)

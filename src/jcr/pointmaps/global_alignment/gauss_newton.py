@@ -141,9 +141,7 @@ def _least_squares(
 ) -> tuple[Iterate, list[ImageEquations]]:
     """Minimise the weighted squares of residuals and pairs' errors; return the result and the last equations.
 
-    The result is the state with its residuals, and there is one ImageEquations per image. The weights are those at
-    `begin`. `noise` is the spread of each image's residuals. `pair_spread` has the standard deviations of the pairs'
-    errors (three of translation, three of rotation). Raises RejectedError where the equations are singular.
+    The weights are those at `begin`. Raises RejectedError where the equations are singular.
     """
     latest: list[ImageEquations] = []
     weights = [residual_weights(*of) for of in zip(images, begin[1], noise, strict=True)]
@@ -234,7 +232,6 @@ def image_equations(
 ) -> ImageEquations:
     """Return the Gauss-Newton equations of the pointmaps of image `o`, with residuals `r` and their `weights`.
 
-    `weights` has those across and along the line of sight; `pair_spread` the standard deviations of the pairs' errors.
     A modelled point lies at distance |x| along the unit vector x̂. If it moves by v, the weighted squares of the
     residuals' changes sum to vᵀ (α I + β x̂ x̂ᵀ) v. Here α = w_across/|x|² and β = w_along/|x|² − α, with the weights
     of the residuals across and along x̂. Raises LinAlgError where the pairs' errors cannot be eliminated.
@@ -289,9 +286,8 @@ def _eliminated(
 ) -> dict[str, ndarray]:
     """Return the fields of ImageEquations, by name, that follow from the elimination of the pairs' errors.
 
-    They are `hessian`, `gradient`, `gain`, `offset`, `axes` and `error_variance`. The c rows of `hessian` and
-    `gradient` are six per second view (twists), then the log pair scales and the log focal length. `pair_spread` are
-    the prior standard deviations of the errors (translation, rotation).
+    The c rows of `hessian` and `gradient` are six per second view (twists), then the log pair scales and the log focal
+    length.
     """
     n, count = o.second_count, 6 * o.second_count
     axes = adjoint(inverse(state.recon_from_camera[o.observer[:n]]))

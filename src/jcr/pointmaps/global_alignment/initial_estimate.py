@@ -112,8 +112,7 @@ def _contradiction(
 
     The disagreement of rotations that differ by the angle θ is 2 sin(θ/2), about θ in rad. It detects a pair whose two
     pointmaps fit each other but not the scene. The result is the first quartile over the third images. With a third of
-    the pairs wrong, most products around a correct pair are wrong, too. The result is 0 without a third image. `edges`
-    are the images (first, second) of each pair, and `images` is the number of images.
+    the pairs wrong, most products around a correct pair are wrong, too. The result is 0 without a third image.
     """
     rotation = np.full((images, images, 3, 3), np.nan)
     first, second = edges.T

@@ -162,8 +162,7 @@ def _inflation(
 ) -> Float[ndarray, " k"]:
     """Return the variance of the mean residuals of coarse cells, over their variance if residuals were independent.
 
-    The result (design effect) is at least 1, for each of k pointmaps. `parts` are the c components of the residuals at
-    m pixels, and `weight` their weights. `o` gives the cell of each pixel.
+    The result (design effect) is at least 1, for each of k pointmaps.
     """
     total = np.maximum(weight.sum(axis=1), 1e-12)
     cell_total = weight @ o.cell
