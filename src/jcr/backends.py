@@ -368,11 +368,8 @@ def network_weights(options: ReconstructOptions) -> Weights:
     row = BACKENDS[options.backend]
     name = options.weights or row.hub_id
     published = next((other for other in BACKENDS.values() if other.hub_id == name), None)
-    licence = (
-        published.licence
-        if published
-        else f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
-    )
+    unknown = f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
+    licence = published.licence if published else unknown
     if options.weights is not None and Path(name).exists():
         return Weights(Path(name), name, licence)
     revision = (published and published.revision) or None

@@ -247,13 +247,10 @@ def _indexed(table: Table, images: Sequence[str]) -> list[Table]:
     columns = [[row[k] for row in table.rows] for k in range(len(table.columns))]
     texts = [[cell for cell in cells if isinstance(cell, str)] for cells in columns]
     whole = [cells for cells in texts if len(cells) == len(table.rows)]
-    own = {plain_name(image) for image in images}
-    of_images = [
-        cells
-        for cells in whole
-        if cells and all(Path(cell).suffix.lower() in IMAGE_SUFFIXES for cell in cells)
-    ]
-    if not of_images or len({plain_name(cell) for cell in of_images[0]} & own) < NEARLY * len(own):
+    names = {plain_name(image) for image in images}
+    endings = [{Path(cell).suffix.lower() for cell in cells} for cells in whole]
+    of_images = [cells for cells, own in zip(whole, endings, strict=True) if own and own <= {*IMAGE_SUFFIXES}]
+    if not of_images or len({plain_name(cell) for cell in of_images[0]} & names) < NEARLY * len(names):
         return []
     for cells in whole:
         if cells is of_images[0] or len(set(cells)) < len(cells):

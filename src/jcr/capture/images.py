@@ -202,9 +202,7 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
 def exposure_fault(image: UInt8[ndarray, "h w 3"]) -> str | None:
     """Return "nearly black" (mean grey level up to 12 of 255) or "nearly white" (from 243); None if exposed well."""
     brightness = float(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).mean())
-    if DARK < brightness < BRIGHT:
-        return None
-    return "nearly black" if brightness <= DARK else "nearly white"
+    return "nearly black" if brightness <= DARK else "nearly white" if brightness >= BRIGHT else None
 
 
 def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:

@@ -105,10 +105,8 @@ def intrinsics_entry(stated: dict[str, Any], where: str) -> IntrinsicsEntry:
 
     Raises InputError for what jcr's camera models cannot express.
     """
-    model, coefficients = (
-        str(stated.get("model") or "").lower(),
-        [*map(float, stated.get("distortion") or ())],
-    )
+    model = str(stated.get("model") or "").lower()
+    coefficients = [*map(float, stated.get("distortion") or ())]
     if abs(skew := float(stated.get("skew") or 0.0)) > SKEW * abs(stated["fx"]):
         raise InputError(
             f"{where}: a skew of {skew:.4g} px between the axes, which cameras do not have; calibrate without skew, or "
@@ -265,10 +263,7 @@ def _of_matrices(file: Path) -> Iterator[dict[str, Any]]:
         matrix = numbers.reshape(3, 3) if numbers.size == 9 else np.full((3, 3), np.nan)
         if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)) or matrix[0, 0] <= 2:
             continue
-        others = [
-            numbers_of_table(one).ravel()
-            for one in tables
-            if set(words_of(one.place)) & {"dist", "d", "distortion", "distcoeffs"}
-        ]
-        distortion = others[0].tolist() if others and others[0].size in (4, 5, 8) else []
+        named = [one for one in tables if {"dist", "d", "distortion", "distcoeffs"} & {*words_of(one.place)}]
+        distortion = numbers_of_table(named[0]).ravel().tolist() if named else []
+        distortion = distortion if len(distortion) in (4, 5, 8) else []
         yield entry_of_matrix(matrix.ravel()) | {"distortion": distortion}

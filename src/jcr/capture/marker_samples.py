@@ -54,11 +54,8 @@ def read(path: Path, options: ReadOptions) -> PosePairs:
     (reading, gripper), (_, marker) = (_poses(path, entries, key, options) for key in keys)
     sound = np.flatnonzero(np.isfinite(gripper).all((1, 2)) & np.isfinite(marker).all((1, 2)))
     require_frames(len(sound), str(path))
-    left_out = [
-        f"left out: sample {row + 1} holds no pair of poses"
-        for row in range(len(entries))
-        if row not in sound
-    ]
+    lost = np.setdiff1d(np.arange(len(entries)), sound).tolist()
+    left_out = [f"left out: sample {row + 1} holds no pair of poses" for row in lost]
     return PosePairs(
         source=path,
         images=tuple(f"sample {row + 1}" for row in sound),

@@ -1,7 +1,6 @@
 """Notations of rotations, names of robot makers for them, and the conversion of rows of numbers to transforms."""
 
 import warnings
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -42,43 +41,35 @@ NUMBERS = {"quat:xyzw": 4, "quat:wxyz": 4, "rotvec": 3, "matrix": 9, "matrix:col
 """Notations of a rotation, and how many numbers each has."""
 
 
-class Maker(NamedTuple):
-    """Notation in which the robots of a maker show a pose, and the document that states it."""
-
-    notation: str
-    source: str
-
-
 # "euler:xyz" about fixed axes is Rz(third)·Ry(second)·Rx(first); "euler:ZYX" is Rz(first)·Ry(second)·Rx(third).
 MAKERS = {
-    "rpy": Maker("euler:xyz", "ROS, REP 103 and URDF: roll, pitch, yaw about fixed axes"),
-    "ur": Maker("rotvec", "Universal Robots, The URScript Programming Language, pose p[x, y, z, rx, ry, rz]"),
-    "franka": Maker("matrix:columns", "Franka, libfranka, RobotState::O_T_EE: column-major 4x4"),
-    "xarm": Maker("euler:xyz", "UFACTORY, xArm Developer Manual: roll, pitch, yaw about fixed axes"),
-    "xarm-axis-angle": Maker("rotvec", "UFACTORY, xArm Developer Manual: axis-angle pose"),
-    "kuka": Maker("euler:ZYX", "KUKA, System Software operating manual: A about Z, B about Y, C about X"),
-    "fanuc": Maker("euler:xyz", "FANUC, operator's manual of the R-30iB: W, P, R about fixed X, Y, Z"),
-    "yaskawa": Maker("euler:xyz", "Yaskawa, DX200 operator's manual: Rx, Ry, Rz about fixed X, Y, Z"),
-    "abb": Maker("quat:wxyz", "ABB, RAPID technical reference manual, data type orient: q1 is the scalar"),
-    "unitree": Maker("euler:xyz", "Unitree, Z1 SDK: roll, pitch, yaw"),
-    "realman": Maker("euler:xyz", "RealMan, RM API2, rm_euler_t: rx, ry, rz about fixed axes"),
-    "doosan": Maker("euler:ZYZ", "Doosan Robotics, programming manual, posx: A, B, C are Z-Y-Z"),
-    "kawasaki": Maker("euler:ZYZ", "Kawasaki, AS Language reference manual: O, A, T are Z-Y-Z"),
-    "staubli": Maker(
-        "euler:XYZ", "Stäubli, VAL 3 reference manual, type trsf: rx, ry, rz about moving X, Y, Z"
-    ),
-    "mecademic": Maker("euler:XYZ", "Mecademic, Meca500 programming manual: mobile X-Y-Z"),
-    "techman": Maker("euler:xyz", "Techman Robot, TMflow expression editor: RX, RY, RZ with R = Rz·Ry·Rx"),
-    "aubo": Maker("euler:xyz", "AUBO, ARCS interface description: rx, ry, rz with R = Rz·Ry·Rx"),
-    "jaka": Maker("euler:xyz", "JAKA, SDK manual, type Rpy: rx, ry, rz about fixed axes"),
-    "epson": Maker("euler:ZYX", "Epson, RC+ user's guide: U about Z, V about Y, W about X"),
+    "rpy": "euler:xyz",  # ROS, REP 103 and URDF: roll, pitch, yaw about fixed axes
+    "ur": "rotvec",  # Universal Robots, The URScript Programming Language, pose p[x, y, z, rx, ry, rz]
+    "franka": "matrix:columns",  # Franka, libfranka, RobotState::O_T_EE: column-major 4x4
+    "xarm": "euler:xyz",  # UFACTORY, xArm Developer Manual: roll, pitch, yaw about fixed axes
+    "xarm-axis-angle": "rotvec",  # UFACTORY, xArm Developer Manual: axis-angle pose
+    "kuka": "euler:ZYX",  # KUKA, System Software operating manual: A about Z, B about Y, C about X
+    "fanuc": "euler:xyz",  # FANUC, operator's manual of the R-30iB: W, P, R about fixed X, Y, Z
+    "yaskawa": "euler:xyz",  # Yaskawa, DX200 operator's manual: Rx, Ry, Rz about fixed X, Y, Z
+    "abb": "quat:wxyz",  # ABB, RAPID technical reference manual, data type orient: q1 is the scalar
+    "unitree": "euler:xyz",  # Unitree, Z1 SDK: roll, pitch, yaw
+    "realman": "euler:xyz",  # RealMan, RM API2, rm_euler_t: rx, ry, rz about fixed axes
+    "doosan": "euler:ZYZ",  # Doosan Robotics, programming manual, posx: A, B, C are Z-Y-Z
+    "kawasaki": "euler:ZYZ",  # Kawasaki, AS Language reference manual: O, A, T are Z-Y-Z
+    "staubli": "euler:XYZ",  # Stäubli, VAL 3 reference manual, type trsf: rx, ry, rz about moving X, Y, Z
+    "mecademic": "euler:XYZ",  # Mecademic, Meca500 programming manual: mobile X-Y-Z
+    "techman": "euler:xyz",  # Techman Robot, TMflow expression editor: RX, RY, RZ with R = Rz·Ry·Rx
+    "aubo": "euler:xyz",  # AUBO, ARCS interface description: rx, ry, rz with R = Rz·Ry·Rx
+    "jaka": "euler:xyz",  # JAKA, SDK manual, type Rpy: rx, ry, rz about fixed axes
+    "epson": "euler:ZYX",  # Epson, RC+ user's guide: U about Z, V about Y, W about X
 }
-"""Notation of each maker; units differ between a maker's products and follow from the numbers or `--pose-units`."""
+"""Notation of each maker, with the document that states it; units differ between the products of a maker, and follow
+from the numbers or `--pose-units`."""
 
 
 def notation_of(name: str) -> str:
     """Return the notation for a value of `--pose-convention`, a notation or a maker; raise InputError for others."""
-    notation = MAKERS[name].notation if name in MAKERS else name
+    notation = MAKERS.get(name, name)
     sequence = notation.removeprefix("euler:")
     if notation in NUMBERS or (notation == f"euler:{sequence}" and sequence in SEQUENCES):
         return notation

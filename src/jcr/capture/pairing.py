@@ -135,13 +135,10 @@ def _by_cells(table: Table, images: Sequence[str]) -> Pairing | None:
         enough = NEARLY * min(len(images), len(table.rows))
         if count >= max(enough, 1) and count > most:
             most = count
-            name = (
-                "names of rows"
-                if column is None
-                else f"column {table.columns[column] or f'no. {column + 1}'}"
-            )
-            own_column = frozenset(() if column is None else (column,))
-            best = Pairing(how=f"by the {name}", row=row, skipped=own_column, is_by_name=True)
+            name, skipped = "names of rows", frozenset[int]()
+            if column is not None:
+                name, skipped = f"column {table.columns[column] or f'no. {column + 1}'}", frozenset([column])
+            best = Pairing(how=f"by the {name}", row=row, skipped=skipped, is_by_name=True)
     return best
 
 
@@ -320,10 +317,8 @@ def poses_at_images(
                 "first pose: the two clocks differ; correct the time stamps of one, or add a column with the images' "
                 "names"
             )
-        stamps, note = (
-            stamps + shift,
-            f"the clocks differ by {shift / 3.6e12:+.2f} h; the poses were shifted by that",
-        )
+        stamps = stamps + shift
+        note = f"the clocks differ by {shift / 3.6e12:+.2f} h; the poses were shifted by that"
     at_images, gap_ns = interpolated_poses(times, known, stamps)
     stale = gap_ns > 1e6 * max_gap_ms
     at_images[stale] = np.nan

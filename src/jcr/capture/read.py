@@ -84,12 +84,8 @@ def read_source(
         if extra.get("made_from") == origin:
             return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
         found = FORMATS[name].read(path, options, folder, progress)
-    if (
-        options.pose_inverted
-        and isinstance(found, Capture)
-        and found.reading is None
-        and not found.candidates
-    ):
+    is_unread = isinstance(found, Capture) and found.reading is None and not found.candidates
+    if options.pose_inverted and is_unread:
         read = Reading(file=path.name, inverted=True, decided_by="option")
         found = replace(found, base_from_gripper=inverse(found.base_from_gripper), reading=read)
     names = {"base": options.base_frame, "gripper": options.gripper_frame}

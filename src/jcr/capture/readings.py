@@ -242,11 +242,8 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
             made = poses_of(numbers[:, at], numbers[:, of_rotation], notations[0])
             is_rotation = int(np.isnan(made[:, 0, 0]).sum()) <= tolerated(len(numbers))
             if is_rotation and not numbers[:, none].any():
-                found.append(
-                    PoseColumns(
-                        position=at, rotation=of_rotation, notations=notations, name=name, is_named=False
-                    )
-                )
+                columns_of = {"position": at, "rotation": of_rotation, "notations": notations}
+                found.append(PoseColumns(**columns_of, name=name, is_named=False))
         if found:
             return found[:1] if len(columns) == 16 else _most_exact(found, numbers)
     return []
@@ -337,12 +334,9 @@ def readings_of(
     sets = pose_columns(table, skipped)
     if options.pose_columns is not None:
         sets = [one for one in sets if one.name == options.pose_columns.lower()]
-    moving = [
-        one
-        for one in sets
-        if np.ptp(numbers[:, one.position], axis=0).max(initial=0.0) > 0 or len(numbers) < 2
-    ]
-    sets = moving or sets  # a position that never changes is something else, such as an arm's configuration
+    moving = [one for one in sets if np.ptp(numbers[:, one.position], axis=0).max(initial=0.0) > 0]
+    # A position that never changes is something else, such as an arm's configuration.
+    sets = moving if moving and len(numbers) > 1 else sets
     # All makers write the position first.
     if options.pose_convention != "auto" or _maker_in(table.words) is not None:
         sets = [one for one in sets if one.position < one.rotation or len(one.rotation) == 9] or sets
@@ -410,11 +404,8 @@ def untaken_readings(
         own = replace(columns, notations=every, is_named=False, length=taken.units.split("-")[0], angle=None)
         with suppress(InputError):
             found += _readings_of_columns(replace(table, words=""), own, numbers, ReadOptions(), where)
-    return [
-        one
-        for one in _distinct(found)
-        if (one[0].notation, one[0].inverted) != (taken.notation, taken.inverted)
-    ]
+    own = taken.notation, taken.inverted
+    return [one for one in _distinct(found) if (one[0].notation, one[0].inverted) != own]
 
 
 def _allowed(columns: PoseColumns, asked: str | None, words: str) -> tuple[str, ...]:
@@ -429,8 +420,8 @@ def _allowed(columns: PoseColumns, asked: str | None, words: str) -> tuple[str, 
             return columns.notations
         return (asked,) if NUMBERS[asked] == len(columns.rotation) else ()
     maker = _maker_in(words)
-    if maker is not None and MAKERS[maker].notation in columns.notations:
-        return (MAKERS[maker].notation,)
+    if maker is not None and MAKERS[maker] in columns.notations:
+        return (MAKERS[maker],)
     return columns.notations
 
 
@@ -504,10 +495,8 @@ def decision_in_words(reading: Reading) -> str:
         return text
     following = ""
     if reading.next_best is not None:
-        size = (
-            "none of them fits"
-            if reading.next_misfit_mm is None
-            else f"{significant(reading.next_misfit_mm)} mm"
-        )
+        size = "none of them fits"
+        if reading.next_misfit_mm is not None:
+            size = f"{significant(reading.next_misfit_mm)} mm"
         following = f"; next best: {reading.next_best}, {size}"
     return f"{text} ({significant(reading.misfit_mm)} mm{following})"

@@ -160,10 +160,7 @@ def _rows(message: Any, channels: int, kind: np.dtype, what: str, where: str) ->
     """Return the values of an image message without the padding of its rows, shape (h, w·channels) and type `kind`."""
     width, height, step = (int(index(number)) for number in (message.width, message.height, message.step))
     require_pixels((width, height), where)
-    data, used = (
-        np.frombuffer(message.data, np.uint8),
-        width * channels * kind.itemsize,
-    )  # of rclpy an array.array
+    data, used = np.frombuffer(message.data, np.uint8), width * channels * kind.itemsize
     if step < used or data.size < height * step:
         raise InputError(f"{where}: a {what} of {width}x{height} is cut short; record again")
     rows = data[: height * step].reshape(height, step)

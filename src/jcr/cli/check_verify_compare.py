@@ -134,13 +134,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         closing = _command_of_remedy(command, found) or closing
     if not is_rejected:
         lines += [] if undecided else _motion_lines(found)
-        run = [
-            "jcr",
-            "run",
-            str(command.capture),
-            f"out/{command.capture.stem if command.capture.is_file() else command.capture.name}",
-        ]
-        closing = shlex.join([*run, *read_arguments(command.read)])
+        path = command.capture
+        out = f"out/{path.stem if path.is_file() else path.name}"
+        closing = shlex.join(["jcr", "run", str(path), out, *read_arguments(command.read)])
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, MOST_LINES - len(lines) - 1)
     if command.output.verbose:

@@ -165,10 +165,8 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = (), options: Export
 """
 
 
-_COMMENT, _JOINT = (
-    re.compile(r"<!--.*?-->", re.DOTALL),
-    re.compile(r"<joint\b[^>]*>.*?</joint\s*>", re.DOTALL),
-)
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_JOINT = re.compile(r"<joint\b[^>]*>.*?</joint\s*>", re.DOTALL)
 _ORIGIN = re.compile(r"<origin\b[^>]*?(?:/>|>\s*</origin\s*>)", re.DOTALL)
 
 

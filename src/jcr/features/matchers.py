@@ -111,13 +111,12 @@ class Matcher:
         if found is None or self.still is None:
             return found
         inliers = np.asarray(found.inlier_matches, dtype=int).reshape(-1, 2)
-        shown, usable = (
-            ~np.any(
-                [hidden(x_px[image][own], self.still) for image, own in zip(key, of.T, strict=True)], axis=0
-            )
-            for of in (inliers, rows)
-        )
-        return found if shown.all() else self.verified(key, rows[usable], moved)
+        still = self.still
+
+        def is_hidden(rows: Int[ndarray, "m 2"]) -> Bool[ndarray, " m"]:
+            return np.any([hidden(x_px[k][own], still) for k, own in zip(key, rows.T, strict=True)], axis=0)
+
+        return found if not is_hidden(inliers).any() else self.verified(key, rows[~is_hidden(rows)], moved)
 
     def pair(self, intrinsics: Intrinsics, key: Key, geometry: pycolmap.TwoViewGeometry) -> Pair:
         """Return the inliers of image pair `key`, and the camera motions that its geometry allows; cached."""

@@ -181,12 +181,9 @@ def rotation_of_x(
     a, b = (np.stack([of[first[order]], of[second[order]]], 2) for of in (axis_a, axis_b))
     a, b = (np.concatenate([of, np.cross(of[..., 0], of[..., 1])[..., None]], 2) for of in (a, b))
     hypotheses = nearest_rotation(a @ np.swapaxes(b, 1, 2))
-    score = np.concatenate(
-        [
-            np.maximum(1 - (_gap(few[:, None], gripper, camera) / tolerance) ** 2, 0).sum(1)
-            for few in np.array_split(hypotheses, len(hypotheses) // 256 + 1)
-        ]
-    )
+    parts = np.array_split(hypotheses, len(hypotheses) // 256 + 1)
+    gaps = (_gap(few[:, None], gripper, camera) for few in parts)
+    score = np.concatenate([np.maximum(1 - (gap / tolerance) ** 2, 0).sum(1) for gap in gaps])
     x = hypotheses[int(score.argmax())]
     information, agreeing = np.zeros((3, 3)), np.zeros(len(gripper), dtype=bool)
     for _ in range(MOST_ROTATION_ROUNDS):

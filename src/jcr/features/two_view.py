@@ -87,13 +87,10 @@ def starting_motions(
     if essential is not None:
         found.append(cv2.recoverPose(essential, ray_i, ray_j, np.eye(3), distanceThresh=1e6)[1:3])
     if homography is not None:
-        count, rotations, translations, normals = cv2.decomposeHomographyMat(homography, np.eye(3))
-        found += [
-            (rotations[k], translations[k])
-            for k in range(count)
-            if np.mean(_homogeneous(ray_i) @ normals[k][:, 0] > 0) > 0.9
-            and np.linalg.norm(translations[k]) > 1e-6
-        ]
+        _, rotations, translations, normals = cv2.decomposeHomographyMat(homography, np.eye(3))
+        for r, translation, normal in zip(rotations, translations, normals, strict=True):
+            is_ahead = np.mean(_homogeneous(ray_i) @ normal[:, 0] > 0) > 0.9
+            found += [(r, translation)] if is_ahead and np.linalg.norm(translation) > 1e-6 else []
     return [(r.T, -r.T @ translation[:, 0] / np.linalg.norm(translation)) for r, translation in found]
 
 

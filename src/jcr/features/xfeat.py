@@ -55,25 +55,14 @@ def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
     Raises InputError if kornia or the weights are not installed.
     """
     kornia = extra("kornia.feature", "match", "features xfeat", ", or take features sift")
-    network, matcher = (
-        kornia.XFeatModel(),
-        kornia.LightGlue(
-            features=None,  # a name would download weights
-            input_dim=64,
-            descriptor_dim=96,
-            n_layers=6,
-            num_heads=1,
-            depth_confidence=-1,
-            width_confidence=0.95,
-        ),
-    )
+    network = kornia.XFeatModel()
     network.load_state_dict(read_weights("xfeat.pt"))
+    sizes = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
+    # A name of features would download weights.
+    matcher = kornia.LightGlue(features=None, depth_confidence=-1, width_confidence=0.95, **sizes)
     # The file contains XFeat, too; the thresholds are constants that the module computes itself.
-    of_matcher = {
-        name.removeprefix("matcher."): value
-        for name, value in read_weights("xfeat-lighterglue.pt").items()
-        if name.startswith("matcher.")
-    }
+    of_both, prefix = read_weights("xfeat-lighterglue.pt"), "matcher."
+    of_matcher = {name.removeprefix(prefix): of_both[name] for name in of_both if name.startswith(prefix)}
     thresholds = {"confidence_thresholds": matcher.state_dict()["confidence_thresholds"]}
     matcher.load_state_dict(of_matcher | thresholds)
     return network.eval(), matcher.eval()

@@ -280,11 +280,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _body(self, most: int) -> bytes | None:
         """Return the request's body; None if its length is not stated or exceeds `most` bytes."""
         length = self.headers.get("Content-Length", "")
-        return (
-            self.rfile.read(int(length))
-            if length.isdecimal() and len(length) < 10 and int(length) <= most
-            else None
-        )
+        is_stated = length.isdecimal() and len(length) < 10 and int(length) <= most
+        return self.rfile.read(int(length)) if is_stated else None
 
     def _send_json(self, content: dict[str, Any], status: int = 200) -> None:
         """Send a response with JSON content."""

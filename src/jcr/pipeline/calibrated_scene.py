@@ -137,12 +137,8 @@ def _kept_features(file: Path, digest: str, count: int) -> tuple[ImageFeatures, 
     with read_npz(file, FORMAT) as (about, arrays):
         if json.loads(about)["digest"] != digest:
             return None
-        return tuple(
-            ImageFeatures(
-                arrays[f"x_px{k}"], arrays[f"rays{k}"], arrays[f"descriptors{k}"].astype(np.float32)
-            )
-            for k in range(count)
-        )
+        parts = ([arrays[f"{name}{k}"] for name in ("x_px", "rays", "descriptors")] for k in range(count))
+        return tuple(ImageFeatures(x_px, rays, d.astype(np.float32)) for x_px, rays, d in parts)
 
 
 class OldScene:
@@ -174,10 +170,9 @@ class OldScene:
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             found = list(threads.map(lambda image: registrations(self.known, image, camera)[0], new.pixels))
         rows = [row for row, (one, _) in enumerate(found) if one is not None]
+        counts = {image: count for image, (one, count) in zip(new.images, found, strict=True) if one is None}
         lost = [
-            f"{image} shares {count_of(count, 'point')} with the calibrated scene"
-            for image, (one, count) in zip(new.images, found, strict=True)
-            if one is None
+            f"{name} shares {count_of(n, 'point')} with the calibrated scene" for name, n in counts.items()
         ]
         if not rows:
             raise RejectedError(

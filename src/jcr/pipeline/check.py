@@ -79,10 +79,8 @@ class Examination:
     @property
     def verdict(self) -> Verdict:
         """Expected verdict on a calibration of the capture; "not checked" if the reading of its poses is undecided."""
-        verdict, undecided = (
-            verdict_of(self.findings),
-            isinstance(self.capture, Capture) and self.capture.candidates,
-        )
+        verdict = verdict_of(self.findings)
+        undecided = isinstance(self.capture, Capture) and self.capture.candidates
         return "not checked" if undecided and verdict != "rejected" else verdict
 
     def __repr__(self) -> str:
@@ -260,17 +258,14 @@ def assumptions_of(case: Case) -> Assumptions:
     x, used, distance_m = case.calibration.gripper_from_camera, case.base_from_gripper[case.used], None
     if case.solution is not None:
         distance_m = case.scene_distance_m
+    shifted = [one for one in case.calibration.findings if one.shift is not None]
     return Assumptions(
         gripper_from_camera=x,
         distance_m=median_distance(used @ x) if distance_m is None else distance_m,
         noise=case.calibration.robot_noise,
         scale_std=case.reconstruction.metric_std,
         camera=None if case.solution is None or distance_m is None else PredictedCamera.of(case.solution),
-        shifts=tuple(
-            np.array([*one.shift, *(one.intrinsics_shift or ())])
-            for one in case.calibration.findings
-            if one.shift is not None
-        ),
+        shifts=tuple(np.array([*(one.shift or ()), *(one.intrinsics_shift or ())]) for one in shifted),
     )
 
 

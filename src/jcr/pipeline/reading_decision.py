@@ -185,11 +185,9 @@ def _ranked(
     for reading, poses in candidates:
         at_images = poses[image_index]
         known = np.flatnonzero(np.isfinite(at_images).all((1, 2)))
-        gap = (
-            angle_gap(pair_angles(at_images[known]), cameras[np.ix_(known, known)])
-            if len(known) > 2
-            else np.inf
-        )
+        gap = np.inf
+        if len(known) > 2:
+            gap = angle_gap(pair_angles(at_images[known]), cameras[np.ix_(known, known)])
         ranked.append((gap, reading, poses, known))
     for gap, reading, poses, known in sorted(ranked, key=lambda one: one[0]):
         # Of two rotations that differ, each has half of the error.
@@ -266,14 +264,8 @@ def _rows_of_images(
         row, at = _places(rows, images, dropped, image_index)
         poses = capture.candidates[k][1][row]
         if np.isfinite(poses).all():
-            fits.append(
-                (
-                    pose_misfit(poses, recon_from_camera[at], share=1.0),
-                    capture.candidates[k][0],
-                    dropped,
-                    poses,
-                )
-            )
+            misfit = pose_misfit(poses, recon_from_camera[at], share=1.0)
+            fits.append((misfit, capture.candidates[k][0], dropped, poses))
     fits.sort(key=lambda one: one[0].mm)
     plain = str(count_differs(capture))
     if not fits or not fits[0][0].is_of_robot:

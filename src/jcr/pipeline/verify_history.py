@@ -164,12 +164,8 @@ def telling_poses(run: RunResult, count: int) -> list[tuple[int, tuple[float, fl
     tracks, covariances = reconstruction.tracks, list[ndarray]()
     for row in rows:
         own = tracks.image == np.flatnonzero(reconstruction.image_index == row)[0]
-        pose = absolute_pose(
-            tracks.x_px[own],
-            tracks.points_in_recon[tracks.point[own]],
-            reconstruction.intrinsics,
-            gate_px=3.0,
-        )
+        points = tracks.points_in_recon[tracks.point[own]]
+        pose = absolute_pose(tracks.x_px[own], points, reconstruction.intrinsics, gate_px=3.0)
         if pose is None:
             raise InputError(
                 f"{capture.images[row]}: shows too few points of the scene; name poses of your own"
@@ -206,11 +202,5 @@ def _without_image(new: NewCapture, image: int) -> NewCapture:
     left = [k for k in range(len(new.images)) if k != image]
     parts = {name: part and tuple(part[k] for k in left) for name, part in vars(new.located).items()}
     note = f"{new.images[image]}: its pose contradicts the other images; it is left out"
-    return NewCapture(
-        **vars(new)
-        | {
-            "images": tuple(new.images[k] for k in left),
-            "located": Located(**parts),
-            "notes": (*new.notes, note),
-        }
-    )
+    update = {"images": tuple(new.images[k] for k in left), "located": Located(**parts)}
+    return new.model_copy(update=update | {"notes": (*new.notes, note)})

@@ -34,11 +34,8 @@ def require_fields(record: Any) -> None:
         for name, kinds in arrays.items():
             value = getattr(record, name)
             if not isinstance(value, kinds):
-                found = (
-                    f"{value.dtype} of shape {value.shape}"
-                    if isinstance(value, ndarray)
-                    else type(value).__name__
-                )
+                is_array = isinstance(value, ndarray)
+                found = f"{value.dtype} of shape {value.shape}" if is_array else type(value).__name__
                 expected = " or ".join(getattr(one, "dim_str", "None").strip() for one in kinds)
                 raise InputError(
                     f"{kind.__name__}: {name}: {found}, not an array of shape ({expected}); correct it"

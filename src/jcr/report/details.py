@@ -64,15 +64,10 @@ def cameras_section(cameras: CamerasFile) -> Content:
     for camera in cameras.cameras:
         arm = "" if camera.arm is None else f" of arm {camera.arm}"
         name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
-        images = [
-            (
-                image.image,
-                f"{image.points} points",
-                "" if image.reprojection_px is None else f"{significant(image.reprojection_px)} px",
-                image.reason or "used",
-            )
-            for image in camera.images
-        ]
+        images = list[tuple[str, ...]]()
+        for image in camera.images:
+            px = "" if image.reprojection_px is None else f"{significant(image.reprojection_px)} px"
+            images.append((image.image, f"{image.points} points", px, image.reason or "used"))
         about = {"rejected": camera.doubt is not None, "remarks": camera.warnings, "images": images}
         matrix = _matrix(camera.parent_from_camera, camera.uncertainty)
         cards.append({"title": f"{camera.name}: {name}", "name": name} | about | matrix)

@@ -40,26 +40,18 @@ def scene_section(result: RunResult) -> Content:
     layers, labels = point_layers(result.scene, result.cloud, POINTS)
     tracked = base_from_recon(reconstruction.tracks.points_in_recon)
     row_of, images = {int(row): k for k, row in enumerate(result.image_index)}, result.calibration.images
-    views = [
-        scene_view(
-            name,
-            image_numbers(image) if image.used else f"rejected: {image.reason}",
-            image.used,
-            result.capture.base_from_gripper[i],
-            base_from_camera[row_of[i]] if i in row_of else None,
-        )
-        for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
-    ]
+    views = list[dict[str, Any]]()
+    for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True)):
+        caption = image_numbers(image) if image.used else f"rejected: {image.reason}"
+        camera = base_from_camera[row_of[i]] if i in row_of else None
+        views.append(scene_view(name, caption, image.used, result.capture.base_from_gripper[i], camera))
     others = _others(result, base_from_camera)
     intrinsics = result.intrinsics or reconstruction.intrinsics
     drawn = [*layers, track_layer("tracked features", tracked)]
-    data = scene_data(drawn, views, intrinsics, base_from_camera[:, :3, 3]) | {
-        "others": others,
-        "bases": [
-            {"name": f"base of {arm.name}", "base": _rows(np.array(arm.base_from_other_base))}
-            for arm in (() if result.cameras is None else result.cameras.arms)
-        ],
-    }
+    arms = {} if result.cameras is None else {a.name: a.base_from_other_base for a in result.cameras.arms}
+    bases = [{"name": f"base of {name}", "base": _rows(np.array(matrix))} for name, matrix in arms.items()]
+    data = scene_data(drawn, views, intrinsics, base_from_camera[:, :3, 3])
+    data |= {"others": others, "bases": bases}
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
     checks.append(("tracks", "tracked features (red)", not layers))

@@ -25,19 +25,12 @@ def failure_section(calibration: AnyCalibration) -> Content:
     failed, *others = calibration.findings
     remedies = [sentence(one) for one in others if one.kind is FindingKind.BOARD_IN_VIEW]
     remedies += filter(None, [failed.remedy])
-    return {
-        "fault": failed.text,
-        "remedies": [words[0].upper() + words[1:] for words in remedies],
-        "attempts": [
-            (
-                attempt.backend,
-                f" with {attempt.features}" if attempt.features else "",
-                attempt.reconstruct_s + attempt.calibrate_s,
-                attempt.why_not or "",
-            )
-            for attempt in calibration.attempts
-        ],
-    }
+    attempts = list[tuple[str, str, float, str]]()
+    for one in calibration.attempts:
+        features = f" with {one.features}" if one.features else ""
+        attempts.append((one.backend, features, one.reconstruct_s + one.calibrate_s, one.why_not or ""))
+    remedies = [words[0].upper() + words[1:] for words in remedies]
+    return {"fault": failed.text, "remedies": remedies, "attempts": attempts}
 
 
 def _verdict(calibration: AnyCalibration) -> dict[str, str]:
@@ -55,10 +48,8 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     corner = corner_in_words(calibration)
     evidence = (f"{corner[0].upper()}{corner[1:]}. " if corner else "") + _leave_one_out(calibration)
     if isinstance(calibration, PublishedCalibration):
-        reason, evidence = (
-            calibration.findings[0].text,
-            "Small residuals do not prove accuracy, because X is on both sides of AX = XB.",
-        )
+        reason = calibration.findings[0].text
+        evidence = "Small residuals do not prove accuracy, because X is on both sides of AX = XB."
     if isinstance(calibration, Calibration):
         worst = worst_direction(calibration)
         evidence += f" Largest uncertainty of the translation: {worst} (1 σ)."
@@ -89,20 +80,17 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     uncertainty = calibration.uncertainty
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
         far, turned = significant(1e-3 * seen.distance_mm), significant(seen.rotation_95_deg)
-        bound, is_met = f"{significant(seen.within_95_mm)} mm", calibration.short is None
-        yield (
-            "Point at the image centre",
-            bound,
-            f"at {far} m, {turned}°; 95 %",
-            "first" if is_met else "first missed",
+        bound, kind = (
+            f"{significant(seen.within_95_mm)} mm",
+            "first" + " missed" * (calibration.short is not None),
         )
-        degrees = significant(seen.corners.rotation_95_deg)
-        yield (
-            "Point in the image corner",
+        yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", kind
+        bound, degrees = (
             f"{significant(seen.corners.within_95_mm)} mm",
-            f"{degrees}°; 95 %",
-            "first missed" if corner_is_missed(calibration) else "first",
+            significant(seen.corners.rotation_95_deg),
         )
+        kind = "first missed" if corner_is_missed(calibration) else "first"
+        yield "Point in the image corner", bound, f"{degrees}°; 95 %", kind
     elif uncertainty is not None:
         degrees = significant(max(uncertainty.rotation_std_deg))
         yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", "first"
@@ -115,10 +103,5 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     if isinstance(calibration, PublishedCalibration):
         yield "Scale", f"{calibration.scale:.4g}", "m per unit of the reconstruction", "first"
     elif uncertainty is not None and calibration.scale is not None:
-        percent = significant(uncertainty.scale_std_percent)
-        yield (
-            "Scale",
-            f"±{percent}\u00a0%",
-            f"{significant(calibration.scale, 4)} m per unit of the reconstruction",
-            "first",
-        )
+        std = f"±{significant(uncertainty.scale_std_percent)}\u00a0%"
+        yield "Scale", std, f"{significant(calibration.scale, 4)} m per unit of the reconstruction", "first"

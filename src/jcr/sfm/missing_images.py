@@ -144,10 +144,8 @@ def model_near_cameras(
         if not model.num_reg_images():
             break
         adjust_robustly(model, known, ROUGHLY, scale_px)
-        camera, cameras = (
-            model.camera(1),
-            dict(zip(rows_of(model), poses_of(model, rows_of(model)), strict=True)),
-        )
+        camera, rows = model.camera(1), rows_of(model)
+        cameras = dict(zip(rows, poses_of(model, rows), strict=True))
     return model
 
 

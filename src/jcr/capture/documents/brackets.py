@@ -165,23 +165,17 @@ def read_statements(file: Path, lines: Sequence[str], across_lines: bool = True)
                 stack, first = [_Bracket()], line
     if len(stack) > 1:
         return read_statements(file, lines, False) if across_lines else []
-    return [
-        one
-        for one in statements
-        if len(one.entries) > 2 or any(is_container(value) for _, value in one.entries)
+    has_values = [
+        len(one.entries) > 2 or any(is_container(value) for _, value in one.entries) for one in statements
     ]
+    return [one for one, kept in zip(statements, has_values, strict=True) if kept]
 
 
 def _close(outer: _Bracket, inner: _Bracket) -> None:
     """Add the content of a closed bracket to the outer one; an index such as [3] after a name belongs to the name."""
     value = inner.value()
-    if (
-        inner.glued
-        and inner.opening == "["
-        and 0 < len(outer.word) < LONGEST_NAME
-        and inner.entries[1:] == []
-        and inner.last.isdigit()
-    ):
+    is_index = inner.glued and inner.opening == "[" and inner.last.isdigit() and not inner.entries[1:]
+    if is_index and 0 < len(outer.word) < LONGEST_NAME:
         outer.word += f"[{inner.last}]"
     elif value:
         outer.add(value)

@@ -109,11 +109,8 @@ def _families(value: Any) -> Iterator[Family]:
             yield commonprefix(keys) + "*", [value[key] for key in keys], keys
     for lists in parallel.values():
         if len(lists) > 1:
-            yield (
-                "",
-                [dict(zip(lists, cells, strict=True)) for cells in zip(*lists.values(), strict=True)],
-                None,
-            )
+            rows = [dict(zip(lists, cells, strict=True)) for cells in zip(*lists.values(), strict=True)]
+            yield "", rows, None
 
 
 def _are_alike(children: Sequence[Any]) -> bool:

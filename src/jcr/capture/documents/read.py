@@ -42,16 +42,10 @@ def read_record_tables(files: Sequence[Path]) -> tuple[Table, ...]:
             groups[group].setdefault(file, row)
             words.setdefault(group, around)
     folder = Path(os.path.commonpath([file.parent for file in files])) if files else Path()
-    tables = [
-        table_of(
-            folder,
-            list(rows.values()),
-            place=str(group[0]),
-            keys=[file.stem for file in rows],
-            words=words[group],
-        )
-        for group, rows in groups.items()
-    ]
+    tables = list[Table | None]()
+    for group, rows in groups.items():
+        keys, place = [file.stem for file in rows], str(group[0])
+        tables.append(table_of(folder, list(rows.values()), place=place, keys=keys, words=words[group]))
     return tuple(table for table in tables if table)[:MAX_TABLES]
 
 

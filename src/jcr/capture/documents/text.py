@@ -55,13 +55,8 @@ def _bracket_tables(file: Path, lines: list[str], comments: dict[int, str]) -> l
     if not any(mark in line for line in lines for mark in "[({=:"):
         return []
     texts = {k: line.strip() for k, line in enumerate(lines) if line.strip()} | comments
-    rows, lists, inner, statements = (
-        list[Statement](),
-        dict[str, Any](),
-        list[Table](),
-        read_statements(file, lines),
-    )
-    for one in statements:
+    rows, lists, inner = list[Statement](), dict[str, Any](), list[Table]()
+    for one in read_statements(file, lines):
         for k in range(*one.lines):
             texts.pop(k, None)
             lines[k] = ""
@@ -144,11 +139,8 @@ def _cells(line: str, separator: str | None, decimal: bool) -> list[Cell]:
         texts = line.split(separator)
     cells = list[Cell]()
     for text in texts:
-        cell = cell_of(
-            (text.replace(",", ".") if decimal and _DECIMAL_COMMA.fullmatch(text.strip()) else text).strip(
-                "\"'"
-            )
-        )
+        text = text.replace(",", ".") if decimal and _DECIMAL_COMMA.fullmatch(text.strip()) else text
+        cell = cell_of(text.strip("\"'"))
         if isinstance(cell, str) and (" " in cell or "," in cell):
             marks = r",?\s+" if decimal else r"[,\s]+"
             parts = [cell_of(part.replace(",", ".")) for part in re.split(marks, cell) if part]
@@ -177,14 +169,13 @@ def _line_tables(file: Path, lines: Sequence[str], comments: dict[int, str]) -> 
         header = _header(texts, rows[0][0], width, separator) if rows else None
         if header and separator and not tables:  # rows with missing or wrong cells stay rows
             first = rows[0][0]
-            full = [
-                (k, cells) for k, cells in parsed.items() if k >= first and cells.count(None) < len(cells)
+            below = [
+                (k, cells)
+                for k, cells in parsed.items()
+                if k >= first and any(cell is not None for cell in cells)
             ]
-            rows = [
-                (k, cells + [None] * (width - len(cells)))
-                for k, cells in full
-                if 1 < len(cells) <= width and cells != header
-            ]
+            fitting = [(k, cells) for k, cells in below if 1 < len(cells) <= width and cells != header]
+            rows = [(k, cells + [None] * (width - len(cells))) for k, cells in fitting]
             widths = {other: [row for row in widths[other] if row[0] < first] for other in widths}
         if not rows:
             continue
@@ -249,14 +240,11 @@ def _matrices(file: Path, rows: Sequence[Row], texts: dict[int, str]) -> list[Ta
         expected = {k + gap % height for gap in gaps for k in range(0, len(rows), height)} - {0}
         if len(rows) % height or gaps != expected:
             continue
-        table = table_of(
-            file,
-            [
+        keys, made = _keys(texts, [block[0][0] for block in blocks]), list[dict[str | int, Cell]]()
+        for block in blocks:
+            made.append(
                 {f"{i}.{j}": cell for i, (_, cells) in enumerate(block) for j, cell in enumerate(cells)}
-                for block in blocks
-            ],
-            keys=_keys(texts, [block[0][0] for block in blocks]),
-            words=tidy_words(texts.values()),
-        )
+            )
+        table = table_of(file, made, keys=keys, words=tidy_words(texts.values()))
         tables += [table] if table else []
     return tables

@@ -217,15 +217,13 @@ def _read_table(path: Path, columns: list[str], episode: int, rows: Sequence[int
     try:
         for file in path.rglob("*.parquet") if path.is_dir() else [path]:
             about = parquet.read_metadata(file)
-            every = (
-                about.row_group(k).column(j) for k, j in np.ndindex(about.num_row_groups, about.num_columns)
+            starts, places = (
+                tuple(f"{name}." for name in columns),
+                np.ndindex(about.num_row_groups, about.num_columns),
             )
-            read = [
-                one
-                for one in every
-                if any(f"{one.path_in_schema}.".startswith(f"{name}.") for name in columns)
-            ]
-            size = sum(max(one.total_uncompressed_size, 8 * one.num_values) for one in read)
+            chunks = (about.row_group(k).column(j) for k, j in places)
+            read = (chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(starts))
+            size = sum(max(chunk.total_uncompressed_size, 8 * chunk.num_values) for chunk in read)
             if size > max(USUAL_BYTES, PACKED * file.stat().st_size):
                 raise ValueError(f"it unpacks to {size / 1e9:.1f} GB")
         images = [f"{name}.bytes" for name in columns]  # equal ones are kept once
