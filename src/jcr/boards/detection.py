@@ -129,7 +129,7 @@ def _charuco(
     """Return the detector of the inner corners of a ChArUco board; its pixels have whole numbers at pixel centres.
 
     `count` are the board's squares (columns, rows); `square` and `marker` are side lengths (m). `legacy` is the layout
-    of OpenCV before 4.6. Raises ValueError for a marker that is not smaller than the square.
+    of OpenCV before 4.6.
     """
     if marker >= square:
         raise ValueError(f"a marker of {marker} m does not fit into a square of {square} m")
@@ -165,10 +165,7 @@ def _charuco_shift_px() -> float:
 
 
 def _chessboard(count: tuple[int, int], square: float) -> Detector:
-    """Return the detector of a chessboard with `count` inner corners (columns, rows) and squares of side `square`, m.
-
-    Raises ValueError if columns plus rows are even, because such a board looks the same after a rotation by 180°.
-    """
+    """Return the detector of a chessboard with `count` inner corners (columns, rows) and squares of side `square`, m."""
     across, down = count
     if (across + down) % 2 == 0:
         raise ValueError(

@@ -106,10 +106,7 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
 
 
 def _fresh_frames(recording: Recording) -> tuple[Bool[ndarray, " n"], tuple[str, ...]]:
-    """Return the mask of the frames with pose samples around them within `options.max_gap_ms`, and a note of the others.
-
-    Raises InputError without such a frame.
-    """
+    """Return the mask of the frames with pose samples around them within `max_gap_ms`, and a note of the others."""
     gap_ns, most_ms = recording.gap_ns, recording.options.max_gap_ms
     fresh, limit = gap_ns <= 1e6 * most_ms, f"{most_ms:.0f} ms"
     if not fresh.any():
@@ -124,10 +121,7 @@ def _fresh_frames(recording: Recording) -> tuple[Bool[ndarray, " n"], tuple[str,
 
 
 def _written(recording: Recording, rows: Rows, into: Path, report: Progress) -> list[str]:
-    """Write the images of the frames `rows` to the folder `into`; return their paths relative to it.
-
-    Raises InputError for an image that cannot be read.
-    """
+    """Write the images of the frames `rows` to the folder `into`; return their paths relative to it."""
     images = list[str]()
     for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         images.append(f"images/{recording.names[row]}{ending}")

@@ -178,8 +178,7 @@ class RecordedArm:
 def read_arm(options: ReadOptions) -> RecordedArm:
     """Read the arm of `options.urdf` between its links `options.base_frame` (None: root) and `options.gripper_frame`.
 
-    The unit of recorded angles is that of `options.pose_units`; "auto": rad. Raises InputError if a link is missing, if
-    no moving joint lies between the links, if one does not rotate, or if the URDF is invalid.
+    The unit of recorded angles is that of `options.pose_units`; "auto": rad.
     """
     file = options.urdf
     assert file is not None

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.features.pair_verification import Gate, Key
+from jcr.features.pair_verification import Gate, Key, Motions
 from jcr.geometry import apply, inverse, motion_length, nearest_to_lines, rotation_angle, skew, transform
 from jcr.records import Intrinsics
 
@@ -36,27 +36,23 @@ POINTS_OF_PAIR = 60
 """Approximate number of matches of a pair that are used with the pairs' poses."""
 
 
-def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
+def near_pairs(motion: Motions, neighbours: int) -> list[Key]:
     """Return the pairs of each image with one image of each of its `neighbours` nearest viewpoints.
 
-    The distance is the length of the gripper's motion (geometry.motion_length). `motion[i, j]` is the gripper's
-    i_from_j.
+    The distance is the length of the gripper's motion (geometry.motion_length).
     """
     return _best(-np.asarray(motion_length(motion)), neighbours, viewpoints(motion))
 
 
-def repeats(motion: Float[ndarray, "n n 4 4"]) -> Bool[ndarray, "n n"]:
+def repeats(motion: Motions) -> Bool[ndarray, "n n"]:
     """Test for each pair of images whether the gripper's motion is below SAME_VIEWPOINT; `motion[i, j]` is i_from_j."""
     metres, radians = SAME_VIEWPOINT
     way = np.linalg.norm(motion[..., :3, 3], axis=-1)
     return (way < metres) & (np.asarray(rotation_angle(motion[..., :3, :3])) < radians)
 
 
-def viewpoints(motion: Float[ndarray, "n n 4 4"]) -> Int[ndarray, " n"]:
-    """Return for each image the row of the first image of the same viewpoint (SAME_VIEWPOINT).
-
-    `motion[i, j]` is the gripper's i_from_j.
-    """
+def viewpoints(motion: Motions) -> Int[ndarray, " n"]:
+    """Return for each image the row of the first image of the same viewpoint (SAME_VIEWPOINT)."""
     same, first = repeats(motion), np.arange(len(motion))
     for row in range(len(motion)):
         if first[row] == row:
@@ -68,13 +64,13 @@ def pairs_of_common_scene(
     x_px: Sequence[Float[ndarray, "_ 2"]],
     intrinsics: Intrinsics,
     found: Gate,
-    motion: Float[ndarray, "n n 4 4"],
+    motion: Motions,
 ) -> list[Key]:
     """Return the pairs of every image with the viewpoints that share most of its scene; empty if this is not known yet.
 
     Each image has up to PARTNERS viewpoints. The shared scene is measured by the points of the pairs in `found` that
-    the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `motion[i, j]` is the
-    gripper's i_from_j. `x_px` are the keypoints of every image (px), `intrinsics` those of the images.
+    the gripper confirms. It is unknown without a hand-eye rotation and with fewer than 20 points. `x_px` are the
+    keypoints of every image (px), `intrinsics` those of the images.
     """
     if (gripper_from_camera := hand_eye_of_pairs(found, motion)) is None:
         return []
@@ -108,12 +104,12 @@ def pairs_of_common_scene(
     return _best(score, PARTNERS, viewpoints(motion))
 
 
-def hand_eye_of_pairs(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> Float[ndarray, "4 4"] | None:
+def hand_eye_of_pairs(found: Gate, motion: Motions) -> Float[ndarray, "4 4"] | None:
     """Return gripper_from_camera = (R_X, t_X) from the confirmed image pairs; None while R_X is unknown.
 
-    The gripper's motion of a pair is (R_A, t_A), `motion[i, j]` (i_from_j, m). The camera's translation is known up to
-    its length; R_X rotates its direction to d. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X and needs
-    neither the scale nor a map. A prior of standard deviation PRIOR_STD_M draws t_X to 0.
+    The gripper's motion of a pair is (R_A, t_A). The camera's translation is known up to its length; R_X rotates its
+    direction to d. The equation d × ((R_A − I) t_X + t_A) = 0 is linear in t_X and needs neither the scale nor a map. A
+    prior of standard deviation PRIOR_STD_M draws t_X to 0.
     """
     if found.of_x is None or not found.confirmed:
         return None

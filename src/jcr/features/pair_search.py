@@ -30,6 +30,7 @@ from jcr.features.pair_verification import (
     SYSTEMATIC_OF_GUESS,
     Gate,
     Key,
+    Motions,
     Pair,
     RotationOfX,
     agreeing_motions,
@@ -79,7 +80,7 @@ class _Search:
     """State of the search for matching pairs: geometries found, image rotations tried, intrinsics, gripper motions."""
 
     matcher: Matcher
-    motion: Float[ndarray, "n n 4 4"]
+    motion: Motions
     """Gripper's motions i_from_j."""
     intrinsics: Intrinsics
     """Intrinsics at the size of matching, given or estimated."""
@@ -319,11 +320,10 @@ def _pairs_to_map(
     return {key: pair for key, pair in search.pairs.items() if key in believed}, notes, warnings
 
 
-def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
+def _contradicted_by_all(found: Gate, motion: Motions) -> set[int]:
     """Return the rows of images with a wrong gripper pose: their pairs contradict it and agree on one correction.
 
-    An image needs three such pairs or more, whose corrections differ by less than 3° in the median. `motion[i, j]` is
-    the gripper's i_from_j.
+    An image needs three such pairs or more, whose corrections differ by less than 3° in the median.
     """
     assert found.of_x is not None
     x = found.of_x.rotation

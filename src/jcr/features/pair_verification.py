@@ -40,6 +40,8 @@ MOST_ROTATION_ROUNDS = 20
 
 Key = tuple[int, int]
 """Rows of two images, the smaller first."""
+Motions = Float[ndarray, "n n 4 4"]
+"""Gripper's motion of each pair of images: the element [i, j] is i_from_j."""
 
 
 @dataclass(frozen=True)
@@ -99,15 +101,15 @@ def agreeing_motions(pair: Pair, angle: float, systematic: float) -> list[tuple[
 
 def classify_pairs(
     pairs: Sequence[Pair],
-    motion: Float[ndarray, "n n 4 4"],
+    motion: Motions,
     systematic: float = SYSTEMATIC,
     known: RotationOfX | None = None,
 ) -> Gate:
     """Classify image pairs by whether their camera rotation agrees with the gripper's motion.
 
-    `motion[i, j]` is the gripper's i_from_j. Pairs pass first by rotation angle alone, which may differ by the share
-    `systematic`. The hand-eye rotation R_X is estimated from these. Every possible motion of every pair is then judged
-    by its whole rotation. `known` is an R_X from a larger set of pairs, used where these pairs do not determine it.
+    Pairs pass first by rotation angle alone, which may differ by the share `systematic`. The hand-eye rotation R_X is
+    estimated from these. Every possible motion of every pair is then judged by its whole rotation. `known` is an R_X
+    from a larger set of pairs, used where these pairs do not determine it.
     """
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     undecided, passing, judged = [], [], []
@@ -140,7 +142,7 @@ def classify_pairs(
 
 
 def _common_rotation(
-    passing: Sequence[tuple[Key, CameraMotion, float]], motion: Float[ndarray, "n n 4 4"]
+    passing: Sequence[tuple[Key, CameraMotion, float]], motion: Motions
 ) -> RotationOfX | None:
     """Return the hand-eye rotation R_X; None if fewer than LEAST_PAIRS image pairs agree on it or it is uncertain.
 

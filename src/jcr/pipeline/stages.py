@@ -338,8 +338,7 @@ def _densify(result: RunResult, progress: Progress) -> RunResult:
 def _map(result: RunResult, progress: Progress) -> RunResult:
     """Return the result with cloud, map and measured objects, and write cloud and map.
 
-    Images that were added later are included. Raises InputError if no point is confident enough, or the options leave
-    no points for a map.
+    Images that were added later are included.
     """
     # These imports take seconds, which a calibration without a map does not need.
     from jcr.depth.added_images import extend

@@ -135,8 +135,7 @@ def _images(
 
     `rows` has the capture's row of each image of the file, and `size` is width and height of the pointmaps. Intrinsics
     in the file are those of undistorted images, as in predictions made by this package. Without them, the pixels are
-    taken to be those of the capture's images, and a known distortion cannot be accounted for. Raises InputError where
-    the sizes do not fit.
+    taken to be those of the capture's images, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
     intrinsics, warnings = usable_intrinsics(capture.intrinsics)

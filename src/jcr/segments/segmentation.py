@@ -76,10 +76,7 @@ def _read_label(capture: Capture, image: str, name: str) -> UInt16[ndarray, "h w
 
 
 def _read_names(path: Path) -> dict[int, str]:
-    """Return the name of each label in the file `path`, names.json; an empty dict if there is no such file.
-
-    Raises InputError if the file has another format.
-    """
+    """Return the name of each label in the file `path`, names.json; an empty dict if there is no such file."""
     if not path.is_file():
         return {}
     try:

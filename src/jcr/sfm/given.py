@@ -63,8 +63,7 @@ def _images_of(names: Mapping[str, int], images: Sequence[str], where: str) -> d
     """Return the id of the model's image for each image of the capture that the model has, by index in the capture.
 
     `names` are the ids of the model's images by name. The longest name that is the end of an image's path is its own;
-    otherwise an image and a name with the same file name belong together. Raises InputError if a name fits several
-    images, or an image several names.
+    otherwise an image and a name with the same file name belong together.
     """
     by_path = {Path(name).parts: name for name in names}
     if len(by_path) < len(names):

@@ -134,8 +134,7 @@ class Viewer:
     ) -> None:
         """Fill the server with the scene and controls of a run; `urdf` replaces the robot of the capture.
 
-        There is no robot if `urdf` is None and the capture has no URDF or no joint values. Raises InputError as
-        `read_robot` does.
+        There is no robot if `urdf` is None and the capture has no URDF or no joint values.
         """
         self.server, self._lock = server, threading.Lock()
         self.calibration, self.capture, self.reconstruction = run.of_wrist_camera()

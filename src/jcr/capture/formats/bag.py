@@ -44,11 +44,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture.
-
-    Raises InputError if the options name a topic or frame that does not exist (the message lists the existing ones). It
-    also raises InputError if every image is more than `options.max_gap_ms` away from pose samples.
-    """
+    """Extract the sharpest frames at rest of a bag into the folder `into`, and return them as a capture."""
     with _opened(path) as reader:
         bag = _Bag(reader, path, options, report)
         stamps, joints, base = bag.stamp_ns, None, options.base_frame
@@ -229,10 +225,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
-    """Return the topic of --camera-topic, or without that option the only topic with colour images.
-
-    Raises InputError that lists the topics if that one does not exist, or if several have colour images.
-    """
+    """Return the topic of --camera-topic, or without that option the only topic with colour images."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
     videos = {c.topic: VIDEOS[c.msgtype] for c in reader.connections if c.msgtype in VIDEOS}
     asked = options.camera_topic or (next(iter(videos), "") if not topics else "")
@@ -252,8 +245,7 @@ def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
     """Return the reader's connections (topics) with the robot's poses: tf, a PoseStamped topic, or joint states.
 
-    Joint states are read if `options.urdf` is given; a topic of poses if the options name it, or without tf. Raises
-    InputError if there are none, or if several topics have joint states and the options choose none.
+    Joint states are read if `options.urdf` is given; a topic of poses if the options name it, or without tf.
     """
     if options.urdf is None:
         found = [c for c in reader.connections if c.msgtype in TF]

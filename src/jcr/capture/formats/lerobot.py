@@ -93,10 +93,7 @@ def recognises(path: Path) -> bool:
 
 
 def episodes_of(path: Path, options: ReadOptions) -> tuple[list[int], int]:
-    """Return the episodes that the options name, at most MOST_EPISODES for "all", and the number that were meant.
-
-    Raises InputError for "all" unless the path is a data set that states its number of episodes.
-    """
+    """Return the episodes that the options name, at most MOST_EPISODES for "all", and the number that were meant."""
     named = [one for one in options.episode if one != "all"]
     if len(named) == len(options.episode):
         return named, len(named)
@@ -110,11 +107,7 @@ def episodes_of(path: Path, options: ReadOptions) -> tuple[list[int], int]:
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """Extract the sharpest frames at rest from the episode that the options name; return them as a capture.
-
-    Raises InputError that lists the existing cameras, states or episodes if the options name others, or more than one
-    episode.
-    """
+    """Extract the sharpest frames at rest from the episode that the options name; return them as a capture."""
     info: Info = validated_content(Info, read_json(path / INFO), str(path / INFO))
     features = info.features
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
@@ -207,8 +200,7 @@ def _seconds(values: Sequence[Any], where: str) -> Float[ndarray, " n"]:
 def _read_table(path: Path, columns: list[str], episode: int, rows: Sequence[int] | None = None) -> Any:
     """Read columns of one episode from Parquet, a file or a folder of files, as a table of pyarrow.
 
-    `rows` are the frame indices to read; None: all frames of the episode. Raises InputError for damaged files, and for
-    those that unpack to far more than their size.
+    `rows` are the frame indices to read; None: all frames of the episode.
     """
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     filters: list[tuple[str, str, Any]] = [("episode_index", "==", episode)]
@@ -238,7 +230,7 @@ def _read_table(path: Path, columns: list[str], episode: int, rows: Sequence[int
 def _file(path: Path, template: str, fields: dict[str, Any]) -> Path:
     """Return the file of a path template such as data/chunk-{episode_chunk:03d}/file.parquet, filled with `fields`.
 
-    The template is relative to the data set `path`. Raises InputError if the result leads out of it.
+    The template is relative to the data set `path`.
     """
     name = re.sub(
         r"\{(\w+)(?::0?(\d?\d)d)?\}",  # the value of a field is padded with zeros to the width in the template
@@ -272,10 +264,7 @@ def _images(episode: Episode, rows: Int[ndarray, " k"], key: str, fps: float) ->
 def _video_frames(
     file: Path, time_s: Float[ndarray, " n"], tolerance_s: float
 ) -> Iterator[UInt8[ndarray, "h w 3"]]:
-    """Yield the RGB frames at n ascending times (s) since the start of a video.
-
-    Raises InputError if the file is no video, or if a time has no frame within `tolerance_s`.
-    """
+    """Yield the RGB frames at n ascending times (s) since the start of a video."""
     av = extra("av", "lerobot", "a video")
     due = time_s.tolist()
     try:

@@ -139,8 +139,7 @@ def _in_batches(
 ) -> None:
     """Call `work` on batches of the integers 0 to `count` − 1; the batch size is the last number in `sizes`.
 
-    When CUDA runs out of memory, half of this size is appended to `sizes`, and the batch is repeated. Raises InputError
-    if a batch of one does not fit.
+    When CUDA runs out of memory, half of this size is appended to `sizes`, and the batch is repeated.
     """
     done = 0
     while done < count:
