@@ -66,5 +66,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names and "__version__"."""
     return [*__all__, "__version__"]

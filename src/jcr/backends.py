@@ -48,7 +48,6 @@ def _lazy(function: str, *arguments: str) -> Callable[..., Reconstruction]:
     """
 
     def reconstruct(capture: Capture, options: "ReconstructOptions", progress: Progress) -> Reconstruction:
-        """Run the back end with its options."""
         if "device" in arguments:
             extra("torch", "networks", f"backend {options.backend}")
         chosen = {"weights": network_weights, "device": device_of}

@@ -118,11 +118,9 @@ class RunResult:
         return getattr(self.calibration, name)
 
     def __dir__(self) -> list[str]:
-        """Return the names of the attributes, with those of the calibration."""
         return sorted({*super().__dir__(), *dir(Calibration), *(field.name for field in fields(Calibration))})
 
     def __repr__(self) -> str:
-        """Return the verdict, the number of used images, and the error that 95 % of the points stay below."""
         try:
             found = self.calibration
         except InputError as error:

@@ -46,7 +46,6 @@ class Discovery:
     """Paths relative to the folder, in natural order."""
     tables: tuple[tuple[Table, Pairing], ...]
     documents: tuple[Path, ...]
-    """Files that may hold intrinsics or poses."""
     refused: tuple[tuple[Path, InputError], ...]
     """Files that cannot be read, or whose poses differ in number from the images, with the error of each."""
     notes: tuple[str, ...]
@@ -195,7 +194,6 @@ def _tables_of(
     refused, others = list[tuple[Path, InputError]](), list[tuple[Path, InputError]]()
 
     def add(tables: Sequence[Table]) -> None:
-        """Append the tables that may belong to the images."""
         for table in tables:
             paired = pair(table, images)
             off = abs(len(table.rows) - len(images))

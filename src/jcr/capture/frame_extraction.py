@@ -45,7 +45,6 @@ class Recording:
     joints: Float[ndarray, "n j"] | None = None
     """Joint angles (rad) of the arm in `options.urdf`, one row per frame; None if they are unknown."""
     frame_names: FrameNames = FrameNames()
-    """Names of base and camera frame, as far as the recording states them."""
 
 
 def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:

@@ -60,7 +60,6 @@ class Pairing:
     stamp_ns: Int[ndarray, " r"] | None = None
     """Time stamp of each row, where images have time stamps, too."""
     image_ns: Int[ndarray, " n"] | None = None
-    """Time stamp of each image."""
 
     @property
     def is_paired(self) -> bool:

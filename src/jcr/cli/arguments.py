@@ -38,7 +38,6 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
     """
 
     def refuse(event: _errors.ParseErrorEvent) -> None:
-        """Raise InputError that states what is wrong with the arguments."""
         known, why = {*_flags(record), "--help", "-h"}, "the arguments cannot be understood"
         words = (word.partition("=")[0] for word in arguments if word.startswith("-"))
         options = (word.replace("_", "-") for word in words if word.lstrip("-")[:1].isalpha())
@@ -80,7 +79,6 @@ def _plain_descriptions() -> Iterator[None]:
     made = _fields.FieldDefinition.make
 
     def make(*arguments: Any, **named: Any) -> _fields.FieldDefinition:
-        """Return tyro's definition of an option with a description of one line."""
         field = made(*arguments, **named)
         given = field.helptext
         field.helptext = lambda: " ".join(((given() if callable(given) else given) or "").split()) or None

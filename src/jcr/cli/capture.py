@@ -86,7 +86,6 @@ class CaptureCommand:
             options = replace(options, images=options.images or VERIFIED)
 
         def tell(answer: Answer, lines: list[str]) -> None:
-            """Print the lines of an answer, and keep the answer for --json."""
             answers.append(answer)
             _print("\n".join(lines))
 

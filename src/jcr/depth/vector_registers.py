@@ -68,7 +68,6 @@ class Lanes:
     __ge__ = partialmethod(_compare, ">=")
 
     def __abs__(self) -> "Lanes":
-        """Return the absolute value of each lane."""
         return (self < 0.0).choose(self * -1.0, self)
 
     def choose(self, yes: Any, no: Any) -> "Lanes":

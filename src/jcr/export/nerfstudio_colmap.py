@@ -31,16 +31,13 @@ class PosedImages:
     """Registered images of a capture, with the camera poses and tracked points in the base frame."""
 
     folder: Path
-    """Folder of the capture."""
     images: tuple[str, ...]
-    """Paths of the m images, relative to `folder`."""
     base_from_camera: Float[ndarray, "m 4 4"]
     base_from_gripper: Float[ndarray, "m 4 4"]
     """Gripper poses as reported by the robot, one per image."""
     intrinsics: Intrinsics
     tracks: Tracks
     points_in_base: Float[ndarray, "p 3"]
-    """Positions (m) of the p points of `tracks`."""
     base_from_recon: Similarity
 
 
@@ -196,7 +193,6 @@ def _file_names(images: Sequence[str], suffix: str | None) -> list[str]:
     """
 
     def ending(name: str) -> str:
-        """Return the name with the suffix."""
         return name if suffix is None else f"{Path(name).stem}{suffix}"
 
     own = [ending(Path(image).name) for image in images]

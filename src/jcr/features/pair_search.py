@@ -72,7 +72,6 @@ class MatchedPairs:
     """Rough estimate of gripper_from_camera by the confirmed pairs; None if they do not determine it."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """Notes and warnings for records.Reconstruction."""
 
 
 @dataclass(kw_only=True)
@@ -81,7 +80,6 @@ class _Search:
 
     matcher: Matcher
     motion: Motions
-    """Gripper's motions i_from_j."""
     intrinsics: Intrinsics
     """Intrinsics at the size of matching, given or estimated."""
     repeats: Bool[ndarray, "n n"]

@@ -49,13 +49,11 @@ class Pair:
     """Matched keypoints of two images that fit one two-view geometry, and the camera motions that may explain them."""
 
     key: Key
-    """Rows of the two images."""
     rows: Int[ndarray, "m 2"]
     """Rows of the matched keypoints among those of the first and of the second image."""
     motions: tuple[CameraMotion, ...]
     """Possible relative motions of the two cameras, best first; empty where none could be found."""
     geometry: pycolmap.TwoViewGeometry
-    """Two-view geometry whose inliers are `rows`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +78,6 @@ class Gate:
     undecided: tuple[Pair, ...]
     """Pairs whose rotation is too uncertain to be judged."""
     contradicted: tuple[Pair, ...]
-    """Pairs that disagree with the gripper's motion."""
     of_x: RotationOfX | None
     """Hand-eye rotation R_X from the confirmed pairs; None while too few pairs agree."""
 

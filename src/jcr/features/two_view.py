@@ -29,7 +29,6 @@ class CameraMotion:
     """Possible relative motion of cameras i and j of an image pair: rotation, direction, covariance and noise."""
 
     rotation: Float[ndarray, "3 3"]
-    """Rotation i_from_j."""
     direction: Float[ndarray, "3"]
     """Unit vector from camera i to camera j, in the frame of camera i."""
     covariance: Float[ndarray, "5 5"]

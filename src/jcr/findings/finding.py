@@ -97,7 +97,6 @@ class Finding:
         return made
 
     def __repr__(self) -> str:
-        """Return kind, severity and text on one line."""
         return f"<Finding {self.kind.name}, {self.severity}: {self.text}>"
 
     @property

@@ -276,7 +276,6 @@ class ImageSummary:
     grid: Float32[ndarray, "gh gw"]
     """Grey levels of the image reduced to GRID_PX, minus their mean."""
     sharpness: float
-    """Variance of the Laplacian."""
 
     @staticmethod
     def of(image: UInt8[ndarray, "h w 3"]) -> "ImageSummary":

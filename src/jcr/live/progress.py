@@ -36,7 +36,6 @@ class LiveProgress:
     """Reconstructed points of the scene (m, base frame); None without a calibration."""
 
     def __repr__(self) -> str:
-        """Return the number of registered images, and the calibration in short."""
         found = "no calibration yet" if self.hand_eye is None else self.hand_eye.in_short
         return f"<LiveProgress: {len(self.registered)} of {len(self.images)} images registered; {found}>"
 

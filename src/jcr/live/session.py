@@ -64,15 +64,12 @@ class SessionState:
     is_refusal: bool = False
     """Whether the event is the reason why a request or command was refused."""
     images: tuple[FrameEntry, ...] = ()
-    """Entries of the images in capture.json."""
     can_undo: bool = False
-    """Whether a change can be undone."""
     replaces: str | None = None
     """Name of the image that the next one replaces; None: the next one is added."""
     progress: LiveProgress = LiveProgress(images=())
     """Last state of the calibration; the newest images may be missing in it."""
     is_over: bool = False
-    """Whether the capture has ended: no more images are taken."""
     is_done: bool = False
     """Whether this is the last state of the session."""
     result: "RunResult | None" = None
@@ -109,7 +106,6 @@ class LiveSession:
         self._lock = threading.RLock()
         """Lock that is held while an image is taken or a command is executed."""
         self._changed = threading.Condition()
-        """Condition that is notified when `state` changes."""
         self.has_gripper = gripper is not None
         """Whether the session can read the pose of the gripper, so that a person can take an image."""
         self.state = SessionState(images=self.folder.images)
@@ -128,7 +124,6 @@ class LiveSession:
         """
 
         def request() -> None:
-            """Run `source`, then end the capture, with the error of the source if there is one."""
             try:
                 source()  # pyright: ignore[reportOptionalCall]
             except Exception as error:

@@ -41,7 +41,6 @@ class PyramidLevel:
     """Settings of the alignment at one image height: points per image, number of rounds, scale of the robust cost."""
 
     height: int
-    """Height of the images in pixels."""
     per_image: int
     """Number of points per image."""
     rounds: int

@@ -61,13 +61,9 @@ class Trial:
     """One attempt to reconstruct and calibrate with one back end: its results, or the error that ended it."""
 
     account: Attempt
-    """Record of the attempt for run.json and calibration.json."""
     reconstruction: Reconstruction | None
-    """Reconstruction; None if the back end failed."""
     hand_eye: Calibration | PublishedCalibration | None
-    """Calibration; None if the reconstruction or the calibration failed."""
     failure: InputError | RejectedError | None
-    """Error of the reconstruction or the calibration; None without one."""
 
     @property
     def rejection(self) -> Finding | None:
@@ -150,7 +146,6 @@ def select_reconstruction(
         return view_findings(capture)
 
     def calibrate(capture: Capture, made: Reconstruction) -> Calibration:
-        """Calibrate a reconstruction with the options of the run."""
         return calibrate_reconstruction(capture, made, options.calibrate)
 
     if before is not None:

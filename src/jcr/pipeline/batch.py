@@ -46,16 +46,12 @@ class BatchRow:
     """Row of the table of a batch: capture, status, accuracy, and the reason of a problem."""
 
     capture: str
-    """Path of the capture."""
     out: str
-    """Run folder."""
     status: Verdict | Literal["failed"]
     """Verdict on the calibration; "failed": there is none because of an error."""
     backend: str = ""
     images: int = 0
-    """Number of images of the capture."""
     used: int = 0
-    """Number of images that the calibration uses."""
     point_95_mm: float | None = None
     """Bound of 95 % of the errors of a point at the distance of the scene; None without a calibration."""
     rotation_95_deg: float | None = None
@@ -88,7 +84,6 @@ class BatchRow:
     cx: float | None = None
     cy: float | None = None
     seconds: float = 0.0
-    """Duration of the run."""
     reason: str = ""
     """Reason of a failure or rejection, or that the camera moved between episodes, or else the first warning."""
 

@@ -84,7 +84,6 @@ class Examination:
         return "not checked" if undecided and verdict != "rejected" else verdict
 
     def __repr__(self) -> str:
-        """Return the expected verdict, the expected accuracy of a point, and the first finding, on one line."""
         seen = self.expected and self.expected.seen
         point = f", a point within {significant(seen.within_95_mm)} mm (95 %)" if seen else ""
         first = "".join(f"; {one.text}" for one in self.findings[:1])
@@ -96,13 +95,10 @@ class _Comparison:
     """Comparison of gripper poses with camera poses, by a calibration of both."""
 
     hand_eye: Calibration | None = None
-    """Calibration; None if no camera poses were found."""
     findings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     tried: Int[ndarray, " t"] = field(default_factory=lambda: np.zeros(0, int))
-    """Rows of the images that were compared."""
     registered: Int[ndarray, " c"] = field(default_factory=lambda: np.zeros(0, int))
-    """Rows of the images that the calibration uses."""
     assumptions: Assumptions | None = None
     """Camera and robot as the calibration estimates them; None if it is rejected, or of a fixed camera."""
 

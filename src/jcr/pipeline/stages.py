@@ -180,7 +180,6 @@ def fingerprint(*values: Any) -> str:
     """
 
     def identity(value: Any) -> Any:
-        """Return the value to hash for a value that JSON lacks."""
         if isinstance(value, ndarray):
             return hashlib.sha256(value.tobytes()).hexdigest()
         if not isinstance(value, Path):
@@ -406,7 +405,6 @@ class Stage(NamedTuple):
     """Stage of a run: its files, its function, and its inputs."""
 
     files: tuple[str, ...]
-    """Files in the run folder."""
     function: Callable[[RunResult, Progress], RunResult]
     """Function that writes the files and adds records to the result."""
     inputs: Callable[[RunResult], Any] | None = None

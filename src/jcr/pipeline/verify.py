@@ -53,7 +53,6 @@ class Move(NamedTuple):
     first: int
     """Index of the first capture after the change, in the history."""
     since: str
-    """Name of that capture."""
     step: Float[ndarray, "6"] | None
     """Step of the camera (gripper axes) or the scene (base axes): m, rad; None: the robot's poses changed."""
 

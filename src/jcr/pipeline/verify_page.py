@@ -31,11 +31,9 @@ class Chart(NamedTuple):
     points: list[tuple[float, float, str, bool]]
     """x, y, text, and whether the length is outside of the band."""
     band: str
-    """Corners of the polygon between 0 and the limit."""
     tolerance: float | None
     """y of the tolerance; None outside of the chart."""
     top: str
-    """Number at the upper end of the axis."""
 
 
 def write_page(out: Path, found: Verification, tolerance: tuple[float, float]) -> Path:

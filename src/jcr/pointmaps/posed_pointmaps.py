@@ -33,7 +33,6 @@ class PosedPointmaps:
     confidence: Float[ndarray, "n h w"]
     """Confidence, at least 0; 0 means no estimate. It is comparable only within an image, and no probability."""
     is_metric: bool
-    """True if the unit is the metre."""
     covariance: Float[ndarray, "r r"] | None = None
     """Covariance of the steps of all camera poses (translation, rotation), r = 6n; None: unknown."""
     notes: tuple[str, ...] = ()

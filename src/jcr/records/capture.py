@@ -229,7 +229,6 @@ class Capture(Checked):
         return len(self.images)
 
     def __repr__(self) -> str:
-        """Return the folder, the number and size of the images, and whether intrinsics are given."""
         size, given = "x".join(map(str, self.image_size)), "unknown" if self.intrinsics is None else "given"
         return f"<Capture {self.source or self.folder}: {count_of(len(self), 'image')} of {size}, intrinsics {given}>"
 

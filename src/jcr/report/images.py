@@ -120,7 +120,6 @@ def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
         undistort = undistortion(small, without_distortion(small))
 
     def thumbnail(name: str) -> str:
-        """Return one image as a data URL."""
         pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
         jpeg = encode_jpeg(pixels if undistort is None else undistort(pixels))
         return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"

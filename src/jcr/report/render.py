@@ -33,7 +33,6 @@ def _environment(package: str) -> Environment:
     )
 
     def source(name: str) -> Markup:
-        """Return the unescaped text of a style sheet or script in the folder of the templates."""
         return Markup(loader.get_source(environment, name)[0])  # nosec B704: a file of this package, no text from outside
 
     environment.globals["source"] = source

@@ -53,7 +53,6 @@ def build_scene(
         fields = Fields([occupancy, surface], lattices).to(device)
 
         def fit(field: Field) -> int:
-            """Train the network `field` on the rays of the cloud, and return the number of training steps."""
             stage = f"map: {', '.join(field.heads)}"
             return train(field, rays, seen, options.map_seed, options.max_seconds, partial(progress, stage))
 
@@ -105,7 +104,6 @@ def threads_of_one_core(device: torch.device) -> Executor:
     """
 
     def limit() -> None:
-        """Limit torch to one thread in the calling thread."""
         torch.zeros(1)  # torch sets its number of threads at a thread's first operation
         threadpool_limits(1, user_api="openmp")
 

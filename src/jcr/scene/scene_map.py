@@ -51,7 +51,6 @@ class Sample:
         self._map, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
 
     def __repr__(self) -> str:
-        """Return the number of points, and of unseen ones."""
         count, unseen = len(self._x), int((self._map.seen.at(self._x) == 0).sum())
         return f"<Sample of {count} point{'s' * (count != 1)}, {unseen} unseen>"
 
@@ -198,7 +197,6 @@ class SceneMap:
         self._lock = threading.Lock()
 
     def __repr__(self) -> str:
-        """Return the corners of the workspace (m), its unseen share, and the properties of the map."""
         lower, upper = (" ".join(f"{one:.2f}" for one in corner) for corner in self.box)
         unseen = f"{100 * (self.seen.state == 0).double().mean().item():.0f} % unseen"
         return f"<SceneMap from {lower} to {upper} m, {unseen}; {', '.join(self.properties)}>"
@@ -358,7 +356,6 @@ class SceneMap:
             behind = SeenGrid(self.seen.lower, self.cell, skin.to(torch.uint8))
 
             def is_solid(x: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"]]:
-                """Return the mask (n,) of points that count as solid."""
                 inside = self.fields(x, ("occupancy",))["occupancy"][:, 0] >= 0
                 if self.is_published:
                     return (inside,)

@@ -51,7 +51,6 @@ class Rays:
     """Properties of the points to be learnt: color (n,3) in [0, 1], and label (n,) if there are labels."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
-        """Return the rays of the given rows, a tensor of indices or a slice."""
         columns = {name: value[rows] for name, value in vars(self).items() if name != "targets"}
         return Rays(targets={name: target[rows] for name, target in self.targets.items()}, **columns)
 
@@ -122,7 +121,6 @@ def workspace_rays(
     weight /= 1.0 + (margin**2 + depth_std**2) / cell**2
 
     def tensor(array: ndarray) -> Tensor:
-        """Return an array as a float32 tensor on the training device."""
         return torch.as_tensor(array, dtype=torch.float32, device=device)
 
     targets = {"color": tensor(cloud.color[inside] / np.float32(255))}
@@ -154,7 +152,6 @@ def draw_samples(rays: Rays, seen: SeenGrid, generator: torch.Generator) -> Samp
     device, cell, n = rays.x.device, 2 * seen.cell, len(rays.x)
 
     def uniform(rows: int, columns: int = 1) -> Tensor:
-        """Return random numbers in [0, 1), shape (rows, columns)."""
         return torch.rand(rows, columns, generator=generator, device=device)
 
     a, b = rays[: n // 2], rays[n // 2 :]

@@ -58,7 +58,6 @@ class Measurement:
     """Objects, sorted by footprint, largest first."""
 
     def __repr__(self) -> str:
-        """Return the number of objects, each one's name and size, and the flatness of the plane, on one line."""
         sizes = ((one.name, "x".join(f"{1e3 * m:.0f}" for m in one.box_size)) for one in self.objects)
         named = ", ".join(f"{name} {size} mm" for name, size in sizes)
         return (

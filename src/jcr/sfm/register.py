@@ -31,7 +31,6 @@ class ImageFeatures:
     rays: Float[ndarray, "k 2"]
     """Undistorted directions x/z, y/z of the keypoints."""
     descriptors: Float32[ndarray, "k 128"]
-    """Descriptors of unit length."""
 
 
 @dataclass(frozen=True)

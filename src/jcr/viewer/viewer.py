@@ -226,7 +226,6 @@ class Viewer:
 
         @self.server.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
-            """Show the values at the clicked point."""
             self.click(np.array(event.ray_origin), np.array(event.ray_direction))
 
     def _add_map(self, map: SceneMap, measured: Measurement | None) -> None:

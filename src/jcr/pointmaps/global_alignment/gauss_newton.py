@@ -53,7 +53,6 @@ class AlignmentSolution:
     noise: list[ResidualSpread]
     """Spread of the residuals of each image's pointmaps."""
     settled: bool
-    """True if the last step was smaller than the tolerance."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,7 +86,6 @@ class ImageObservations:
 
     image: int
     second_count: int
-    """Number of second views."""
     pixel_offset: Float[ndarray, "2 m"]
     """Pixel x, y minus the principal point, with y divided by fy/fx; divided by fx it is the ray at unit depth."""
     cell: Float[ndarray, "m c"]
