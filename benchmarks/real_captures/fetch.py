@@ -22,7 +22,7 @@ from PIL import Image
 from scipy.io import loadmat
 
 from jcr.capture.formats import capture_json
-from jcr.capture.notations import poses_of_rows
+from jcr.capture.notations import angle_unit, length_unit, notation_of, poses_of
 from jcr.capture.options import UnitsName
 from jcr.errors import InputError
 from jcr.estimation.arms import RobotName, arm_named
@@ -272,7 +272,15 @@ def _poses(recipe: Recipe, files: dict[str, bytes]) -> Float[ndarray, "n 4 4"]:
     numbers = np.array(_chosen(rows, recipe.use_poses))
     if recipe.robot:
         return forward_kinematics(arm_named(recipe.robot), numbers[:, recipe.joints])
-    return poses_of_rows(numbers, recipe.convention, recipe.units, recipe.poses)
+    position, rotation, notation = numbers[:, :3], numbers[:, 3:], notation_of(recipe.convention)
+    if notation == "matrix":
+        matrix = numbers.reshape(-1, 4, 4)
+        position, rotation = matrix[:, :3, 3], matrix[:, :3, :3].reshape(-1, 9)
+    length, angle = (None, None) if recipe.units == "auto" else recipe.units.split("-")
+    length = length_unit(position, length, recipe.poses)
+    return poses_of(
+        position, rotation, notation, f"{length}-{angle_unit(rotation, notation, angle, recipe.poses)}"
+    )
 
 
 def _numbers(recipe: Recipe, content: bytes, width: int, alone: bool) -> list[list[float]]:

@@ -12,9 +12,9 @@ from jcr.capture.notations import (
     NUMBERS,
     angle_unit,
     length_unit,
+    notation_of,
     numbers_of,
     poses_of,
-    poses_of_rows,
 )
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import Candidate, pose_columns, readings_of, text_of
@@ -74,7 +74,7 @@ KNOWN = {
 def test_known_poses(conventions: str):
     row, axes = KNOWN[conventions]
     for convention in conventions.split():
-        (pose,) = poses_of_rows(np.array([row], float), convention)
+        ((_, (pose, *_)),) = read(table_of(np.tile(np.array(row, float), (4, 1))), pose_convention=convention)
         np.testing.assert_allclose(pose[:3, :3].T, axes, atol=1e-9)
         np.testing.assert_allclose(pose[:3, 3], [0.1, 0.2, 0.3], atol=1e-12)
 
@@ -105,20 +105,10 @@ def test_rows_that_are_no_transform_are_nan():
     assert np.isnan(poses_of(np.zeros((3, 3)), matrices, "matrix")[:, 0, 0]).tolist() == [False, True, True]
 
 
-@pytest.mark.parametrize("convention", ["matrix", "matrix:columns"])
-def test_a_transposed_or_scaled_matrix_is_refused(convention: str):
-    """The translation in the last row was ignored."""
-    right = POSES if convention == "matrix" else np.swapaxes(POSES, 1, 2)
-    np.testing.assert_allclose(poses_of_rows(right.reshape(-1, 16), convention), POSES, atol=1e-9)
-    for wrong in (np.swapaxes(right, 1, 2), 2 * right):
-        with refused("poses: the last row of pose 1 is not 0 0 0 1"):
-            poses_of_rows(wrong.reshape(-1, 16), convention)
-
-
 @pytest.mark.parametrize("name", ["kukka", "euler:xx", "euler:abc", "euler:", "quat", "euler:zyx "])
 def test_an_unknown_notation_lists_those_there_are(name: str):
     with refused(r"--pose-convention .*: not one of quat:xyzw, .*euler:ZYX, .*kuka"):
-        poses_of_rows(np.zeros((1, 6)), name)
+        notation_of(name)
 
 
 @pytest.mark.parametrize(

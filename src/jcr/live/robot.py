@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.notations import METRES_LIMIT, RADIANS_LIMIT, poses_of_rows
+from jcr.capture.notations import METRES_LIMIT, RADIANS_LIMIT, UNIT_TOLERANCE, poses_of
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import inverse, rotation_angle
@@ -102,16 +102,22 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
     if (named := BY_COUNT.get(len(numbers))) is None:
         forms = "x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; m, rad"
         raise InputError(f"{where}: {len(numbers)} numbers; give {forms}")
-    far_m, largest = float(np.linalg.norm(numbers[:3])), max(map(abs, numbers[3:6]))
+    position, rotation = np.array(numbers[:3], float), np.array(numbers[3:], float)
     if len(numbers) == 16:
-        far_m = float(np.linalg.norm(numbers[3:12:4]))
-    if far_m > METRES_LIMIT:
+        matrix = np.reshape(numbers, (4, 4))
+        position, rotation = matrix[:3, 3], matrix[:3, :3].ravel()
+        if not (np.abs(matrix[3] - (0, 0, 0, 1)) < UNIT_TOLERANCE).all():
+            raise InputError(f"{where}: the last row is not 0 0 0 1; give the matrix by rows")
+    if (far_m := float(np.linalg.norm(position))) > METRES_LIMIT:
         raise InputError(
             f"{where}: the gripper is {far_m:.4g} m from the base; these look like millimetres: give metres"
         )
-    if len(numbers) == 6 and largest > RADIANS_LIMIT:
+    if len(numbers) == 6 and (largest := float(np.abs(rotation).max())) > RADIANS_LIMIT:
         raise InputError(f"{where}: an angle of {largest:.4g} rad; these look like degrees: give radians")
-    return poses_of_rows(np.array([numbers], np.float64), named, "m-rad", where)[0]
+    pose = poses_of(position[None], rotation[None], named)[0]
+    if np.isnan(pose).any():
+        raise InputError(f"{where}: no rigid transform, or NaN or infinity in it; check the numbers")
+    return pose
 
 
 def states_of(source: str) -> States | None:
@@ -209,7 +215,7 @@ def xarm_states(host: str) -> Iterator[RobotState]:
                 raise InputError(
                     f"{where}: the arm answers with code {code or wrong}; see UFACTORY Studio; the same command resumes"
                 )
-            (base_from_gripper,) = poses_of_rows(np.array([pose]), "rotvec", "mm-rad", where)
+            base_from_gripper = pose_of_numbers([*np.divide(pose[:3], 1e3), *pose[3:]], where)
             joints = np.array(angles[: arm.axis], dtype=np.float64)
             yield RobotState(time.monotonic(), base_from_gripper, joints)
             time.sleep(XARM_POLL_S)

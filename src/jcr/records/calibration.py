@@ -382,10 +382,7 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance (j,j) of transform and scale in COVARIANCE_ORDER, then of the intrinsics if estimated.
-
-        Without these, j is 7.
-        """
+        """Covariance of transform and scale in COVARIANCE_ORDER (j = 7), then of the intrinsics if they are estimated."""
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property
