@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
-from jcr.pointmaps.pair_predictions import ARRAYS, PairPredictions, complete_pairs
+from jcr.pointmaps.pair_predictions import SHAPES, PairPredictions, complete_pairs
 from jcr.records import Intrinsics
 from simulation.truth import read_truth, true_depth
 
@@ -233,7 +233,7 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int) -> Float[nda
 
 def write_pairs(path: Path, predictions: PairPredictions) -> None:
     """Write predictions as the npz file that jcr reads."""
-    arrays: dict[str, object] = {name: getattr(predictions, name) for name in ARRAYS}
+    arrays: dict[str, object] = {name: getattr(predictions, name) for name in SHAPES}
     arrays |= {"images": np.array(predictions.images, dtype=str), "is_metric": predictions.is_metric}
     if predictions.colors is not None:
         arrays["colors"] = predictions.colors

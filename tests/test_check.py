@@ -62,7 +62,7 @@ def test_nothing_is_stated_of_an_undecided_reading(small_capture: Path, tmp_path
     np.savetxt(tmp_path / "p.csv", np.hstack([1e3 * poses[:, :3, 3], turned]), delimiter=",")
     assert dispatch(["check", str(tmp_path), "--poses-only"]) == 3
     said = capsys.readouterr().out
-    assert said.startswith("NOT DECIDED") and "leave out --poses-only, or name the reading" in said
+    assert said.startswith("NOT DECIDED") and "leave out --poses-only or name the reading" in said
     assert not any(word in said for word in ("Motion", "Expected", "1σ"))
     assert dispatch(["check", str(tmp_path), "--poses-only", "--json"]) == 3
     found = json.loads(capsys.readouterr().out)

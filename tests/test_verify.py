@@ -246,7 +246,7 @@ def test_images_of_a_calibration_are_refused_by_content(out: Path, capture: Capt
     file = today.folder / "capture.json"
     file.write_text(file.read_text().replace(Path(capture.images[3]).name, "fresh.jpg"))
     assert dispatch(["verify", str(out), str(today.folder)]) == 2
-    assert f"fresh.jpg: equals {capture.images[3]}, an image of the calibration" in capsys.readouterr().err
+    assert f"fresh.jpg: equals image {capture.images[3]} of the calibration" in capsys.readouterr().err
 
 
 def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(out, capture, x, tmp_path, capsys):

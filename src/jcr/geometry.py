@@ -280,9 +280,7 @@ def require_rigid(matrix: Transform, where: str) -> Transform:
         size = abs(determinant) ** (1 / 3)
         scaled = size > 0 and np.abs(rotation.T @ rotation / size**2 - np.eye(3)).max() < RIGID_TOLERANCE
         hint = f"it is scaled by {size:.4g}: divide it out" if scaled else "check units, order and angles"
-        raise InputError(
-            f"{where}: not a rotation matrix, RᵀR differs from the identity by {off:.2g}; {hint}"
-        )
+        raise InputError(f"{where}: not a rotation matrix, RᵀR differs from identity by {off:.2g}; {hint}")
     if determinant < 0:
         raise InputError(f"{where}: a reflection (determinant {determinant:.3f}); flip the sign of an axis")
     return transform(nearest_rotation(rotation), matrix[:3, 3])

@@ -34,7 +34,7 @@ def require_memory(size: int, claimant: str) -> None:
     physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if size > physical:
         raise InputError(
-            f"{claimant}: unpacks to {size / GB:.1f} GB, this machine has {physical / GB:.1f} GB; use a smaller file"
+            f"{claimant}: unpacks to {size / GB:.1f} GB of {physical / GB:.1f} GB here; use a smaller file"
         )
 
 

@@ -28,7 +28,7 @@ from jcr.capture.added_capture import read_added
 from jcr.capture.read import read_capture
 from jcr.cell.added_cameras import read_added_cameras
 from jcr.cell.placement import CamerasFile, read_cameras
-from jcr.depth.depth_npz import FILE as DEPTH
+from jcr.depth.depth_npz import DEPTH_FILE as DEPTH
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
@@ -36,7 +36,7 @@ from jcr.files import read_bytes
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
-from jcr.scene.map_file import FILE as MAP
+from jcr.scene.map_file import MAP_FILE as MAP
 from jcr.scene.map_file import load_map
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
@@ -136,9 +136,7 @@ class RunResult:
     def found(self) -> Calibration:
         """Calibration of a successful run; raises RejectedError for a failed one, InputError for a published one."""
         if isinstance(found := self.solved, PublishedCalibration):
-            raise InputError(
-                f"{self.out}: is by --method paper, which has no uncertainty; run the default method for this"
-            )
+            raise InputError(f"{self.out}: --method paper has no uncertainty; run the default method")
         return found
 
     @property
@@ -155,13 +153,9 @@ class RunResult:
         try:
             return RunState.model_validate_json(read_bytes(file), strict=True)
         except ValidationError as error:
-            raise InputError(
-                f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"
-            ) from None
+            raise InputError(f"{file}: {first_fault(error)}; repeat `jcr calibrate` or `jcr run`") from None
         except OSError:
-            raise InputError(
-                f"{self.out}: holds no run; make one with `jcr run` or `jcr calibrate`"
-            ) from None
+            raise InputError(f"{self.out}: no run; make one with `jcr run` or `jcr calibrate`") from None
 
     @cached_property
     def capture(self) -> Capture:
@@ -266,9 +260,7 @@ class RunResult:
             )
         capture = self.capture
         if [image.image for image in calibration.images] != list(capture.images):
-            raise InputError(
-                f"{capture.folder}: has changed since {self.out} was made; run `jcr calibrate` again"
-            )
+            raise InputError(f"{capture.folder}: changed after {self.out}; run `jcr calibrate` again")
         reconstruction = self.reconstruction
         if len(calibration.images) <= reconstruction.image_index.max(initial=-1):
             raise InputError(

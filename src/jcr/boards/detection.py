@@ -31,7 +31,7 @@ EVEN = 0.2
 """Largest `_unevenness` of a chessboard's corners. Correct corners of three boards before five cameras have up to 0.15,
 points beside the board of 80 images 0.28 to 5.7; with 0.1 some correct ones are replaced by less accurate ones, with 0.3
 two of these 80 wrong detections remain."""
-PRINTED = 0.002
+PRINTED_STD = 0.002
 """Relative standard deviation of a printed board's size."""
 SIDE = "SIDE"
 """Word that replaces an unknown side of a square or tag in a board's name; the side is then the unit of length."""
@@ -90,7 +90,7 @@ def boards(spec: str) -> list[Board]:
                 raise ValueError(f"no such board; write it as {'; '.join(KINDS)}")
     except ValueError as error:
         raise InputError(f"board {spec}: {error}") from None
-    size_std = None if SIDE in parts else PRINTED
+    size_std = None if SIDE in parts else PRINTED_STD
     return [Board(name, detect, _length(side), size_std) for name, detect in detectors.items()]
 
 

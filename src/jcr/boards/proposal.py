@@ -16,12 +16,12 @@ LOOKED_AT = 3
 """Number of images that are searched; a useful board is in most of them."""
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "APRILTAG_25h9")
 """Largest dictionary of OpenCV with tags of each kind, without DICT_."""
-SIZES = (50, 100, 250, 1000)
+DICTIONARY_SIZES = (50, 100, 250, 1000)
 FEWEST_SHOWN = 2
 """Least number of images that must show the same tags or chessboard; in a single image, texture may look like one."""
-SMALLEST = 4
+LEAST_CORNERS = 4
 """Least number of inner corners on a side of a chessboard; windows and keyboards also show 3x3 corners."""
-LONG_SIDE_PX = 800
+SEARCHED_PX = 800
 """Largest long side, px, of an image that is searched; larger images are reduced to it."""
 
 
@@ -32,7 +32,7 @@ def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
     """
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in chosen]
-    if (factor := LONG_SIDE_PX / max(grey[0].shape)) < 1:
+    if (factor := SEARCHED_PX / max(grey[0].shape)) < 1:
         grey = [cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) for one in grey]
     return _tags(grey) or _chessboard(grey)
 
@@ -57,7 +57,7 @@ def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
         return None
     if family.startswith("APRILTAG"):
         return f"apriltag:SIDE:{family.removeprefix('APRILTAG_')}"
-    return f"aruco:SIDE:DICT_{family[:3]}_{next(size for size in SIZES if max(numbers) < size)}"
+    return f"aruco:SIDE:DICT_{family[:3]}_{next(size for size in DICTIONARY_SIZES if max(numbers) < size)}"
 
 
 def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
@@ -67,7 +67,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
         found, _, meta = cv2.findChessboardCornersSBWithMeta(
             image, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         )
-        if found and meta is not None and min(meta.shape[:2]) >= SMALLEST:
+        if found and meta is not None and min(meta.shape[:2]) >= LEAST_CORNERS:
             sizes.append(tuple(sorted(meta.shape[:2], reverse=True)))
     if len(sizes) < FEWEST_SHOWN:
         return None

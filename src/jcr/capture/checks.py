@@ -75,9 +75,7 @@ def checked_capture(
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
     """Raise InputError if `count` frames are fewer than `at_least` or more than 1000."""
     if count > MAX_FRAMES:
-        raise InputError(
-            f"{where}: {count_of(count, 'frame')}; choose {MAX_FRAMES} at most; 5 to 15 are usual"
-        )
+        raise InputError(f"{where}: {count_of(count, 'frame')}; choose 5 to 15, {MAX_FRAMES} at most")
     if count < at_least:
         raise InputError(f"{where}: {count_of(count, 'frame')}; at least {at_least} are needed; take 5 to 15")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 
 from jcr.capture.documents import Table, read_record_tables, read_tables
-from jcr.capture.images import FORMATS
+from jcr.capture.images import IMAGE_FORMATS
 from jcr.capture.pairing import NEARLY, Pairing, natural, pair, plain_name
 from jcr.capture.readings import pose_columns, words_of
 from jcr.errors import InputError, count_of, first_few
@@ -26,7 +26,7 @@ NOT_SCENE = {
     "mask", "masks", "depth", "depths", "seg", "segmentation", "label", "labels", "disparity", "confidence",
 }  # fmt: skip
 """Words in names of files and folders with images that do not show the scene in colour."""
-USUAL = ("images", "image", "rgb", "color", "colour", "img", "imgs")
+USUAL_FOLDERS = ("images", "image", "rgb", "color", "colour", "img", "imgs")
 """Names of folders with the images of a capture, the first ones preferred."""
 IGNORED = {
     ".pyc", ".py", ".ipynb", ".md", ".pdf", ".zip", ".gz", ".ply", ".pcd", ".stl", ".urdf", ".mp4", ".avi", ".svg",
@@ -140,14 +140,14 @@ def _preference(one: Path, folder: Path, found: dict[Path, list[Path]]) -> tuple
     """Return the sort key of a folder with images: many enough, usual name, number of images."""
     most = max(map(len, found.values()))
     name = one.name.lower() if one != folder else ""
-    rank = len(USUAL) - USUAL.index(name) if name in USUAL else 0
+    rank = len(USUAL_FOLDERS) - USUAL_FOLDERS.index(name) if name in USUAL_FOLDERS else 0
     return len(found[one]) >= min(3, most), rank, len(found[one])
 
 
 def _size(file: Path) -> tuple[int, int] | None:
     """Return the size of an image file by its header; None for a damaged one."""
     try:
-        with Image.open(file, formats=FORMATS) as opened:
+        with Image.open(file, formats=IMAGE_FORMATS) as opened:
             return opened.size
     except Exception:  # decoders raise errors of many types for a damaged file
         return None

@@ -12,19 +12,19 @@ from jcr.errors import InputError
 from jcr.estimation.pose_equations import ASSUMED_NOISE, expected_covariance, pose_residuals
 from jcr.geometry import inverse, motion_length
 
-STILL = 0.005
+STILL_SPEED = 0.005
 """Speed (m/s) below which the arm is at rest; rotation counts as in motion_length. At half a metre this moves the image
 by a tenth of a pixel in 20 ms."""
 LOOKS = 5
 """Number of frames of one stop whose sharpness is compared."""
-ENOUGH = 8
+ENOUGH_VIEWS = 8
 """Number of different views at rest that suffice: a frame in motion is blurred, and its pose less exact. With eight
 images a wrong one is recognised."""
 SAME_VIEW = 0.005
 """Smallest distance (m) between two views, as by motion_length; the sharpest of closer frames is kept."""
 UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
 """Errors of translation (m), rotation (rad) and log scale that have equal weight: 1 mm, 0.1°, 0.2 %."""
-WEAK = 1e-6
+WEAK_PRIOR = 1e-6
 """Prior information (1/m², 1/rad²) about each calibration parameter, which keeps the covariance finite."""
 UNREADABLE = -1.0
 """Sharpness of an image that cannot be read."""
@@ -44,13 +44,13 @@ def best_frames(
     The frames minimise the predicted uncertainty of the calibration. `speed` is that of the gripper (m/s; 1 rad counts
     as 0.3 m). `usable` marks the frames with a valid pose. `sharpness_of` returns the sharpness of k ascending rows,
     which is UNREADABLE for an image that cannot be read. Each stop of the arm (below 5 mm/s) gives at most one frame.
-    With fewer than ENOUGH different views at rest, the slowest frames between stops are added. Raises InputError if
-    fewer than three frames are left.
+    With fewer than ENOUGH_VIEWS different views at rest, the slowest frames between stops are added. Raises InputError
+    if fewer than three frames are left.
     """
     steps = np.asarray(motion_length(inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]))
     # A camera that is triggered at the stops has no frames between them: the arm's moves part the stops, too.
     moved = np.append(steps > SAME_VIEW, False)
-    still = _runs(usable & (speed < STILL), moved)
+    still = _runs(usable & (speed < STILL_SPEED), moved)
     moments = [run[np.linspace(0, len(run) - 1, LOOKS + 2).astype(int)[1:-1]] for run in still]
     sharp, left_out = np.full(len(speed), np.nan), 0
 
@@ -72,20 +72,20 @@ def best_frames(
         return views
 
     views = different_views() if moments else np.zeros(0, int)
-    if len(views) < min(count, ENOUGH):
-        moments += _slowest(_runs(usable & (speed >= STILL)), speed, 4 * count)
+    if len(views) < min(count, ENOUGH_VIEWS):
+        moments += _slowest(_runs(usable & (speed >= STILL_SPEED)), speed, 4 * count)
         views = different_views()
     if len(views) < MIN_FRAMES:
         raise InputError(
             f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
             "needed: record again with a pause at each of twelve views"
         )
-    frames = _frames_of_views(views, base_from_gripper[views], speed[views] < STILL, count)
+    frames = _frames_of_views(views, base_from_gripper[views], speed[views] < STILL_SPEED, count)
     notes = []
     if left_out:
         notes.append(f"{left_out} moments of the recording are blurred and were left out")
-    at_rest = int((speed[views] < STILL).sum())
-    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
+    at_rest = int((speed[views] < STILL_SPEED).sum())
+    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL_SPEED:
         notes.append(
             f"the arm stands still at {at_rest} different views where {count} frames are wanted; the others were "
             f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
@@ -103,7 +103,7 @@ def _slowest(moving: list[Rows], speed: Float[ndarray, " n"], count: int) -> lis
 def _frames_of_views(views: Rows, base_from_gripper: Poses, at_rest: Bool[ndarray, " n"], count: int) -> Rows:
     """Return the rows of up to `count` of n `views` that minimise the predicted uncertainty, those at rest first."""
     information = _pose_information(base_from_gripper)
-    frames, known = np.zeros(0, int), WEAK * np.eye(13)
+    frames, known = np.zeros(0, int), WEAK_PRIOR * np.eye(13)
     for of_kind in (at_rest, ~at_rest):
         gain = information[of_kind]
         chosen = _most_informative(gain, known, count - len(frames))

@@ -18,7 +18,7 @@ from jcr.files import require_file
 MAX_PIXELS = 64_000_000
 """Largest number of pixels of an image. No wrist camera has more; a larger file may be a decompression bomb, which is
 refused before it is unpacked."""
-FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
 """Pillow's names of the formats that are read, by the content of the file. Others have readers that are little used, or
 that start programs (PostScript)."""
 MAX_SCANS = 100
@@ -64,7 +64,7 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
             # Pillow's own bomb warning would end a run that treats warnings as errors; our limit is lower.
             warnings.simplefilter("ignore")
             file = source if isinstance(source, Path) else io.BytesIO(source)
-            with Image.open(file, formats=FORMATS) as opened:
+            with Image.open(file, formats=IMAGE_FORMATS) as opened:
                 require_pixels(opened.size, where)
                 if opened.format in ("JPEG", "MPO"):
                     data = source.read_bytes() if isinstance(source, Path) else source
@@ -83,9 +83,7 @@ def opened_image(source: Path | bytes, where: str) -> Iterator[Image.Image]:
     except InputError:
         raise
     except Image.DecompressionBombError:  # Pillow's own limit is above ours, but for previews and tiles
-        raise InputError(
-            f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
-        ) from None
+        raise InputError(f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink it") from None
     except Exception as error:  # decoders raise errors of many types for a damaged file
         raise InputError(f"{where}: not a readable image ({error}); save it again as PNG or JPEG") from None
 
@@ -95,7 +93,7 @@ def require_pixels(size: tuple[int, int], where: str) -> None:
     if min(size) < 1:
         raise InputError(f"{where}: {size[0]}x{size[1]} pixels, an empty image; take it again")
     if size[0] * size[1] > MAX_PIXELS:
-        raise InputError(f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image")
+        raise InputError(f"{where}: over {MAX_PIXELS // 1_000_000} million pixels; shrink it")
 
 
 def read_image(source: Path | bytes, where: str | None = None) -> UInt8[ndarray, "h w 3"]:
@@ -124,9 +122,7 @@ def read_one_channel(source: Path | bytes, where: str) -> UInt8[ndarray, "h w"] 
     with opened_image(source, where) as opened:
         kind = ONE_CHANNEL.get(opened.mode)
         if kind is None:
-            raise InputError(
-                f"{where}: pixels of mode {opened.mode}; save it as PNG with one channel of 8 or 16 bits"
-            )
+            raise InputError(f"{where}: mode {opened.mode}; save it as PNG with one channel of 8 or 16 bits")
         pixels = np.asarray(opened)
         if pixels.dtype.itemsize > 2 and pixels.size and not 0 <= pixels.min() <= pixels.max() <= 65535:
             raise InputError(f"{where}: values beyond 65535; save it as PNG with one channel of 16 bits")

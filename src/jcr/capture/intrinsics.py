@@ -20,7 +20,7 @@ from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
 from jcr.records.capture_json import IntrinsicsEntry
 from jcr.records.json_file import validated_content
 
-NAMED = re.compile(
+INTRINSICS_NAMES = re.compile(
     r"cam(era)?[_-]?(info|intr|param|calib)|intrin|calib|^ost$|cameras?$|^k$|opencv", re.IGNORECASE
 )
 """Names of files that may hold intrinsics."""
@@ -66,7 +66,7 @@ def intrinsics_of_capture(
         if file.name.lower() in CERTAIN and file.parent in (folder, folder / "images"):
             return intrinsics_of_file(file, size), ()
     found = dict[Path, Intrinsics]()
-    for file in (one for one in documents if NAMED.search(one.stem)):
+    for file in (one for one in documents if INTRINSICS_NAMES.search(one.stem)):
         with suppress(InputError):
             entry = read_intrinsics(file)
             if entry is not None and entry.width is not None:  # else it may be of another camera

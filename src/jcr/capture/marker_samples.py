@@ -20,14 +20,16 @@ from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.records import PosePairs
 
-PAIRS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
+POSE_KEYS = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"))
 """Keys of the gripper pose and the marker pose in a sample of MoveIt Calibration and of easy_handeye2."""
-SUFFIXES = (".yaml", ".yml", ".json", ".samples")
+SAMPLE_SUFFIXES = (".yaml", ".yml", ".json", ".samples")
 
 
 def recognises(path: Path) -> bool:
     """Test whether a path is a file with samples of MoveIt Calibration or easy_handeye2."""
-    return path.is_file() and path.suffix.lower() in SUFFIXES and _pairs(read_content(path)) is not None
+    return (
+        path.is_file() and path.suffix.lower() in SAMPLE_SUFFIXES and _pairs(read_content(path)) is not None
+    )
 
 
 def read(path: Path, options: ReadOptions) -> PosePairs:
@@ -71,7 +73,7 @@ def _pairs(content: Any) -> tuple[list[Any], tuple[str, str]] | None:
     """Return the samples in the content of a file, and their keys of gripper and marker pose; None without samples."""
     lists = [content, *(content.values() if isinstance(content, dict) else ())]
     for entries in (one for one in lists if isinstance(one, list) and one and isinstance(one[0], dict)):
-        for keys in PAIRS:
+        for keys in POSE_KEYS:
             if set(keys) <= entries[0].keys():
                 return entries, keys
     return None
@@ -82,13 +84,11 @@ def _poses(path: Path, entries: Sequence[Any], key: str, options: ReadOptions) -
 
     A marker's pose is camera_from_marker; only the gripper's pose is inverted by `options`.
     """
-    is_gripper = key in {gripper for gripper, _ in PAIRS}
+    is_gripper = key in {gripper for gripper, _ in POSE_KEYS}
     own = replace(options, pose_columns=None) if is_gripper else ReadOptions(pose_units=options.pose_units)
     rows = [leaves(path, one[key]) if isinstance(one, dict) and key in one else None for one in entries]
     table = table_of(path, rows)
     for candidate in readings_of(table, own, f"{path}: {key}")[1] if table else ():
         if candidate[0].inverted == own.pose_inverted:
             return candidate
-    raise InputError(
-        f"{path}: {key}: holds no poses; give position and quaternion, or 16 numbers of a matrix"
-    )
+    raise InputError(f"{path}: {key} holds no poses; give position and quaternion, or 16 numbers of a matrix")

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.capture.documents import Table
-from jcr.capture.frame_choice import STILL
+from jcr.capture.frame_choice import STILL_SPEED
 from jcr.capture.pose_track import NEVER, interpolated_poses
 from jcr.errors import InputError, count_of, shown
 from jcr.files import LONGEST
@@ -338,7 +338,7 @@ def _zone(
         at = stamps + step * ZONE_NS
         _, gap = interpolated_poses(times, poses, at)
         before, after = (interpolated_poses(times, poses, at + side * MOMENT_NS)[0] for side in (-1, 1))
-        slow = np.asarray(motion_length(inverse(before) @ after)) / (2e-9 * MOMENT_NS) < STILL
+        slow = np.asarray(motion_length(inverse(before) @ after)) / (2e-9 * MOMENT_NS) < STILL_SPEED
         if (gap != NEVER).all() and slow.mean() >= NEARLY:
             fitting.append(step * ZONE_NS)
     return fitting[0] if len(fitting) == 1 else None
@@ -346,7 +346,7 @@ def _zone(
 
 AS_TEXT = "in the order of the images' names as text (1, 10, 11, … 2)"
 AS_NUMBERS = "in the order of the images' names as numbers (1, 2, … 10)"
-FARTHEST = 2
+LARGEST_SHIFT = 2
 """Largest shift, in images, between poses and images that is tried."""
 
 
@@ -354,7 +354,7 @@ def other_orders(names: Sequence[str]) -> Iterator[tuple[str, Int[ndarray, " n"]
     """Yield other orders of the poses of n named images: words for each, and the pose's index of each image, or -1."""
     n = len(names)
     yield "listed in reverse order of the images", np.arange(n)[::-1]
-    for shift in range(1, min(FARTHEST, n - 5) + 1):
+    for shift in range(1, min(LARGEST_SHIFT, n - 5) + 1):
         for word, sign, step in (("ahead of", "+", shift), ("behind", "−", -shift)):
             order = np.arange(n) + step
             order[(order < 0) | (order >= n)] = -1

@@ -20,7 +20,7 @@ from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs, Reading
 
-FORMATS: dict[str, Any] = {
+READERS: dict[str, Any] = {
     "capture": capture_json,
     "bag": bag,
     "lerobot": lerobot,
@@ -74,7 +74,7 @@ def read_source(
         notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     name = format_of(path) if options.format == "auto" else options.format
     if name not in RECORDINGS:
-        folder, origin, found = None, [], FORMATS[name].read(path, options)
+        folder, origin, found = None, [], READERS[name].read(path, options)
     elif into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
     else:
@@ -83,7 +83,7 @@ def read_source(
         extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
         if extra.get("made_from") == origin:
             return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
-        found = FORMATS[name].read(path, options, folder, progress)
+        found = READERS[name].read(path, options, folder, progress)
     is_unread = isinstance(found, Capture) and found.reading is None and not found.candidates
     if options.pose_inverted and is_unread:
         read = Reading(file=path.name, inverted=True, decided_by="option")
@@ -105,7 +105,7 @@ def format_of(path: Path) -> str:
     Raises InputError for a folder of bags, and for a folder of captures without images of its own.
     """
     for name in ("capture", "bag", "lerobot", "samples"):
-        if FORMATS[name].recognises(path):
+        if READERS[name].recognises(path):
             return name
     if path.is_dir() and any(bag.recognises(file) for file in path.iterdir()):
         raise InputError(f"{path}: holds bags; name one of them")

@@ -43,7 +43,7 @@ ROTATION = {
     "vector", "axis", "aa", "r", "xyzw", "wxyz", "matrix",
 }  # fmt: skip
 """Words of column names that stand for one half of a pose; the rest of the name is that of the whole pose."""
-WIDEST = 100
+MOST_UNNAMED = 100
 """Largest number of columns without names in which a pose is looked for; poses and joints of two arms have 30."""
 VECTOR = {"rvec", "rotvec", "vector", "aa"}
 ROBOT = {
@@ -233,7 +233,7 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
     Six numbers are a position and three numbers of a rotation, in either order; seven a position and a quaternion;
     twelve or sixteen a matrix. A quaternion or a matrix is found among more numbers by its length or its axes.
     """
-    for group in _layouts(len(columns)) if len(columns) <= WIDEST else ():
+    for group in _layouts(len(columns)) if len(columns) <= MOST_UNNAMED else ():
         found = []
         for position, rotation, notations, zero in group:
             at, of_rotation, none = (

@@ -97,9 +97,7 @@ def _as_message(where: str) -> Iterator[None]:
         if isinstance(error, InputError):
             raise
         reason = " ".join(str(error).split())[:LONGEST_SHOWN]
-        raise InputError(
-            f"{where}: not an image message of ROS ({reason}); record the standard message"
-        ) from None
+        raise InputError(f"{where}: no ROS image message ({reason}); record the standard message") from None
 
 
 def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
@@ -114,9 +112,7 @@ def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"],
             for magic, ending in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n", ".png")):
                 if data.startswith(magic):
                     return data, ending
-            raise InputError(
-                f"{where}: compressed as {shown(message.format)}; jcr reads JPEG and PNG of colours"
-            )
+            raise InputError(f"{where}: compressed as {shown(message.format)}; give JPEG or PNG of colours")
         if message.encoding not in _ENCODINGS:
             raise InputError(
                 f"{where}: encoding {shown(message.encoding)} is no colour image; choose another topic"

@@ -17,7 +17,7 @@ from jcr.geometry import transform
 
 ARGUMENTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Arguments of ROS 2's static_transform_publisher."""
-ARRAYS = (".npy", ".npz", ".mat")
+ARRAY_SUFFIXES = (".npy", ".npz", ".mat")
 
 
 def read_transform(file: Path) -> Float[ndarray, "4 4"]:
@@ -26,12 +26,10 @@ def read_transform(file: Path) -> Float[ndarray, "4 4"]:
     Read are a static_transform_publisher's arguments, the only fixed joint of a URDF, translation and rotation in YAML
     or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several.
     """
-    text = "" if file.suffix.lower() in ARRAYS else decode_text(file, read_limited(file))
+    text = "" if file.suffix.lower() in ARRAY_SUFFIXES else decode_text(file, read_limited(file))
     found = [*_of_arguments(text), *_of_urdf(file, text)] or _of_record(file)
     if not found:
-        raise InputError(
-            f"{file}: holds no transform; give translation and rotation, a 4x4 matrix, or what `jcr export` writes"
-        )
+        raise InputError(f"{file}: no transform; give a 4x4 matrix, or a file of `jcr export`")
     if any(not np.allclose(found[0], other, rtol=0, atol=1e-9) for other in found[1:]):
         raise InputError(f"{file}: holds several transforms; give a file with one")
     return found[0]
@@ -56,9 +54,7 @@ def _of_urdf(file: Path, text: str) -> list[Float[ndarray, "4 4"]]:
                 np.array(origin.get(key, "0 0 0").split(), float).reshape(3) for key in ("xyz", "rpy")
             )
         except ValueError:
-            raise InputError(
-                f"{file}: an origin whose xyz and rpy are not three numbers each; write three"
-            ) from None
+            raise InputError(f"{file}: an origin without three numbers for xyz and rpy; write them") from None
         made.append(transform(Rotation.from_euler("xyz", rpy).as_matrix(), xyz))
     return made
 

@@ -75,9 +75,7 @@ def read_chain(where: "Path | yourdfpy.URDF", dof: int) -> Arm:
     chains = [chain for chain in chains if sum(joint.type != "fixed" for joint in chain) == dof]
     if len(chains) != 1:
         found = f"chains to {', '.join(chain[-1].child for chain in chains)}" if chains else "no chain"
-        raise InputError(
-            f"{where}: {found} with {count_of(dof, 'joint')}; give as many joints per frame as the arm has"
-        )
+        raise InputError(f"{where}: {found} with {count_of(dof, 'joint')}; give one angle for each joint")
     return _arm_of(chains[0], where)
 
 
@@ -153,7 +151,7 @@ class RecordedArm:
         angles = recorded * self.unit
         if (largest := float(np.abs(angles).max(initial=0.0))) > 2 * RADIANS_LIMIT:
             raise InputError(
-                f"{where}: joint angles up to {largest:.0f} rad; if they are degrees, add --pose-units m-deg"
+                f"{where}: joint angles up to {largest:.0f} rad; for degrees add --pose-units m-deg"
             )
         return forward_kinematics(self.arm, angles)
 

@@ -27,7 +27,7 @@ from jcr.estimation.problem import Effect, PoseModel, ReportedPoses, State, scal
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
-from jcr.sfm.register import GATE_PX, KnownImages, Registration, features, registrations
+from jcr.sfm.register import POSE_GATE_PX, KnownImages, Registration, features, registrations
 
 CLEARLY_MORE = 1.1
 """Ratio of RANSAC inliers with estimated over given focal length, above which the given one is wrong."""
@@ -51,7 +51,7 @@ def localise(
     """
     given, _ = usable_intrinsics(camera.intrinsics)
     start = given or guessed_intrinsics(camera.image_size)
-    gate_px = 2 * GATE_PX * max(1.0, start.width / 1600)
+    gate_px = 2 * POSE_GATE_PX * max(1.0, start.width / 1600)
     focals: Sequence[Literal["given", "free"]] = ("free",) if given is None else ("free", "given")
     found, *by_given = registrations(known, image, start, focals, gate_px)
     return by_given[0] if by_given and found[1] <= CLEARLY_MORE * by_given[0][1] else found

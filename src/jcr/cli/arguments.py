@@ -27,7 +27,7 @@ CONFIGURATION = (
     tyro.conf.DisallowNone,
 )
 """Settings of tyro for the conversion of a command's fields to options."""
-WIDEST = 120
+HELP_WIDTH = 120
 """Largest width of the help's paragraphs in columns, also on a wider terminal."""
 
 
@@ -101,7 +101,7 @@ def _default_hint(label: str) -> str:
 @contextmanager
 def _wrapped_paragraphs() -> Iterator[None]:
     """Wrap the paragraphs of the help at words while the context is active; tyro 1.0 prints each as one line."""
-    width, output = min(shutil.get_terminal_size().columns, WIDEST), sys.stdout
+    width, output = min(shutil.get_terminal_size().columns, HELP_WIDTH), sys.stdout
     # These two attributes decide which box characters and colours tyro uses.
     like_output = {"encoding": output.encoding, "isatty": output.isatty}
     printed = type("Help", (io.StringIO,), like_output)()

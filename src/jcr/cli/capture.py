@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jcr.capture.intrinsics import read_intrinsics
+from jcr.capture.options import MIN_FRAMES
 from jcr.cli.output import Output
 from jcr.errors import InputError, count_of, printable
 from jcr.estimation.arms import CHOICES, RobotName
 from jcr.files import locked
 from jcr.live.cameras import open_camera
 from jcr.live.robot import states_of
-from jcr.live.session import LEAST_IMAGES, Answer, LiveSession, SessionOptions
+from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.number_format import labelled
 
 if TYPE_CHECKING:
@@ -143,13 +144,13 @@ def _conclude(
         lines = summary(result.calibration).splitlines()
     facts |= {"result": None if result is None else str(result.out), "verdict": verdict}
     command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_sound else f"jcr check {out}"
-    if images < LEAST_IMAGES:
-        command = f"the same command resumes; {LEAST_IMAGES} or more images are needed"
+    if images < MIN_FRAMES:
+        command = f"the same command resumes; {MIN_FRAMES} or more images are needed"
     lines += [*labelled("Capture", f"{count_of(images, 'image')} in {out}"), *labelled("Next", command)]
     arguments.output.result(lines, facts)
     if arguments.session.until_accurate:
         return 0 if verdict == "accepted" and requirement_met else 3
-    return 3 if images >= LEAST_IMAGES and verdict != "accepted" else 0
+    return 3 if images >= MIN_FRAMES and verdict != "accepted" else 0
 
 
 def _print(text: str) -> None:

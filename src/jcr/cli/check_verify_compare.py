@@ -117,9 +117,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     lines = [f"{verdict}: {outcome}. {about}"]
     if isinstance(capture, Capture) and capture.candidates:
         readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
-        lines += labelled(
-            "Poses", readings, "leave out --poses-only, or name the reading (--pose-convention)"
-        )
+        lines += labelled("Poses", readings, "leave out --poses-only or name the reading (--pose-convention)")
     elif isinstance(capture, Capture) and capture.reading is not None:
         lines += labelled("Poses", decision_in_words(capture.reading))
     if isinstance(capture, Capture) and capture.others:
@@ -328,9 +326,7 @@ class VerifyCommand:
         if self.check_poses:
             return self._print_poses()
         if not self.captures:
-            raise InputError(
-                "verify: no captures; name one or more with new images of the scene, or --check-poses"
-            )
+            raise InputError("verify: no captures; name those with new images of the scene, or --check-poses")
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
             captures = read_captures(self.captures, self.read, Path(scratch), progress)
             if self.new_scene:

@@ -25,8 +25,8 @@ from jcr.progress import progress_bars
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
-_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
-PRINTED = 10
+_CSV_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
+PRINTED_POINTS = 10
 """Number of points whose answers are printed; those of all are in the file."""
 _FORMATS = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d,%.5f"
 
@@ -165,7 +165,7 @@ class QueryCommand:
             answers |= {"margin_95_m": scene.margin_95, "look_std_m": scene.uncertainty.look_std_m}
             summary += f"; surface within {1e3 * scene.margin_95:.1f} mm of the map on the free side (95 %)"
         if self.output.json:
-            for name, column in zip(_COLUMNS.split(","), columns, strict=True):
+            for name, column in zip(_CSV_COLUMNS.split(","), columns, strict=True):
                 rounded = column.astype(float).round(6) if column.dtype.kind == "f" else column
                 # JSON has no NaN.
                 answers[name] = [None if value != value else value for value in rounded.tolist()]
@@ -174,12 +174,12 @@ class QueryCommand:
             if path.suffix != ".csv":
                 raise InputError(f"{path}: answers are written as .csv")
             lines = (_FORMATS % row for row in zip(*(column.tolist() for column in columns), strict=True))
-            write_text(path, "\n".join([_COLUMNS, *lines]) + "\n")
+            write_text(path, "\n".join([_CSV_COLUMNS, *lines]) + "\n")
             summary = f"wrote {path}: {summary}"
         values = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy, sample.label))
         distance, std, occupancy, label = values
         few = zip(x_in_base, distance, std, occupancy, label, strict=True)
-        lines = [summary, *(_answer(*one, scene.label_names) for one in islice(few, PRINTED))]
+        lines = [summary, *(_answer(*one, scene.label_names) for one in islice(few, PRINTED_POINTS))]
         self.output.result(lines, answers)
         return 0
 

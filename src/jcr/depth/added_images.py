@@ -16,11 +16,11 @@ from jcr.records import MATCHED, NO_DEPTH, Capture, Intrinsics, Pointmaps, Recon
 
 NEIGHBOURS = 6
 """Largest number of images that a new image is compared with; at most half of these are new as well."""
-REACH = 1.5
+RANGE_FACTOR = 1.5
 """Factor by which the searched range of inverse depth is widened: a new object may be taller than all others."""
-CONTRADICTION = 0.015
+NEARER_BY = 0.015
 """Relative difference of depth from which one surface counts as nearer than another, above depth and pose noise."""
-LEAST_SHARE = 0.005
+LEAST_NEW_SHARE = 0.005
 """Least share of a new image's pixels that must get a depth; with less, the image is taken to show another scene."""
 
 
@@ -61,12 +61,12 @@ def extend(
         neighbours.append(np.concatenate([latest, others[others < old][: NEIGHBOURS - len(latest)]]))
     planes = sweep_planes(tracks, cameras)
     middle = planes.mean(1, keepdims=True)
-    planes = middle + REACH * (planes - middle)
+    planes = middle + RANGE_FACTOR * (planes - middle)
     found = dense_pointmaps(colors, cameras, pinhole, neighbours, planes, report, before=dense).of_rows(
         np.arange(old, old + new)
     )
     for name, confidence in zip(added.images, found.confidence, strict=True):
-        if (confidence > 0).mean() < LEAST_SHARE:
+        if (confidence > 0).mean() < LEAST_NEW_SHARE:
             raise InputError(
                 f"{added.folder / name}: no depth can be found in it; its pose may be wrong, or it shows nothing "
                 "that other images show"
@@ -131,7 +131,7 @@ def _contradicted(
         nearest = np.where(known[other], depth, np.inf).astype(np.float32)
         nearest = np.where(known[other], cv2.erode(nearest, np.ones((5, 5), np.uint8)), 0.0)
         u, v, z, inside = _pixels(apply(other_from_recon, points_in_recon[row][known[row]]), pinhole)
-        return v, u, inside & (z < (1 - CONTRADICTION) * nearest[v, u])
+        return v, u, inside & (z < (1 - NEARER_BY) * nearest[v, u])
 
     # The later view sees through the point: its surface lies behind the point, at all pixels around.
     gone = np.zeros(known[earlier].shape, bool)

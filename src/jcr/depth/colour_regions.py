@@ -12,11 +12,11 @@ from jcr.numba_compile import compiled, inlined
 
 SCALE = 0.35
 """Constant k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1; it grows with the regions' size."""
-SMALLEST = 12
+SMALLEST_REGION = 12
 """Least number of pixels of a region; smaller ones are merged with the neighbour of most similar colour."""
 TRIALS = 60
 """Number of RANSAC trials for the plane of a region."""
-FEWEST_MATCHED = 12
+FEWEST_OF_REGION = 12
 """Least number of matched pixels from which a region's plane is fitted."""
 SAMPLED = 400
 """Approximate largest number of matched pixels of a region among which RANSAC counts inliers."""
@@ -67,7 +67,7 @@ def _join(first, second, weight, parent, size, inner):
             if a == b:
                 continue
             if small == 1:
-                join = size[a] < SMALLEST or size[b] < SMALLEST
+                join = size[a] < SMALLEST_REGION or size[b] < SMALLEST_REGION
             else:
                 join = weight[e] <= min(inner[a] + SCALE / size[a], inner[b] + SCALE / size[b])
             if join:
@@ -115,9 +115,9 @@ def region_planes(
     """
     pixel = np.stack(np.nonzero(label >= 0)[::-1], -1).astype(float)
     fixed = np.bincount(label[matched], minlength=count)
-    chosen = np.flatnonzero(matched & (fixed >= FEWEST_MATCHED)[label])
+    chosen = np.flatnonzero(matched & (fixed >= FEWEST_OF_REGION)[label])
     chosen = chosen[np.argsort(label.ravel()[chosen], kind="stable")]
-    regions = np.flatnonzero(fixed >= FEWEST_MATCHED)
+    regions = np.flatnonzero(fixed >= FEWEST_OF_REGION)
     size, n = fixed[regions], len(regions)
     start, of = np.cumsum(size) - size, np.repeat(np.arange(n), size)
     ray, depth = rays.reshape(-1, 3)[chosen], inverse_depth.ravel()[chosen].astype(float)
@@ -144,7 +144,7 @@ def region_planes(
     number, mean, covariance = _moments(of[carries], pixel[chosen[carries]], n)
     whole = _moments(label.ravel(), pixel, count)[2][regions]
     narrow, wide = (np.linalg.eigvalsh(one)[:, 0] for one in (covariance, whole))
-    good = (on | fitted) & (number >= FEWEST_MATCHED) & (narrow >= SPREAD * wide)
+    good = (on | fitted) & (number >= FEWEST_OF_REGION) & (narrow >= SPREAD * wide)
     kept = regions[good]
     found.plane[kept], found.is_support[kept], found.inliers[kept] = best[good], on[good], number[good]
     found.std[kept] = np.sqrt(np.bincount(of[carries], off[carries] ** 2, n)[good] / number[good])

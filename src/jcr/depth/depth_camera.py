@@ -13,7 +13,7 @@ from jcr.records import MATCHED, PRIOR, Capture, DepthCheck, Reconstruction
 
 TOO_WRONG = 20.0
 """Largest error of scale of the depth images, percent; a larger one means another unit or images of another camera."""
-AGREES = 3.0
+AGREEING_SIGMAS = 3.0
 """Number of standard deviations up to which matched and measured depth count as the same surface."""
 SLOPE = 0.05
 """Relative difference of depth between neighbouring pixels above which a pixel mixes the two surfaces at an edge."""
@@ -62,7 +62,7 @@ def with_measured_depth(
         there = scale * apply(inverse(recon_from_camera), points[k].astype(float))[..., 2]
         matched = known[k] & (reason[k] != PRIOR)
         of_matched = np.where(std[k] > 0, scale * std[k].astype(float), UNSTATED_STD * there)
-        agrees = inside & matched & (np.abs(z - there) < AGREES * np.hypot(sigma, of_matched))
+        agrees = inside & matched & (np.abs(z - there) < AGREEING_SIGMAS * np.hypot(sigma, of_matched))
         against += int((inside & matched & ~agrees).sum())
         both += int((inside & matched).sum())
         share = np.where(agrees, sigma**2 / (sigma**2 + of_matched**2), 0.0)

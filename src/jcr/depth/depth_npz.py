@@ -14,10 +14,10 @@ from jcr.geometry import apply, inverse
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction
 from jcr.records.reconstruction_npz import read_npz, require_shapes, write_npz
 
-FILE = "depth.npz"
+DEPTH_FILE = "depth.npz"
 FORMAT = "jcr.depth/3"
 """Version of the format; a file of another version is rejected."""
-GREY = 128
+MISSING_COLOUR = 128
 """Grey value that replaces the colours where the images are no longer available."""
 
 
@@ -68,7 +68,7 @@ def read_depth(path: Path, reconstruction: Reconstruction, capture: Capture | No
             raise ValueError("a depth, its standard deviation or its confidence is negative")
         matched, filled = (np.unpackbits(file[k], count=int(np.prod(shape))) for k in ("matched", "filled"))
         if capture is None:
-            colors = np.full((*shape, 3), GREY, np.uint8)
+            colors = np.full((*shape, 3), MISSING_COLOUR, np.uint8)
         else:
             names = [capture.images[row] for row in reconstruction.image_index]
             colors = undistorted(capture.folder, names, reconstruction.intrinsics, pinhole)

@@ -17,12 +17,12 @@ from jcr.depth.support_plane import support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
-LEAST_CORRELATION = 0.3
+USABLE_CORRELATION = 0.3
 """Least correlation with the best neighbours for a depth to be used."""
 AGREEMENT = (0.01, 0.005, 0.003, 0.003)
 """Largest relative difference of two depths of one point that are averaged, one per round. On simulated views the
 rounds halve the median error and the share of gross errors."""
-FEWEST_MATCHED = 300
+FEWEST_OF_SCENE = 300
 """Least number of matched pixels of all images together from which planes are fitted."""
 EVERY = 20
 """Step between the matched pixels of an image that the fit of the support plane uses."""
@@ -66,7 +66,7 @@ def fused_depth(
     """
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(others) < 3 else 2 for others in neighbours])[:, None, None]
-    known = score >= LEAST_CORRELATION
+    known = score >= USABLE_CORRELATION
     with ThreadPoolExecutor(threads) as pool:
         check = partial(_checked, pool, views, pinhole)
         consistent, count, through, information = known, *[np.zeros(0)] * 3
@@ -77,7 +77,7 @@ def fused_depth(
         matched = consistent if changing else consistent & (count > 2 * through)
         std = MATCHING_STD_PX / np.sqrt(np.maximum(information, 1e-12)) / inverse_depth
         confidence = np.minimum(score, 1) * count
-        if not priors or matched.sum() < FEWEST_MATCHED:
+        if not priors or matched.sum() < FEWEST_OF_SCENE:
             return _chosen(inverse_depth, [matched], [confidence], [MATCHED], [std])
         plane = _priors(pool, colors, inverse_depth, matched, views, recon_from_camera, pinhole)
         report(0.8)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.depth.colour_regions import FEWEST_MATCHED, colour_regions, region_planes
+from jcr.depth.colour_regions import FEWEST_OF_REGION, colour_regions, region_planes
 from jcr.depth.consistency import colours_agree
 from jcr.depth.patch_match_stereo import Relative, grid
 from jcr.records import Intrinsics
@@ -22,7 +22,7 @@ ON_PLANE = 0.006
 """Largest relative difference of inverse depth at which a matched pixel counts as lying on a plane."""
 SAME_COLOUR = 0.1
 """Distance of colours (RGB, 0 to 1, exposure and vignetting compensated) below which two pixels may show one point."""
-FARTHEST = 3.5
+CONTINUED_SIGMAS = 3.5
 """Distance up to which a plane is continued, in standard deviations of the positions of its supporting pixels. The
 support plane is continued without limit."""
 CARRIED = 0.5
@@ -34,7 +34,7 @@ OFF_PLANE = 0.015
 """Relative difference of inverse depth from which a matched pixel off such a plane counts as wrong."""
 FEWEST_VIEWS = 2
 """Least number of other images that must show a point in its colour."""
-PATCH = 0.02
+LARGEST_PATCH = 0.02
 """Largest region without a plane of its own that may take the support plane, as a share of the image."""
 WHOLE = 0.8
 """Least share of such a region's pixels at which the support plane must be confirmed; an object standing on the plane
@@ -145,13 +145,13 @@ def planar_prior(
     away = np.sqrt(np.maximum(uu[label] * u * u + 2 * uv[label] * u * v + vv[label] * v * v, 0))
     # Shadows and prints on the support plane are small regions without a plane of their own.
     size = np.bincount(label.ravel(), minlength=count)
-    lonely = _beside(label, found.is_support) & (found.inliers == 0) & (found.matched < FEWEST_MATCHED)
-    lonely &= size < PATCH * label.size
+    lonely = _beside(label, found.is_support) & (found.inliers == 0) & (found.matched < FEWEST_OF_REGION)
+    lonely &= size < LARGEST_PATCH * label.size
     found.plane[lonely] = plane
     predicted = np.einsum("hwi,hwi->hw", found.plane[label], ray).astype(np.float32)
     carried = (found.inliers > 0) & (found.inliers >= CARRIED * found.matched)
     on_support, whole = found.is_support[label], (found.is_support | lonely)[label]
-    near = whole | (away < FARTHEST)
+    near = whole | (away < CONTINUED_SIGMAS)
     asked = (carried | lonely)[label] & (predicted > 0) & near
     points = np.where(asked, predicted, np.float32(0))
     counts = np.zeros((3, *label.shape), np.float32)

@@ -27,7 +27,7 @@ MARGIN = REACH * STRIDE
 PAD = 12
 """Pixels by which images are padded, so that windows at their borders need no check."""
 
-NOISE = 3.0
+PIXEL_NOISE = 3.0
 """Standard deviation of pixel noise, in the sum of three colours (each 0 to 255): where the texture is no stronger, the
 correlation tends to 0."""
 COLOR_SIGMA = 25.5
@@ -99,7 +99,7 @@ def _write_windows(typing, rows, image, v, block):
         taps = [(weight * per_total, grey) for weight, grey in taps]
         mean = functools.reduce(Lanes.__add__, (weight * grey for weight, grey in taps))
         variance = functools.reduce(Lanes.__add__, (w * (g - mean) * (g - mean) for w, g in taps))
-        per_spread = (variance + NOISE * NOISE).root().inverted()
+        per_spread = (variance + PIXEL_NOISE * PIXEL_NOISE).root().inverted()
         blocks = cgutils.unpack_tuple(builder, out.shape, 5)[1]
         first = builder.mul(builder.add(builder.mul(given[2], blocks), given[3]), LONG(2 * TAPS * LANES))
         numbers = [n for weight, grey in taps for n in (weight, weight * (grey - mean) * per_spread)]
@@ -198,4 +198,4 @@ def _correlation(image: Any, width: Lanes, window: list[Lanes], weights: list[La
             weighted = tap[0] * grey
             mean, square, product = mean + weighted, square + weighted * grey, product + tap[1] * grey
     variance = square - mean * mean
-    return product / ((variance > 0.0).choose(variance, 0.0) + NOISE * NOISE).root()
+    return product / ((variance > 0.0).choose(variance, 0.0) + PIXEL_NOISE * PIXEL_NOISE).root()

@@ -160,9 +160,7 @@ class ExportedRun:
         self.options, self.run, self.path, self.folders = options, RunResult(out), path, (out, *others)
         self.calibration = self.run.calibration
         if self.calibration.parent_from_camera is None:
-            raise InputError(
-                f"{out}: found no calibration to export ({self.calibration.doubt}); run it on a fixed capture"
-            )
+            raise InputError(f"{out}: no calibration to export ({self.calibration.doubt}); fix the capture")
         cameras = () if self.run.cameras is None else self.run.cameras.cameras
         self.placed = [camera for camera in cameras if camera.parent_from_camera is not None]
         """Cameras other than the calibrated one whose pose was found."""
@@ -239,7 +237,7 @@ class ExportedRun:
         length = float(np.linalg.norm(quat_xyzw))
         if not abs(length - 1) < 1e-2 or not np.isfinite([x, y, z]).all():
             raise InputError(
-                f"--root-from-optical: its quaternion has length {length:.3g}, not 1; give x y z (m) qx qy qz qw"
+                f"--root-from-optical: a quaternion of length {length:.3g}; give x y z (m) qx qy qz qw"
             )
         rotation = Rotation.from_quat(quat_xyzw).as_matrix()
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))

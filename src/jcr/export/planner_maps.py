@@ -154,9 +154,7 @@ def _voxel(scene: SceneMap, side: float | None) -> float:
     if not 0 < side <= extent.min():
         raise InputError(f"voxels of {side:g} m: give a length between 0 and {extent.min():.2f} m")
     if np.prod(extent / side) > MAX_VOXELS:
-        raise InputError(
-            f"voxels of {side:g} m: are over {MAX_VOXELS // 10**6} million in this map; take a larger size"
-        )
+        raise InputError(f"voxels of {side:g} m: over {MAX_VOXELS // 10**6} million; take a larger size")
     return side
 
 

@@ -165,7 +165,7 @@ def urdf(mount: CameraMount, others: Sequence[CameraMount] = (), options: Export
 """
 
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_XML_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _JOINT = re.compile(r"<joint\b[^>]*>.*?</joint\s*>", re.DOTALL)
 _ORIGIN = re.compile(r"<origin\b[^>]*?(?:/>|>\s*</origin\s*>)", re.DOTALL)
 
@@ -179,11 +179,9 @@ def _into_robot(file: Path, mount: CameraMount) -> str:
     try:
         text = read_bytes(file).decode()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{file}: cannot be read as UTF-8 text ({error}); name the URDF or xacro of a robot"
-        ) from None
+        raise InputError(f"{file}: not UTF-8 text ({error}); name the URDF or xacro of a robot") from None
     # Comments keep their place and length, so that places are those of the text.
-    plain = _COMMENT.sub(lambda found: " " * len(found[0]), text)
+    plain = _XML_COMMENT.sub(lambda found: " " * len(found[0]), text)
     joints = {found: _links_of(found[0]) for found in _JOINT.finditer(plain)}
     own = [found for found, (_, child) in joints.items() if child == mount.child]
     if len(own) != 1:
@@ -262,9 +260,7 @@ def camera_info(mount: CameraMount) -> str:
     Raises InputError if the intrinsics are unknown.
     """
     if (intrinsics := mount.intrinsics) is None:
-        raise InputError(
-            "no intrinsics are known, because camera poses were given without images; export another format"
-        )
+        raise InputError("no intrinsics: camera poses were given without images; export another format")
 
     def matrix(values: ndarray) -> dict[str, Any]:
         return {"rows": len(values), "cols": values.shape[1], "data": values.ravel().tolist()}

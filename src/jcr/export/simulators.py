@@ -98,9 +98,7 @@ def residual_px(camera: Intrinsics) -> tuple[float, float]:
 def _pinhole(mount: CameraMount) -> Intrinsics:
     """Return the intrinsics of a mount; raise InputError if they are unknown."""
     if mount.intrinsics is None:
-        raise InputError(
-            "no intrinsics are known, because camera poses were given without images; export urdf"
-        )
+        raise InputError("no intrinsics: camera poses were given without images; export urdf")
     return mount.intrinsics
 
 

@@ -19,7 +19,7 @@ ALL_PAIRS_UP_TO = 16
 register a camera far from all others (doosan_bench: 12 mm from its gripper with near pairs alone, 7 mm with all)."""
 PARTNERS = 8
 """Number of viewpoints that each image is paired with by the scene they share, once R_X is known."""
-WIDEST = math.radians(60)
+LARGEST_ANGLE = math.radians(60)
 """Largest angle (rad) between two viewing directions of a pair; beyond it nothing matches."""
 LEAST_COMMON = 0.25
 """Least share of the scene points in an image that the other image must see, too."""
@@ -100,7 +100,7 @@ def pairs_of_common_scene(
     share = counted @ counted.T / np.maximum(counted.sum(1), 1)[:, None]
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))
-    score = np.where((between < WIDEST) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
+    score = np.where((between < LARGEST_ANGLE) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
     return _best(score, PARTNERS, viewpoints(motion))
 
 

@@ -18,13 +18,13 @@ from jcr.features.two_view import CameraMotion
 from jcr.geometry import nearest_rotation, rotation_angle, rotation_exp, rotation_log, sine_axis
 from jcr.least_squares import minimise
 
-ROBOT_STD = math.radians(0.3)
+REPORTED_STD = math.radians(0.3)
 """Standard deviation of a reported gripper rotation, rad; an industrial arm has 0.05°, a servo arm 1°."""
 SYSTEMATIC = 0.015
 """Systematic difference of camera and gripper angle, as a share of the angle; real captures show 0.001 to 0.021."""
 SYSTEMATIC_OF_GUESS = 0.04
 """Value of SYSTEMATIC where the focal length is estimated from the gripper's angles."""
-SIGMAS = 3.0
+GATE_SIGMAS = 3.0
 LARGEST_STD = math.radians(3)
 """Largest standard deviation (rad) of a pair's rotation angle; a less certain pair neither confirms nor contradicts."""
 SURE_STD = math.radians(2.5)
@@ -85,12 +85,14 @@ class Gate:
 def agreeing_motions(pair: Pair, angle: float, systematic: float) -> list[tuple[CameraMotion, float]]:
     """Return the motions of an image pair that rotate by about `angle` (rad), each with its tolerance (rad).
 
-    `angle` is that of the gripper's motion. The tolerance is SIGMAS standard deviations of the difference of both
+    `angle` is that of the gripper's motion. The tolerance is GATE_SIGMAS standard deviations of the difference of both
     angles. `systematic` is the share of the angle by which camera and gripper may differ systematically.
     """
     found = []
     for one in pair.motions:
-        tolerance = SIGMAS * math.sqrt(one.angle_std() ** 2 + 2 * ROBOT_STD**2 + (systematic * angle) ** 2)
+        tolerance = GATE_SIGMAS * math.sqrt(
+            one.angle_std() ** 2 + 2 * REPORTED_STD**2 + (systematic * angle) ** 2
+        )
         if abs(float(rotation_angle(one.rotation)) - angle) < tolerance:
             found.append((one, tolerance))
     return found
@@ -126,10 +128,10 @@ def classify_pairs(
             gaps = _gap(of_x.rotation, motion[pair.key][None, :3, :3], camera)
             nearest, by_gripper = pair.motions[int(np.argmin(gaps))], float(angle[pair.key])
             # Variances (rad²) of the pair's rotation, of its prediction by R_X, and of the gripper's motion.
-            own, robot = np.trace(nearest.covariance[:3, :3]), 3 * max(2 * ROBOT_STD**2, of_x.sigma**2)
+            own, robot = np.trace(nearest.covariance[:3, :3]), 3 * max(2 * REPORTED_STD**2, of_x.sigma**2)
             of_mean = 4 * math.sin(min(by_gripper, math.pi) / 2) ** 2 * np.trace(of_x.covariance)
             variance = own + of_mean + robot + (systematic * by_gripper) ** 2
-            best = nearest if gaps.min() < SIGMAS * math.sqrt(variance) else None
+            best = nearest if gaps.min() < GATE_SIGMAS * math.sqrt(variance) else None
         if best is None:
             contradicted.append(pair)
         else:

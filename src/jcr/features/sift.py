@@ -19,7 +19,7 @@ from jcr.progress import Progress, steps
 
 WORKING_SIZE_PX = 1600
 """Largest long side of an image in which features are found, px; larger images are reduced to it."""
-KEYPOINTS = 2000
+SIFT_KEYPOINTS = 2000
 """Largest number of keypoints of an image, those of highest contrast."""
 CONTRAST = 0.01
 """Least contrast of a keypoint. With COLMAP's 0.02 elephant_floor has 420 an image, and 2 of its 15 images register."""
@@ -29,7 +29,7 @@ KEPT = 64
 """Number of images whose keypoints are remembered, 1 MB each: several stages ask for those of the same image."""
 _kept: dict[bytes, tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]] = {}
 """Keypoints and descriptors by the digest of the grey image, the oldest first."""
-FARTHEST = 0.7
+SIFT_DISTANCE = 0.7
 """Largest distance of the unit descriptors of a match, as in COLMAP."""
 
 
@@ -62,7 +62,7 @@ def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[
 def _detected(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
     """Return keypoints and descriptors as in `detect`, which remembers them."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=SIFT_KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -76,8 +76,8 @@ def matches(
 ) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
     """Return the matches of two images as rows of `first` and of `second` (unit descriptors).
 
-    Matches are mutual nearest neighbours that are nearer than FARTHEST and pass the ratio test (RATIO). There are none
-    if an image has fewer than two descriptors.
+    Matches are mutual nearest neighbours that are nearer than SIFT_DISTANCE and pass the ratio test (RATIO). There are
+    none if an image has fewer than two descriptors.
     """
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
@@ -88,7 +88,7 @@ def matches(
     cosine[row, best] = -1.0
     # Distances of unit vectors from their cosines.
     nearest, next_nearest = (np.sqrt(np.maximum(2 - 2 * of, 0)) for of in (largest, cosine.max(1)))
-    kept = np.flatnonzero(mutual & (nearest < FARTHEST) & (nearest < RATIO * next_nearest))
+    kept = np.flatnonzero(mutual & (nearest < SIFT_DISTANCE) & (nearest < RATIO * next_nearest))
     return kept, best[kept]
 
 
@@ -97,7 +97,7 @@ class SiftFeatures:
 
     needs_upright = False
     every_pair = 24
-    farthest = FARTHEST
+    farthest = SIFT_DISTANCE
 
     def __init__(
         self, images: Sequence[UInt8[ndarray, "h w 3"]], size: tuple[int, int], threads: int, report: Progress

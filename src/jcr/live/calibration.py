@@ -36,7 +36,7 @@ OBSERVATIONS = 300, 8000
 """Largest mean number of observations per image, and largest total, while images are taken; `finish` uses all."""
 LEAST_IMAGES_TO_REJECT = 5
 """Smallest number of images with which a missing calibration is a finding that rejects."""
-MOST_POINTS = 3000
+MOST_SHOWN = 3000
 """Largest number of points in `LiveProgress.points_in_base`."""
 
 
@@ -170,9 +170,7 @@ class LiveCalibration:
         """Hold the lock for a change of the images; raise InputError after `close`."""
         with self._lock:
             if self._is_closed:
-                raise InputError(
-                    f"{self.live.folder}: this calibration is closed; open it again to change it"
-                )
+                raise InputError(f"{self.live.folder}: the calibration is closed; open it again to change it")
             yield
 
     def _calibrated(self, capture: Capture | None, added: str | None) -> LiveProgress:
@@ -219,7 +217,7 @@ class LiveCalibration:
                 findings.append(Finding.of(kind, "warns", "poses", one.image, value=metres, rotation=radians))
         # The points shown are observed by three images or more.
         seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
-        points = tracks.points_in_recon[seen[:: max(1, len(seen) // MOST_POINTS)]]
+        points = tracks.points_in_recon[seen[:: max(1, len(seen) // MOST_SHOWN)]]
         found = strongest_first([*findings, *hand_eye.findings])
         return replace(
             state, hand_eye=hand_eye, findings=found, points_in_base=hand_eye.base_from_recon(points)

@@ -22,7 +22,7 @@ from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.records.capture_json import IntrinsicsEntry
 
-TIMEOUT_S = 10.0
+LOST_S = 10.0
 """Time without an image (s) after which a camera counts as lost."""
 REALSENSE = "realsense"
 """Prefix of a RealSense camera in `--camera`; `:SERIAL` or the file of a recording, `:FILE`, may follow."""
@@ -85,11 +85,11 @@ def _read_by(
             with arrived:
                 arrived.wait_for(
                     lambda asked=asked: is_closed.is_set() or (newest and newest[0].time_s >= asked),
-                    TIMEOUT_S,
+                    LOST_S,
                 )
                 if not newest or newest[0].time_s < asked:
                     raise InputError(
-                        f"--camera {name}: gives no more images; check its cable, and run the same command to resume"
+                        f"--camera {name}: no more images; check its cable; the same command resumes"
                     )
                 frame = newest[0]
             yield frame
@@ -102,7 +102,7 @@ def _read_by(
     finally:
         is_closed.set()
         if name is not None:
-            thread.join(TIMEOUT_S)
+            thread.join(LOST_S)
 
 
 @contextmanager
@@ -119,9 +119,7 @@ def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Ca
     is_device = source.isdecimal()
     is_file = not is_device and "://" not in source
     if Path(source).is_dir():
-        raise InputError(
-            f"--camera {source}: is a folder; jcr run calibrates images in a folder with their poses"
-        )
+        raise InputError(f"--camera {source}: is a folder; jcr run calibrates a folder of images and poses")
     if is_file and not Path(source).is_file():
         raise InputError(f"--camera {source}: no such video file; name a file, a device number or a stream")
     # OpenCV and FFmpeg would also write warnings to stderr, which add nothing to the InputError.
@@ -129,7 +127,7 @@ def open_camera(source: str, size: tuple[int, int] | None = None) -> Iterator[Ca
     with ExitStack() as stack:
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         stack.callback(cv2.utils.logging.setLogLevel, before)
-        limit_ms = int(1e3 * TIMEOUT_S)
+        limit_ms = int(1e3 * LOST_S)
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
         video = (
             cv2.VideoCapture(int(source)) if is_device else cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
@@ -240,7 +238,7 @@ def _realsense_reader(
         """Return the next frame; None if none arrives in time."""
         began = time.monotonic()
         try:
-            frames = pipeline.wait_for_frames(int(1e3 * TIMEOUT_S if not is_file else 1e3))
+            frames = pipeline.wait_for_frames(int(1e3 * LOST_S if not is_file else 1e3))
         except RuntimeError:
             return None
         stamp = frames.get_timestamp() / 1e3 if is_file else began
@@ -260,9 +258,9 @@ def _realsense_reader(
 
 # An image can be kept if it is at rest, sharp, well exposed, and different from the images at other gripper poses.
 
-REST_S = 0.2
+COMPARED_S = 0.2
 """Time (s) between two images that are compared for motion."""
-STILL = 2.5
+STILL_GREY = 2.5
 """Largest mean difference (grey levels) of two images at rest, compared at a width of GRID_PX: pixel noise of 10 levels
 gives 1.9, and a shift of a textured tabletop by one pixel in 640 gives 3."""
 GRID_PX = 160
@@ -287,7 +285,9 @@ class ImageSummary:
 
     def is_like(self, other: "ImageSummary") -> bool:
         """Test whether two images are the same view: equal size, and grey levels that differ by noise only."""
-        return self.grid.shape == other.grid.shape and bool(np.abs(self.grid - other.grid).mean() < STILL)
+        return self.grid.shape == other.grid.shape and bool(
+            np.abs(self.grid - other.grid).mean() < STILL_GREY
+        )
 
 
 def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patience_s: float) -> Frame | str:
@@ -305,7 +305,7 @@ def frame_at_rest(frames: Iterator[Frame], kept: Sequence[ImageSummary], patienc
         if frame.time_s < earlier.time_s:
             # The clock was set back, so the patience is counted from this frame.
             earlier, end = frame, frame.time_s + patience_s
-        if frame.time_s - earlier.time_s < REST_S:
+        if frame.time_s - earlier.time_s < COMPARED_S:
             continue
         now = ImageSummary.of(frame.image)
         if earlier.image.shape != frame.image.shape:

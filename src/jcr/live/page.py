@@ -22,7 +22,7 @@ from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
 
 PACKAGE = "jcr.live"
-PARTS = ("head", "images")
+TEMPLATES = ("head", "images")
 """Names of the templates of the parts that change; each part is the content of the HTML element of that name."""
 LAYERS = {
     "cameras": "cameras",
@@ -63,7 +63,7 @@ def page_parts(session: LiveSession, state: SessionState, has_report: bool) -> d
         "is_done": state.is_done,
         "has_report": has_report,
         "images": len(state.images),
-        "parts": {name: render(f"{name}.html", content, PACKAGE) for name in PARTS},
+        "parts": {name: render(f"{name}.html", content, PACKAGE) for name in TEMPLATES},
         "scene": json.dumps(_scene(state)),
     }
 

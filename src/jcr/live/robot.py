@@ -34,7 +34,7 @@ TRY_AGAIN = (1e-3, np.radians(0.2))
 """Least motion (m, rad), in place of MOVED_ON, after an image that was refused."""
 BY_COUNT = {6: "rotvec", 7: "quat:xyzw", 16: "matrix"}
 """Pose convention by the number of numbers."""
-KINDS = ("ur", "franka", "xarm")
+ARM_KINDS = ("ur", "franka", "xarm")
 """Kinds of arms whose controllers can be read."""
 Action = Literal["take", "retake", "remove", "undo", "finish"]
 """Command of the live page."""
@@ -109,9 +109,7 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
         if not (np.abs(matrix[3] - (0, 0, 0, 1)) < UNIT_TOLERANCE).all():
             raise InputError(f"{where}: the last row is not 0 0 0 1; give the matrix by rows")
     if (far_m := float(np.linalg.norm(position))) > METRES_LIMIT:
-        raise InputError(
-            f"{where}: the gripper is {far_m:.4g} m from the base; these look like millimetres: give metres"
-        )
+        raise InputError(f"{where}: {far_m:.4g} m from the base; these look like millimetres: give metres")
     if len(numbers) == 6 and (largest := float(np.abs(rotation).max())) > RADIANS_LIMIT:
         raise InputError(f"{where}: an angle of {largest:.4g} rad; these look like degrees: give radians")
     pose = poses_of(position[None], rotation[None], named)[0]
@@ -123,7 +121,7 @@ def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:
 def states_of(source: str) -> States | None:
     """Return the state reader of an arm, named ur:HOST[:PORT], franka:HOST or xarm:HOST; None for other sources."""
     kind, _, address = source.partition(":")
-    if kind not in KINDS or not address:
+    if kind not in ARM_KINDS or not address:
         return None
     if kind == "ur":
         host, _, number = address.rpartition(":") if ":" in address else (address, "", str(UR_PORT))
@@ -149,9 +147,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
             while head := stream.read(4):
                 length = int.from_bytes(head) if len(head) == 4 else 0
                 if length not in UR_TOOL:
-                    raise InputError(
-                        f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or 30013"
-                    )
+                    raise InputError(f"{where}: {length} bytes: no packet of a UR; use port 30003 or 30013")
                 if len(packet := head + stream.read(length - 4)) < length:
                     break
                 (time_s,) = struct.unpack_from("!d", packet, 4)
@@ -161,9 +157,7 @@ def ur_states(host: str, port: int) -> Iterator[RobotState]:
                 plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
                 yield RobotState(time_s, pose_of_numbers(list(tool), where), plausible)
     except TimeoutError:
-        raise InputError(
-            f"{where}: silent for {UR_TIMEOUT_S:.0f} s; is the robot on, and the address right?"
-        ) from None
+        raise InputError(f"{where}: silent for {UR_TIMEOUT_S:.0f} s; check the robot and address") from None
     except OSError as error:
         raise InputError(f"{where}: {error}; check the address, and that the robot is on") from None
     raise InputError(f"{where}: the robot closed the connection; is another program using the port?")
@@ -213,7 +207,7 @@ def xarm_states(host: str) -> Iterator[RobotState]:
             wrong, angles = arm.get_servo_angle(is_radian=True)
             if code or wrong:
                 raise InputError(
-                    f"{where}: the arm answers with code {code or wrong}; see UFACTORY Studio; the same command resumes"
+                    f"{where}: code {code or wrong} of UFACTORY Studio; the same command resumes"
                 )
             base_from_gripper = pose_of_numbers([*np.divide(pose[:3], 1e3), *pose[3:]], where)
             joints = np.array(angles[: arm.axis], dtype=np.float64)

@@ -30,7 +30,7 @@ from jcr.live.robot import Action, RobotState, pose_of_numbers
 from jcr.live.session import LiveSession
 
 LOOPBACK = "127.0.0.1"
-TIMEOUT_S = 10.0
+REQUEST_S = 10.0
 """Time (s) within which a request must be complete."""
 MAX_COMMAND, MAX_SAMPLE = 1000, 65_536
 """Largest bodies (bytes) of a command and of a sample."""
@@ -128,7 +128,7 @@ class LiveServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     """Handler of one HTTP request to a LiveServer."""
 
-    timeout = TIMEOUT_S
+    timeout = REQUEST_S
     server_version, sys_version = "jcr", ""
     server: LiveServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -319,13 +319,9 @@ def sample_pose(body: bytes) -> Float[ndarray, "4 4"] | None:
             return None
         message = message.get("base_from_gripper")
     if not isinstance(message, list):
-        raise InputError(
-            'no "base_from_gripper" in the body; send 4 rows of 4 numbers, or 6, 7 or 16 numbers'
-        )
+        raise InputError('no "base_from_gripper" in the body; send 4 rows of 4, or 6, 7 or 16 numbers')
     try:
         numbers = np.array(message, dtype=np.float64).ravel().tolist()
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            "base_from_gripper: not numbers; send 4 rows of 4 numbers, or 6, 7 or 16 numbers"
-        ) from None
+        raise InputError("base_from_gripper: not numbers; send 4 rows of 4, or 6, 7 or 16 numbers") from None
     return pose_of_numbers(numbers, "base_from_gripper")

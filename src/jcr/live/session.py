@@ -15,8 +15,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.options import GRASPING, RequiredAccuracy
+from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError, RejectedError
-from jcr.live.cameras import REST_S, Camera, Frame, frame_at_rest
+from jcr.live.cameras import COMPARED_S, Camera, Frame, frame_at_rest
 from jcr.live.progress import LiveProgress, progress_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_json import FrameEntry
@@ -25,12 +26,10 @@ if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
     from jcr.result import RunResult
 
-SAME_PLACE = (0.005, np.radians(1.0))
+SAME_VIEW_AS = (0.005, np.radians(1.0))
 """Smallest difference (m, rad) between the gripper poses of two images; a closer image would add no information."""
 ENOUGH_IMAGES, MOST_IMAGES = 12, 40
 """Default largest number of images: of a capture, and of one with --until-accurate."""
-LEAST_IMAGES = 3
-"""Smallest number of images from which a calibration is computed."""
 LONGEST_S, INTERRUPTED_S = 60.0, 10.0
 """Longest wait (s) for the calibration of the last images: at the end of a capture, and after an interruption."""
 
@@ -243,7 +242,7 @@ class LiveSession:
 
     def finish(self, calibrates: bool = True) -> "RunResult | None":
         """Calibrate all images, if `calibrates`, and return the result; None with fewer than three, or if it failed."""
-        if calibrates and self.state.result is None and len(self.folder.names) >= LEAST_IMAGES:
+        if calibrates and self.state.result is None and len(self.folder.names) >= MIN_FRAMES:
             self._show(f"calibrating all {len(self.folder.names)} images", is_over=True)
             try:
                 self._show(result=self.calibration.finish())
@@ -256,7 +255,7 @@ class LiveSession:
         """Return a frame taken while the gripper rests at this pose (4,4); raise InputError if none can be kept."""
         images = [one for one in self.folder.images if one.image != self.state.replaces]
         for one in images:
-            if not is_farther(one.base_from_gripper, base_from_gripper, SAME_PLACE):
+            if not is_farther(one.base_from_gripper, base_from_gripper, SAME_VIEW_AS):
                 raise InputError(f"the gripper is where {one.image} was taken; move to another pose")
         kept = [self.folder.summary(one.image) for one in images]
         try:
@@ -264,7 +263,7 @@ class LiveSession:
         except StopIteration:
             self.end()
             raise InputError(
-                f"the video has ended; an image needs two equal frames {REST_S:g} s apart (jcr docs capture)"
+                f"the video has ended; an image needs two equal frames {COMPARED_S:g} s apart (jcr docs capture)"
             ) from None
         except InputError as error:
             self.end(error)

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.options import MIN_FRAMES
 from jcr.errors import RejectedError, count_of
 from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, rotation_log, transform
 
 Poses = Float[ndarray, "n 4 4"]
 SCALES = np.linspace(1.0, 4.0, 20_000)
 """Values of λ that the authors' code tries; a scale outside of them is not found."""
-LEAST_IMAGES = 3  # two motions about different axes determine the rotation
 
 
 def motions(a_from_b: Poses) -> Float[ndarray, "n-1 4 4"]:
@@ -62,9 +62,9 @@ def solve(
     `scales` None solves for λ; SCALES is the search of the paper. Raises RejectedError with fewer than three poses, and
     where the result is no transform or no positive scale.
     """
-    if len(base_from_gripper) < LEAST_IMAGES:
+    if len(base_from_gripper) < MIN_FRAMES:
         raise RejectedError(
-            f"{count_of(len(base_from_gripper), 'image')} have a camera pose, the published solver needs {LEAST_IMAGES}",
+            f"{count_of(len(base_from_gripper), 'image')} have a camera pose, the published solver needs {MIN_FRAMES}",
             "overlap the views more",
         )
     a, b = motions(base_from_gripper), motions(recon_from_camera)
@@ -72,7 +72,5 @@ def solve(
     translation, scale = translation_and_scale(a, b, rotation, scales)
     x = transform(rotation, translation)
     if not (np.isfinite(x).all() and 0 < scale < np.inf):
-        raise RejectedError(
-            f"the published solver diverged: its scale is {scale:.3g}", "rotate the wrist more"
-        )
+        raise RejectedError(f"the published solver diverged: scale {scale:.3g}", "rotate the wrist more")
     return x, scale

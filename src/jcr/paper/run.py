@@ -9,12 +9,13 @@ import pycolmap
 
 from jcr.backends import ReconstructOptions, candidates, device_of, network_weights, ready_backend
 from jcr.calibration.record import PublishedCalibration
+from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.pose_equations import paper_residuals
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, scale_translation
 from jcr.paper.alignment import align
-from jcr.paper.hand_eye import LEAST_IMAGES, solve
+from jcr.paper.hand_eye import solve
 from jcr.pointmaps.dust3r.dust3r import predict_capture
 from jcr.pointmaps.pair_predictions import complete_pairs, read_arrays
 from jcr.pointmaps.posed_pointmaps import PosedPointmaps
@@ -83,7 +84,7 @@ def reconstruct_baseline(capture: Capture, seed: int = 0) -> Reconstruction:
         pycolmap.match_exhaustive(database, device=cpu)
         models = pycolmap.incremental_mapping(database, capture.folder, folder, options).values()
         most = max((model.num_reg_images() for model in models), default=0)
-        if most < LEAST_IMAGES:
+        if most < MIN_FRAMES:
             words = f"COLMAP by its defaults registered {most} of {len(capture)} images"
             raise RejectedError(words, "overlap the views more, or use --backend dust3r")
         next(model for model in models if model.num_reg_images() == most).write(folder)

@@ -35,9 +35,9 @@ from jcr.photometric.coarse_to_fine import (
     free_directions,
     tied_directions,
 )
-from jcr.photometric.hand_eye_search import SIZES, search
+from jcr.photometric.hand_eye_search import HEIGHTS, search
 from jcr.photometric.residuals import (
-    FAINT,
+    LEAST_CONTRAST,
     Cameras,
     Level,
     Points,
@@ -64,9 +64,9 @@ LEAST_GAIN = 0.05
 """Largest log gain of any image at which all gains are ignored: shading and gloss have the same effect."""
 LEAST_AGREED = 0.25
 """Least share of the points whose colour the views agree on after the finest stage."""
-LEAST_POINTS = 100
+LEAST_COMPARED = 100
 """Least denominator of the share that is compared with LEAST_AGREED, so that a few points cannot reach it."""
-LEAST_SHARE = 0.4
+LEAST_CONFIRMED = 0.4
 """Least share of the other images' points that an image must confirm, relative to the median image. Images with wrong
 poses have 0.1 to 0.25; images of a robot that is off by 5 mm and 1° have 0.8."""
 REGION = 0.05
@@ -105,7 +105,7 @@ def reconstruct_direct(capture: Capture, progress: Progress = silent) -> Reconst
     level = levels[FINEST.height]
     cameras, points = align_photometrically(level, cameras, FINEST, free_directions(cameras, known))
     progress("direct alignment", 1.0)
-    if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
+    if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_COMPARED)) < LEAST_AGREED:
         raise RejectedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few",
             "take images that overlap more, of a scene that does not move or shine",
@@ -133,7 +133,7 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
     The brightness of two images is compared at points of one that the other shows within twice BEFORE_GAINS.sigma. The
     logs of the factors have mean 0.
     """
-    factor, dark, images = np.ones(level.count), 10 * FAINT, np.arange(level.count)
+    factor, dark, images = np.ones(level.count), 10 * LEAST_CONTRAST, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
         _, points = align_photometrically(even, cameras, BEFORE_GAINS, np.zeros((7, 0)))
@@ -159,7 +159,7 @@ def images_that_fit(
     """Return the rows of the images that fit together, and their cameras, moved as one to fit these images alone.
 
     The measure is the share of the points of other images that an image shows in the same colour. An image with less
-    than LEAST_SHARE of the median share, even with a free camera, has a wrong pose or shows another scene. Raises
+    than LEAST_CONFIRMED of the median share, even with a free camera, has a wrong pose or shows another scene. Raises
     RejectedError where fewer than three images are left.
     """
     rows = np.arange(level.count)
@@ -171,7 +171,7 @@ def images_that_fit(
         _, u, v, seen = in_view(level, alone, points)
         shows = seen & (squared_misfit(level, points, u, v) < FREED[0].sigma ** 2)
         share = shows.sum(1) / np.maximum(seen.sum(1), 1)
-        fits = share > LEAST_SHARE * np.median(share)
+        fits = share > LEAST_CONFIRMED * np.median(share)
         if fits.all():
             return rows, cameras
         if fits.sum() < 3:
@@ -188,7 +188,7 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -
     width, height = intrinsics.width, intrinsics.height
     grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
     stack = np.stack(list(map(undistortion(intrinsics, grid), images))).astype(np.float32) / 255
-    heights = {*SIZES, *(stage.height for stage in FREED), FINEST.height}
+    heights = {*HEIGHTS, *(stage.height for stage in FREED), FINEST.height}
     return {height: make_level(stack, grid, height) for height in heights}
 
 

@@ -35,7 +35,7 @@ images)."""
 COARSEST = PyramidLevel(15, 150, 3, 0.2)
 COARSE = PyramidLevel(30, 100, 8, 0.15)
 JUDGE = PyramidLevel(60, 100, 1, 0.12)
-SIZES = (COARSEST.height, COARSE.height, JUDGE.height)
+HEIGHTS = (COARSEST.height, COARSE.height, JUDGE.height)
 
 
 def search(
@@ -46,7 +46,7 @@ def search(
 ) -> Cameras:
     """Return the cameras (gripper poses times one hand-eye transform) for which the images agree best in colour.
 
-    `levels` are the images by their height in pixels (those of SIZES); the focal length changes unless the intrinsics
+    `levels` are the images by their height in pixels (those of HEIGHTS); the focal length changes unless the intrinsics
     are known. Raises RejectedError where a different hand-eye transform fits as well, or where the images have no
     edges.
     """

@@ -21,9 +21,9 @@ BLUR_PX = 1.0
 """Standard deviation, px, of the blur of every level, which turns an edge into a slope for linear steps."""
 SEEN_BY = 0.6
 """Share of the other images, those of least cost, that the cost of a depth counts; others may not see the point."""
-NEAREST = 0.05
+LEAST_DEPTH = 0.05
 """Least depth of a point in front of a camera, m."""
-FAINT = 2.0 / 255
+LEAST_CONTRAST = 2.0 / 255
 """Change of colour (0 to 1) per pixel below which a pixel has too little contrast to be located."""
 _BORDER_PX = 2
 _KEEP_DEPTH = 1e-3
@@ -125,7 +125,7 @@ def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[
     """Return image row and pixel (u, v) of k strong edges, at most `per_image` in each image.
 
     Each is the pixel of the largest change of colour in a square block. The blocks with the largest changes are taken;
-    changes below FAINT per pixel are left out.
+    changes below LEAST_CONTRAST per pixel are left out.
     """
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
@@ -137,7 +137,7 @@ def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[
     blocks = blocks.swapaxes(2, 3).reshape(n, rows * columns, block * block)
     inside, best = blocks.argmax(-1), blocks.max(-1)
     cell = np.argsort(-best, axis=1, kind="stable")[:, :per_image]
-    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > FAINT**2)
+    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > LEAST_CONTRAST**2)
     cell = cell[host, rank]
     inside = inside[host, cell]
     u, v = cell % columns * block + inside % block, cell // columns * block + inside // block
@@ -210,10 +210,10 @@ def in_view(
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
     x += camera_from_base[:, None, :3, 3]
-    # Depths below NEAREST are clipped before projection.
-    ahead = np.concatenate([x[..., :2], np.maximum(x[..., 2:], np.float32(NEAREST))], -1)
+    # Depths below LEAST_DEPTH are clipped before projection.
+    ahead = np.concatenate([x[..., :2], np.maximum(x[..., 2:], np.float32(LEAST_DEPTH))], -1)
     u, v = np.moveaxis(project(zoomed(level.grid, cameras.zoom), ahead), -1, 0)
-    seen = (x[..., 2] > NEAREST) & (u >= 0) & (u <= level.grid.width - 1)
+    seen = (x[..., 2] > LEAST_DEPTH) & (u >= 0) & (u <= level.grid.width - 1)
     seen &= (v >= 0) & (v <= level.grid.height - 1)
     seen[points.host, np.arange(len(points.host))] = False
     return x, u, v, seen
@@ -320,7 +320,7 @@ def _linearised(
         moves[..., 12:] = other_from_host @ arms
         # camera.by_point of a pinhole, times `moves`: 0.27 instead of 0.47 ms for 500 points in 15 images, without its
         # zeros and the many small products.
-        z = np.maximum(x[..., 2:], np.float32(NEAREST))
+        z = np.maximum(x[..., 2:], np.float32(LEAST_DEPTH))
         shift_u = (moves[..., 0, :] - x[..., :1] / z * moves[..., 2, :]) / z
         shift_v = (moves[..., 1, :] - x[..., 1:2] / z * moves[..., 2, :]) / z
         shift_u *= np.float32(level.grid.fx * cameras.zoom)

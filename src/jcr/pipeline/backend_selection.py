@@ -33,7 +33,7 @@ HELPS: tuple[Concerns, ...] = ("reconstruction", "images")
 TEXTURED = 50
 """Observations per image above which images have enough SIFT features. SIFT finds 600 to 850 in simulated tabletops of
 640x480, 220 in those of half the size, and 90 if all are blurred by 9 px."""
-NEARLY_ALL = 0.9
+SIFT_SUFFICES = 0.9
 """Share of the capture's images that SIFT must register so that other features are not tried."""
 
 
@@ -232,7 +232,7 @@ def _why_untried(
     textured = [one for one in trials if one.is_textured(images)]
     if options.backend == "colmap":
         seen = [0 if one.reconstruction is None else len(one.reconstruction.image_index) for one in textured]
-        if max(seen, default=0) >= NEARLY_ALL * images:
+        if max(seen, default=0) >= SIFT_SUFFICES * images:
             plenty = "no features but SIFT's were tried: there are plenty, and they register"
             return f"{plenty} {max(seen)} of {images} images", True
     if textured and not BACKENDS[options.backend].tests_camera:

@@ -67,9 +67,7 @@ class NewImages:
         ]
         for name, image in zip(names, pixels, strict=True):
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-                raise InputError(
-                    f"{name}: {image.dtype} of shape {image.shape}; give RGB, (h, w, 3) of uint8"
-                )
+                raise InputError(f"{name}: {image.dtype} of shape {image.shape}; give RGB (h, w, 3) of uint8")
         poses = np.asarray(base_from_gripper, np.float64)
         angles = None if joints is None else np.asarray(joints, np.float64)
         if (
@@ -78,7 +76,7 @@ class NewImages:
             or (angles is not None and len(angles) != len(pixels))
         ):
             raise InputError(
-                f"{count_of(len(pixels), 'image')} with poses of shape {poses.shape}; give (n, 4, 4) for n images"
+                f"{count_of(len(pixels), 'image')} , poses of shape {poses.shape}; give (n, 4, 4)"
             )
         for name, pose in zip(names, poses, strict=True):
             require_rigid(pose, f"base_from_gripper of {name}")
@@ -105,7 +103,7 @@ def new_images(new: Capture, camera: CellCamera | None = None) -> NewImages:
 def name_of(capture: Capture) -> str:
     """Return the name of a capture: that of its folder, or of the recording from which it was made."""
     path = capture.source or origin(capture.folder)
-    return (path if path.is_dir() or path.suffix in bag.SUFFIXES else path.parent).absolute().name
+    return (path if path.is_dir() or path.suffix in bag.BAG_SUFFIXES else path.parent).absolute().name
 
 
 def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages) -> None:
@@ -119,9 +117,7 @@ def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages
             )
         for before, other in zip(then.images, old, strict=True):
             if np.array_equal(image, other):
-                raise InputError(
-                    f"{name}: equals {before}, an image of the calibration, and cannot test it; take a new image"
-                )
+                raise InputError(f"{name}: equals image {before} of the calibration; take a new image")
 
 
 @lru_cache(maxsize=2)

@@ -15,7 +15,7 @@ from jcr.calibration.checks.convention import BETTER, FITTED, of_camera
 from jcr.capture.checks import require_frames, require_motion
 from jcr.capture.folder import count_differs
 from jcr.capture.options import tolerated
-from jcr.capture.pairing import FARTHEST, other_orders
+from jcr.capture.pairing import LARGEST_SHIFT, other_orders
 from jcr.capture.readings import text_of, undecided
 from jcr.errors import InputError, RejectedError, count_of, first_few
 from jcr.estimation.observability import observability
@@ -42,7 +42,7 @@ SAME_ROW = 1e-3
 NO_ROBOT = float(2 * np.sqrt(3) * MAX_NOISE[1])
 """Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
 have the largest error on three axes."""
-SHOWN = 10
+FITTED_ANYWAY = 10
 """Number of readings that are fitted although none can be that of a robot, so that a message says how far off it is."""
 MOST_CHOICES = 3000
 """Largest number of choices of rows that are tried where rows and images differ in number."""
@@ -193,7 +193,7 @@ def _ranked(
         # Of two rotations that differ, each has half of the error.
         least_mm = MM_PER_DEG * float(np.degrees(gap)) / 2
         is_hopeless = (
-            gap > NO_ROBOT and len(fits) >= SHOWN and not any(fit.misfit.is_of_robot for fit in fits)
+            gap > NO_ROBOT and len(fits) >= FITTED_ANYWAY and not any(fit.misfit.is_of_robot for fit in fits)
         )
         is_late = fitted is not None and len(fits) >= fitted
         if not least_mm < min(2 * BETTER * max(best, LEAST_MISFIT), most_mm) or is_hopeless or is_late:
@@ -277,9 +277,7 @@ def _rows_of_images(
         return InputError(f"{plain}; the images do not show which are too much")
     if rows < images:
         names = first_few([capture.images[k] for k in dropped])
-        return InputError(
-            f"{plain}; by the images ({_size(misfit)}), {names} have no pose: remove these images"
-        )
+        return InputError(f"{plain}; by the images ({_size(misfit)}), {names} have no pose: remove them")
     numbers = ", ".join(str(k + 1) for k in dropped)
     lag = _lag(capture, dropped)
     remedy, source = "remove it from the file", capture.source
@@ -308,7 +306,7 @@ def _lag(capture: Capture, dropped: tuple[int, ...]) -> str:
     """Return words that poses and images are shifted, if the images' names count from another number than 1."""
     first = "".join(c for c in Path(capture.images[0]).stem if c.isdecimal())
     shift = int(first) - 1 - (0 if 0 not in dropped else len(dropped)) if first else 0
-    if shift and abs(shift) <= FARTHEST:
+    if shift and abs(shift) <= LARGEST_SHIFT:
         by = "one" if abs(shift) == 1 else abs(shift)
         return f" (image {first} has the pose of row {int(first) - shift}: the poses are {by} behind)"
     return ""

@@ -83,9 +83,7 @@ def _merged(parts: Sequence[Capture], first: Capture, folder: Path) -> Capture:
     Intrinsics and robot are those of the capture `first`. Joint angles are kept if all parts have them.
     """
     if not parts:
-        raise InputError(
-            f"{folder}: there are no images since the change; name the captures that were taken after it"
-        )
+        raise InputError(f"{folder}: no images since the change; name captures taken after it")
     images = list[str]()
     for part in map(require_decided, parts):
         for image in part.images:

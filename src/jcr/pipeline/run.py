@@ -25,7 +25,7 @@ from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.files import locked, write_text
 from jcr.options import checked_options
-from jcr.pipeline.backend_selection import NEARLY_ALL, NothingFoundError, solved_pairs
+from jcr.pipeline.backend_selection import SIFT_SUFFICES, NothingFoundError, solved_pairs
 from jcr.pipeline.reading_decision import decided_by_images
 from jcr.pipeline.stages import (
     FIRST,
@@ -43,7 +43,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
-from jcr.scene.map_file import PACKAGES, require_packages
+from jcr.scene.map_file import MAP_PACKAGES, require_packages
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
@@ -202,9 +202,7 @@ def add_camera(
         )
     options = replace(before.state.options, map=None)
     if (doubt := before.calibration.doubt) is not None:
-        raise RejectedError(
-            f"{out}: its calibration is rejected, so no camera can be located with it: {doubt}"
-        )
+        raise RejectedError(f"{out}: its calibration is rejected and locates no camera: {doubt}")
     with locked(before.out):
         known = begun(before.out, before.capture, options)
         file = None if intrinsics is None else Path(intrinsics)
@@ -240,7 +238,7 @@ def _decided(
     if (known := _decided_before(capture, out / CAPTURE)) is not None:
         return known, None
     capture, made = decided_by_images(capture, seed, report)
-    is_enough = made is not None and len(made.image_index) >= NEARLY_ALL * len(capture)
+    is_enough = made is not None and len(made.image_index) >= SIFT_SUFFICES * len(capture)
     return capture, made if is_enough else None
 
 
@@ -268,7 +266,7 @@ def _possible(options: RunOptions, capture: Capture, out: Path) -> tuple[RunOpti
     if options.map is None or capture.mount == "base":
         return replace(options, map=None), ()
     try:
-        if not all(map(is_installed, PACKAGES)):
+        if not all(map(is_installed, MAP_PACKAGES)):
             require_packages("the map", f", then `jcr map {out}`")
     except InputError as error:
         return replace(options, map=None), (f"no map was made: {error}",)

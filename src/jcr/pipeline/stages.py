@@ -367,9 +367,7 @@ def _map(result: RunResult, progress: Progress) -> RunResult:
     cloud, more = label_cloud(cloud, options.segment, support)
     notes = [*remarks, *more]
     if len(added) and options.segment.segments in ("auto", "labels") and given is not None:
-        notes.append(
-            "images added later have no label images; --segments tabletop labels what they show, too"
-        )
+        notes.append("images added later have no label images; --segments tabletop labels them, too")
     give_back()
     with ThreadPoolExecutor(1) as beside:
         sizes = None if support is None else beside.submit(measure_objects, cloud, result.scale_std, support)

@@ -19,7 +19,7 @@ from jcr.geometry import Poses, apply, by_similarity, inverse, scale_translation
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunResult
 
-COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
+CSV_COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
 """Columns of the CSV: image and pixel of a point, and position of the tip that touched the point (base frame)."""
 CLICK_PX = 1.0
 """Standard deviation of a selected pixel, and of the nearest pixel of a pointmap, along each axis (px of the image). At
@@ -147,9 +147,7 @@ def surface_at(
     if not rows:
         raise InputError(f"{asked_by}: {image} is not among the registered images; choose another")
     if (dense := reconstruction.pointmaps) is None:
-        raise InputError(
-            f"{asked_by}: there is no dense depth to read a surface from; make it with `jcr map`"
-        )
+        raise InputError(f"{asked_by}: no dense depth to read a surface from; make it with `jcr map`")
     x_px = project(dense.intrinsics, unproject(reconstruction.intrinsics, x_px))
     column, row = np.round(x_px).astype(int)
     height, width = dense.confidence.shape[1:]
@@ -163,19 +161,19 @@ def surface_at(
 def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
     """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
+        raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(CSV_COLUMNS)}")
     images, numbers = list[str](), list[ndarray]()
     tables = read_tables(path)
     header = decode_text(path, read_limited(path)).partition("\n")[0]
     named = [cell.strip().strip('"') for cell in re.split(r"[,;\t]", header)]
-    if missing := [name for name in COLUMNS if name not in named]:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
-    rows = next((table.rows for table in tables if set(COLUMNS) <= set(table.columns)), ())
+    if missing := [name for name in CSV_COLUMNS if name not in named]:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(CSV_COLUMNS)}")
+    rows = next((table.rows for table in tables if set(CSV_COLUMNS) <= set(table.columns)), ())
     for line, row in enumerate(rows, start=2):
         cell_of = dict(zip(named, row, strict=True))
-        cells = [cell_of[name] for name in COLUMNS[1:]]
+        cells = [cell_of[name] for name in CSV_COLUMNS[1:]]
         if not all(isinstance(cell, float) for cell in cells):
-            raise InputError(f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers")
+            raise InputError(f"{path}: line {line}: {', '.join(CSV_COLUMNS[1:])} must be numbers")
         own = np.array(cells, dtype=np.float64)
         if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
             raise InputError(f"{path}: line {line}: positions are finite and in metres")

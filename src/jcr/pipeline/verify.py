@@ -195,9 +195,7 @@ def verify_run(
         raise InputError(f"{out}: no captures to verify it with; name one or more")
     _, capture, _ = run.of_wrist_camera()
     if not run.found.converged:
-        raise InputError(
-            f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
-        )
+        raise InputError(f"{out}: its rejected calibration cannot be tested; calibrate again (jcr run)")
     with locked(run.out):
         digest = fingerprint(run.found.gripper_from_camera, capture.base_from_gripper, capture.images)
         scene, history, row = old_scene(run.out, digest), read_history(run.out, digest), 0

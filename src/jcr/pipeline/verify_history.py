@@ -167,9 +167,7 @@ def telling_poses(run: RunResult, count: int) -> list[tuple[int, tuple[float, fl
         points = tracks.points_in_recon[tracks.point[own]]
         pose = absolute_pose(tracks.x_px[own], points, reconstruction.intrinsics, gate_px=3.0)
         if pose is None:
-            raise InputError(
-                f"{capture.images[row]}: shows too few points of the scene; name poses of your own"
-            )
+            raise InputError(f"{capture.images[row]}: shows too little of the scene; name poses of your own")
         covariances.append(pose.covariance)
     there = Located(
         base_from_gripper=tuple(reference.base_from_gripper),

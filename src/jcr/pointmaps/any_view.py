@@ -95,9 +95,7 @@ def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarra
     """
     tensor = answer.get(name) if hasattr(answer, "get") else None
     if not isinstance(tensor, torch.Tensor) or tensor.numel() != np.prod(shape):
-        raise InputError(
-            f"{model} gave no {name} of shape {shape}; its package is of another release, update the older one"
-        )
+        raise InputError(f"{model} gave no {name} of shape {shape}; update the older of the packages")
     return tensor.detach().float().cpu().numpy().reshape(shape)
 
 

@@ -14,7 +14,7 @@ from jcr.memory import require_memory
 from jcr.pointmaps.image_grid import ImageGrid
 from jcr.records import Intrinsics
 
-ARRAYS = {
+SHAPES = {
     "edges": "E 2",
     "pts3d": "E H W 3",
     "conf": "E H W",
@@ -91,11 +91,11 @@ def read_arrays(path: Path) -> dict[str, ndarray]:
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
-    """Return checked pairwise predictions from the arrays of a file (by name, see ARRAYS), named `source` in messages.
+    """Return checked pairwise predictions from the arrays of a file (by name, see SHAPES), named `source` in messages.
 
     Raises InputError for arrays that are missing or inconsistent.
     """
-    check_arrays(arrays, ARRAYS, source)
+    check_arrays(arrays, SHAPES, source)
     edges = arrays["edges"]
     count, height, width = arrays["pts3d"].shape[:3]
     images = tuple(str(name) for name in arrays.get("images", ()))
@@ -112,7 +112,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
         raise InputError(f"{source}: colors must be uint8 of shape {(image_count, height, width, 3)}")
     return PairPredictions(
         edges=edges.astype(np.int64),
-        **{name: arrays[name].astype(np.float32, copy=False) for name in ARRAYS if name != "edges"},
+        **{name: arrays[name].astype(np.float32, copy=False) for name in SHAPES if name != "edges"},
         images=images,
         colors=colors,
         intrinsics=intrinsics,
@@ -135,7 +135,7 @@ def check_arrays(arrays: dict[str, ndarray], shapes: Mapping[str, str], source: 
         fits = array.ndim == len(axes) and array.dtype.kind in "fiu"
         if not fits or any(size not in (None, own) for size, own in zip(asked, array.shape, strict=True)):
             raise InputError(
-                f"{source}: {name} is {array.dtype} of shape {array.shape}; it must be numbers of shape {shape}"
+                f"{source}: {name} is {array.dtype} of shape {array.shape}; give numbers {shape}"
             )
         sizes |= dict(zip(axes, array.shape, strict=True))
         # One row at a time: a mask of all pairs would take a quarter of the pairs' memory.

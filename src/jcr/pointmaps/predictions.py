@@ -49,9 +49,7 @@ def reconstruct_predictions(
         images = _images(capture, rows, arrays, (width, height), source)
         maps = _posed_pointmaps(arrays, np.argsort(rows), images.grid, source)
     else:
-        raise InputError(
-            f"{source}: holds neither 'edges' nor 'recon_from_camera' of pointmaps; see jcr docs predictions"
-        )
+        raise InputError(f"{source}: without 'edges' or 'recon_from_camera'; see jcr docs predictions")
     return reconstruct_pointmaps(capture, images, maps, "predictions", progress, np.sort(rows), refining)
 
 
@@ -120,7 +118,7 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
         return np.arange(count)
     if len(names) != count or len(set(names)) != count:
         raise InputError(
-            f"{source}: 'images' has {count_of(len(names), 'name')} for {count_of(count, 'image')}; give one each"
+            f"{source}: 'images' names {len(names)} of {count_of(count, 'image')}; give all names"
         )
     unknown = [name for name in names if name not in capture.images]
     if unknown:

@@ -382,7 +382,7 @@ class Uncertainty:
 
     @property
     def whole(self) -> Float[ndarray, "j j"]:
-        """Covariance of transform and scale in COVARIANCE_ORDER (j = 7), then of the intrinsics if they are estimated."""
+        """Covariance of transform and scale in COVARIANCE_ORDER (j = 7), then of the intrinsics if estimated."""
         return self.covariance if self.joint is None else self.joint.covariance
 
     @property

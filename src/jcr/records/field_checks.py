@@ -37,9 +37,7 @@ def require_fields(record: Any) -> None:
                 is_array = isinstance(value, ndarray)
                 found = f"{value.dtype} of shape {value.shape}" if is_array else type(value).__name__
                 expected = " or ".join(getattr(one, "dim_str", "None").strip() for one in kinds)
-                raise InputError(
-                    f"{kind.__name__}: {name}: {found}, not an array of shape ({expected}); correct it"
-                )
+                raise InputError(f"{kind.__name__}: {name}: {found}, not of shape ({expected}); correct it")
 
 
 class Checked:

@@ -36,14 +36,12 @@ def read_json(file: Path) -> Any:
         return json.loads(text, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}; correct it there"
+            f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}; correct it"
         ) from None
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # a number of thousands of digits
-        raise InputError(
-            f"{file}: an invalid number, or nested too deeply ({str(error)[:80]}); correct it"
-        ) from None
+        raise InputError(f"{file}: invalid number, or too deep ({str(error)[:80]}); correct it") from None
 
 
 def validated_content(schema: type[BaseModel] | TypeAdapter, content: Any, where: str) -> Any:

@@ -192,9 +192,7 @@ class Reconstruction(Checked):
         if len(self.recon_from_camera) != m or (
             self.pointmaps is not None and len(self.pointmaps.confidence) != m
         ):
-            raise InputError(
-                f"Reconstruction: cameras or pointmaps are not those of {m} images; give one each"
-            )
+            raise InputError(f"Reconstruction: cameras or pointmaps not of {m} images; give one each")
         if m and (self.image_index[0] < 0 or (np.diff(self.image_index) <= 0).any()):
             raise InputError("Reconstruction: image_index does not ascend from 0 or more; sort the images")
         require_rows("Reconstruction", "tracks.image", self.tracks.image, m)

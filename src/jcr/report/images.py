@@ -21,7 +21,7 @@ LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Largest and smallest width (px) of the images in the report, and largest number of all their pixels, about 1 MB."""
 MARKS, MAGNIFIED = 120, 20
 """Largest number of features drawn over an image, and factor by which their reprojection errors are magnified."""
-SHOWN = 12
+OPEN_IMAGES = 12
 """Number of images that are not collapsed."""
 GRID = 17
 """Points per side of the grid in `pixels_of_file`; the page interpolates between them."""
@@ -58,7 +58,7 @@ def images_section(capture: Capture, result: RunResult | None = None) -> Content
     is_calibrated = result is not None and intrinsics is not None
     return {
         "cards": cards,
-        "shown": SHOWN,
+        "shown": OPEN_IMAGES,
         "is_calibrated": is_calibrated,
         "rejected": sum(card["rejected"] is not None for card in cards),
         "magnified": MAGNIFIED,

@@ -11,9 +11,17 @@ from jcr.records import Excitation
 from jcr.report.render import Content
 from jcr.result import RunResult
 
-PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
+COMPONENTS = (
+    "translation x",
+    "translation y",
+    "translation z",
+    "rotation x",
+    "rotation y",
+    "rotation z",
+    "scale",
+)
 """Names of the seven components of a direction, in records.COVARIANCE_ORDER."""
-NAMED = 0.4
+NAMED_FROM = 0.4
 """Absolute value from which a component of a unit direction is named."""
 GENERAL = 0.4
 """Excitation that is drawn as a bar of full length; general motions reach it."""
@@ -59,8 +67,8 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
     number is its excitation, and an excitation of 0.4 or more has length 100.
     """
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
-        parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
-        name = ", ".join(parts) or PARTS[int(direction.argmax())]
+        parts = [COMPONENTS[k] for k in np.argsort(-direction) if direction[k] > NAMED_FROM]
+        name = ", ".join(parts) or COMPONENTS[int(direction.argmax())]
         kind = "used" if value >= WEAK else "rejected"
         yield kind, name, min(100 * float(value) / GENERAL, 100.0), significant(float(value))
 

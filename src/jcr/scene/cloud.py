@@ -17,7 +17,7 @@ from jcr.scene.options import CloudOptions
 LEAST_SURE = 40.0
 """Percentage of the points from matching alone, the least confident, whose rays show no free space: few images agree on
 them, and depths that are too large are among them. This removes a third of the space that is wrongly called free."""
-_COLUMNS = {
+_PLY_COLUMNS = {
     **dict.fromkeys("xyz", "f4"),
     **dict.fromkeys(("red", "green", "blue"), "u1"),
     **{"label": "i4", "confidence": "f4", "margin": "f4", "image": "i4", "reason": "u1", "depth_std": "f4"},
@@ -32,7 +32,7 @@ _MOST_NAMED = 10_000
 """Largest number of cameras and of labels of a cloud; each camera is compared with planes, and a map has 1024 labels."""
 _LAYOUT = "format binary_little_endian 1.0"
 """Line of the header that states the layout of the points."""
-_FIRST = "comment jcr cloud in the base frame, metres"
+_PLY_MARK = "comment jcr cloud in the base frame, metres"
 """Line of the header that identifies a cloud of jcr."""
 
 
@@ -142,23 +142,23 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
     depth are written if the cloud has them. Comments in the header hold the label names and camera centres, which
     `read_cloud` reads. `notes` are further comments, one line per name and text.
     """
-    columns = dict(zip(_COLUMNS, (*cloud.points_in_base.T, *cloud.color.T), strict=False))
-    for name in list(_COLUMNS)[6:]:
+    columns = dict(zip(_PLY_COLUMNS, (*cloud.points_in_base.T, *cloud.color.T), strict=False))
+    for name in list(_PLY_COLUMNS)[6:]:
         if (column := getattr(cloud, name)) is not None:
             columns[name] = column
-    vertices = np.empty(len(cloud.image), [(name, f"<{_COLUMNS[name]}") for name in columns])
+    vertices = np.empty(len(cloud.image), [(name, f"<{_PLY_COLUMNS[name]}") for name in columns])
     for name, column in columns.items():
         vertices[name] = column
     centers = cloud.camera_centers_in_base.tolist()
     header = [
         "ply",
         _LAYOUT,
-        _FIRST,
+        _PLY_MARK,
         *(f"comment {name} {text}" for name, text in (notes or {}).items()),
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
         *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
         f"element vertex {len(vertices)}",
-        *(f"property {_PLY_TYPES[_COLUMNS[name]]} {name}" for name in columns),
+        *(f"property {_PLY_TYPES[_PLY_COLUMNS[name]]} {name}" for name in columns),
         "end_header\n",
     ]
     write_bytes(path, "\n".join(header).encode() + vertices.tobytes())
@@ -169,18 +169,20 @@ def read_cloud(path: Path) -> PointCloud:
     try:
         header, _, body = read_bytes(path).partition(b"\nend_header\n")  # a label may be called end_header
         lines = header.decode().splitlines()
-        names = [name for name, kind in _COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines]
-        vertices = np.frombuffer(body, [(name, f"<{_COLUMNS[name]}") for name in names])
-        columns = {name: vertices[name].astype(_AS_READ[_COLUMNS[name]]) for name in names}
+        names = [
+            name for name, kind in _PLY_COLUMNS.items() if f"property {_PLY_TYPES[kind]} {name}" in lines
+        ]
+        vertices = np.frombuffer(body, [(name, f"<{_PLY_COLUMNS[name]}") for name in names])
+        columns = {name: vertices[name].astype(_AS_READ[_PLY_COLUMNS[name]]) for name in names}
         own = [line for line in lines if not line.startswith("comment")]
         elements = [
             f"element vertex {len(vertices)}",
-            *(f"property {_PLY_TYPES[_COLUMNS[name]]} {name}" for name in names),
+            *(f"property {_PLY_TYPES[_PLY_COLUMNS[name]]} {name}" for name in names),
         ]
         if (
             own != ["ply", _LAYOUT, *elements]
-            or _FIRST not in lines
-            or {*names, "margin", "reason", "depth_std"} != _COLUMNS.keys()
+            or _PLY_MARK not in lines
+            or {*names, "margin", "reason", "depth_std"} != _PLY_COLUMNS.keys()
         ):
             raise ValueError  # cut between two points, or of another writer
         words = [line.split(maxsplit=3) for line in lines]

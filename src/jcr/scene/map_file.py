@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from jcr.scene.scene_map import SceneMap
     from jcr.scene.seen_space import SeenGrid
 
-FILE = "map.safetensors"
+MAP_FILE = "map.safetensors"
 SLACK = 1e-3
 """Largest relative error of a lattice's size by rounding to float32."""
 REASON = 200
 """Largest number of characters of a library's message that an error quotes."""
-PACKAGES = "torch", "safetensors", "skimage"
+MAP_PACKAGES = "torch", "safetensors", "skimage"
 """Packages that are needed to train, read and mesh a map."""
 
 
@@ -34,7 +34,7 @@ Nodes = Annotated[int, Field(ge=2, le=100_000)]
 """Number of nodes of a grid along an axis."""
 
 
-MOST = 8
+MOST_PARTS = 8
 """Largest number of networks, of their grids, and of all grids; maps of jcr have up to four. It bounds the memory that a
 header of few bytes takes."""
 
@@ -43,10 +43,10 @@ class NetworkHeader(BaseModel):
     """Arguments of one network of the map (scene.fields.Field)."""
 
     model_config = ConfigDict(extra="forbid")
-    heads: Annotated[dict[str, Units], Field(max_length=MOST)]
+    heads: Annotated[dict[str, Units], Field(max_length=MOST_PARTS)]
     hidden: Units
     frequencies: Annotated[int, Field(ge=0, le=64)]
-    grids: Annotated[list[tuple[Annotated[int, Field(ge=0)], Features]], Field(max_length=MOST)]
+    grids: Annotated[list[tuple[Annotated[int, Field(ge=0)], Features]], Field(max_length=MOST_PARTS)]
 
     @model_validator(mode="after")
     def _has_one_input(self) -> "NetworkHeader":
@@ -60,8 +60,8 @@ class MapHeader(BaseModel):
     """Header of a map file, in JSON: its networks and grids, label names, cell size (m), and how it was made."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    networks: Annotated[list[NetworkHeader], Field(max_length=MOST)]
-    lattices: Annotated[list[tuple[Positive, tuple[Nodes, Nodes, Nodes]]], Field(max_length=MOST)]
+    networks: Annotated[list[NetworkHeader], Field(max_length=MOST_PARTS)]
+    lattices: Annotated[list[tuple[Positive, tuple[Nodes, Nodes, Nodes]]], Field(max_length=MOST_PARTS)]
     """Spacing (m) and number of nodes along z, y and x of each grid of features."""
     label_names: tuple[str, ...]
     cell: Positive
@@ -76,7 +76,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     Raises InputError if the map is missing, damaged or of another version of jcr, or if a package is not installed.
     """
     path = Path(folder)
-    path = path / FILE if path.is_dir() else path
+    path = path / MAP_FILE if path.is_dir() else path
     if not path.is_file():
         raise InputError(f"{path}: no map here; make one with jcr run CAPTURE OUT, or jcr map OUT")
     again = "make it again with jcr map OUT"
@@ -160,10 +160,10 @@ def _lattices_of(about: "MapHeader", seen: "SeenGrid", tensors: "dict[str, Tenso
 
 
 def require_packages(what: str, otherwise: str = "") -> None:
-    """Raise InputError if one of the `PACKAGES` of the map is not installed.
+    """Raise InputError if one of the `MAP_PACKAGES` of the map is not installed.
 
     In the message, `what` is the part of jcr that needs the package; `otherwise` is added at the end, such as another
     remedy.
     """
-    for package in PACKAGES:
+    for package in MAP_PACKAGES:
         extra(package, "map", what, otherwise)

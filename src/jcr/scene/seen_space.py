@@ -47,9 +47,7 @@ class SeenGrid:
         if self.lower.shape != (3,) or self.lower.dtype != torch.float32 or not self.lower.isfinite().all():
             raise InputError("grid of seen space: no lower corner; give three finite numbers (m, float32)")
         if self.state.dtype != torch.uint8 or self.state.ndim != 3 or 0 in self.state.shape:
-            raise InputError(
-                f"grid of seen space: states of shape {tuple(self.state.shape)}; give cells by z, y, x"
-            )
+            raise InputError(f"seen space: states of shape {tuple(self.state.shape)}; give cells by z, y, x")
         if int(self.state.max()) > (CROSSED | HIT):
             raise InputError("grid of seen space: a state that is neither crossed nor hit")
 

@@ -68,7 +68,7 @@ def workspace_box(
         box = np.array(workspace, dtype=np.float64).reshape(2, 3)
         if not np.isfinite(box).all() or (box[0] >= box[1]).any():
             raise InputError(
-                f"workspace {workspace}: give metres as xmin ymin zmin xmax ymax zmax, each minimum below its maximum"
+                f"workspace {workspace}: give xmin ymin zmin xmax ymax zmax (m), minima below maxima"
             )
         return box
     if len(cloud.points_in_base) == 0:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 BLOCK = 4
 """Side (map cells) of the blocks in which the depth's standard deviation is constant."""
-LEAST_POINTS = 20
+BLOCK_POINTS = 20
 """Least number of points of a block for a value of its own; others have that of all points."""
 
 
@@ -117,5 +117,5 @@ def _depth_std(scene: "SceneMap", cloud: PointCloud) -> Float[ndarray, "z y x"]:
     own = np.maximum(spread, np.sqrt(np.add.reduceat(stated**2, first) / count))
     anywhere = max(float(np.quantile(off, 0.9)) / 1.645, float(np.sqrt((stated**2).mean())))
     found = np.full(int(np.prod(shape)), anywhere)
-    found[block[first]] = np.where(count >= LEAST_POINTS, own, anywhere)
+    found[block[first]] = np.where(count >= BLOCK_POINTS, own, anywhere)
     return found.reshape(shape)

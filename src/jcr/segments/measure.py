@@ -17,7 +17,7 @@ SHARPEST = 0.0005
 """Smallest width (m) over which heights are smoothed; twice the roughness of the plane if that is larger."""
 TOP_SHARE = 0.25
 """Smallest density of points at a top, as a share of the object's mean density; stray points are sparser."""
-CELL = 0.003
+OUTLINE_CELL = 0.003
 """Side (m) of the cells in which an object's points, seen from above, are counted."""
 EDGE_SHARE = 0.4
 """Density of points seen from above, as a share of the median density, below which a cell holds only wrong depths
@@ -71,9 +71,9 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
     Label 0 and the support plane's own label are not objects. `scale_std` is the relative standard deviation of the
     calibration's scale. Standard deviations come from a jackknife that leaves out one image at a time (Efron and Stein
     1981). The reason is that depth errors are correlated within an image. The error of the scale is added in
-    quadrature, and half a cell (CELL) for the sides. For the height, the bend of the table is added, sqrt(noise² -
-    roughness²) of the support plane. The spread of heights at the top, divided by the root of the number of images, is
-    added, too. Raises InputError if no plane carries the scene.
+    quadrature, and half a cell (OUTLINE_CELL) for the sides. For the height, the bend of the table is added,
+    sqrt(noise² - roughness²) of the support plane. The spread of heights at the top, divided by the root of the number
+    of images, is added, too. Raises InputError if no plane carries the scene.
     """
     support = support or fit_support(cloud)
     x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
@@ -101,7 +101,9 @@ def measure_objects(cloud: PointCloud, scale_std: float = 0.0, support: Support 
         size, jackknife = np.array([*sides, top]), np.zeros(3)
         if len(parts) > 1:
             jackknife = np.sqrt((len(parts) - 1) * np.var(parts, axis=0))
-        own = np.array([CELL / 2, CELL / 2, np.hypot(bent, spread / np.sqrt(max(len(parts), 1)))])
+        own = np.array(
+            [OUTLINE_CELL / 2, OUTLINE_CELL / 2, np.hypot(bent, spread / np.sqrt(max(len(parts), 1)))]
+        )
         std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
         turn = rotation_exp(np.array([0.0, 0.0, rotation_rad]))
         outline = _outline(within)
@@ -178,10 +180,10 @@ def _top(height: Float[ndarray, " n"], roughness: float) -> tuple[float, float]:
 def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
     """Return the k of n points (m) that are not in the sparse fringe around an object, and a weight for each.
 
-    The points are counted in square cells of side CELL in the plane. The fringe are cells with less than 40 %
+    The points are counted in square cells of side OUTLINE_CELL in the plane. The fringe are cells with less than 40 %
     (EDGE_SHARE) of the median number. The weight is 1 / number of points in the same cell.
     """
-    cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
+    cell = tuple((np.floor((xy - xy.min(0)) / OUTLINE_CELL).astype(int) + 1).T)
     count = np.zeros([rows.max() + 2 for rows in cell])
     np.add.at(count, cell, 1.0)
     kept = gaussian_filter(count, 0.5, mode="constant")[cell] >= EDGE_SHARE * np.median(count[count > 0])

@@ -34,7 +34,7 @@ LEAST_QUALITY, LEAST_STABILITY = 0.7, 0.9
 """Smallest quality and stability of a mask. Quality is the network's estimate of the mask's overlap with the truth.
 Stability is the overlap of the masks with the threshold one higher and one lower, as in the authors' automatic mask
 generator."""
-SAME = 0.7
+DUPLICATE_IOU = 0.7
 """Intersection over union above which two masks of one image are duplicates."""
 VOXEL = 0.01
 """Side (m) of the cells of space in which masks of different images are compared."""
@@ -53,9 +53,7 @@ def load_sam(weights: str) -> "Sam2Model":
     folder = weights
     if not os.path.isdir(weights):
         if not (cached := cached_files(weights)):
-            raise InputError(
-                f"--sam-weights {weights}: not on this machine; jcr models get {weights} downloads them"
-            )
+            raise InputError(f"--sam-weights {weights}: not found; jcr models get {weights} downloads them")
         folder = str(cached[0].parent)
 
     bars = logging.is_progress_bar_enabled()
@@ -126,7 +124,7 @@ def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndar
     masks = torch.cat(found)[torch.cat(quality).argsort(descending=True)]
     flat = masks.flatten(1).float()
     area, shared = flat.sum(1), flat @ flat.T
-    same = shared > SAME * (area[:, None] + area - shared)
+    same = shared > DUPLICATE_IOU * (area[:, None] + area - shared)
     kept: list[int] = []
     for k in range(len(masks)):  # skip masks that repeat a better one
         if area[k] > 0 and not same[k, kept].any():

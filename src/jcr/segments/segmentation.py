@@ -19,7 +19,7 @@ from jcr.records import Capture, PointCloud, Reconstruction
 from jcr.segments.options import LabelImages, SegmentOptions
 from jcr.segments.tabletop import Support, label_tabletop
 
-MOST = 1024
+MOST_LABELS = 1024
 """Largest number of labels; an image with more values is probably no label image."""
 
 
@@ -62,16 +62,14 @@ def _read_label(capture: Capture, image: str, name: str) -> UInt16[ndarray, "h w
     """Return the label image `name` of an image of the capture; raise InputError if there is none that fits."""
     path = capture_file(capture.folder, name, f"{capture.folder}: label image of {image}")
     if not path.is_file():
-        raise InputError(
-            f"{path}: not found; give labels for every image of the capture, or for none ({image})"
-        )
+        raise InputError(f"{path}: not found; give labels for all images of the capture or none ({image})")
     label = read_one_channel(path, str(path))
     if label.shape[::-1] != capture.image_size:
         raise InputError(
             f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
         )
-    if label.max() >= MOST:
-        raise InputError(f"{path}: holds label {label.max()}; number labels from 1 to {MOST - 1}")
+    if label.max() >= MOST_LABELS:
+        raise InputError(f"{path}: holds label {label.max()}; number labels from 1 to {MOST_LABELS - 1}")
     return label.astype(np.uint16)
 
 

@@ -40,9 +40,9 @@ CLEARLY = 1.5
 FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 """Smallest number of points of an occupied cell seen from above, and smallest share of the median cell's number. Cells
 with fewer points hold only stray points."""
-PATCH = 0.02
+FLAT_PATCH = 0.02
 """Side (m) of a patch of the table that counts as flat even if the table is bent."""
-REACH = 10.0
+LARGEST_REACH = 10.0
 """Largest distance (m) of an object from the middle of all along an axis; no arm reaches as far. It bounds memory."""
 FEWEST_MEASURED = 1000
 """Smallest number of measured points for which the fit of the support plane ignores filled-in points."""
@@ -73,7 +73,7 @@ def fit_support(cloud: PointCloud) -> Support:
     rotation = np.stack([along, np.cross(up, along), up], axis=1)
     distance = (x - middle) @ up
     on = np.abs(distance) < 3 * noise
-    patch = np.floor((x[on] - middle) @ rotation[:, :2] / PATCH).astype(np.int64)
+    patch = np.floor((x[on] - middle) @ rotation[:, :2] / FLAT_PATCH).astype(np.int64)
     patch -= patch.min(0)
     _, place = np.unique(np.ravel_multi_index(tuple(patch.T), patch.max(0) + 1), return_inverse=True)
     bend = ndimage.median(distance[on], place, np.arange(place.max() + 1))
@@ -100,7 +100,9 @@ def label_tabletop(
     over = (height > founding) & (height < options.object_highest)
     object_of = np.zeros(len(height), int)
     if over.any():
-        over &= (np.abs(x_in_support[:, :2] - np.median(x_in_support[over, :2], axis=0)) < REACH).all(1)
+        over &= (np.abs(x_in_support[:, :2] - np.median(x_in_support[over, :2], axis=0)) < LARGEST_REACH).all(
+            1
+        )
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
         # Two empty cells on every side; points farther out are counted in the outermost one.
         low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
@@ -160,7 +162,7 @@ def _objects(
     count = np.bincount(part)
     # A part mostly outside of the bare plane is background, such as a wall; a small part is noise.
     plane_xy = x_in_support[bare, :2]
-    if bare.sum() < FEWEST_POINTS or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < PATCH**2 / 12:
+    if bare.sum() < FEWEST_POINTS or np.linalg.eigvalsh(np.cov(plane_xy.T))[0] < FLAT_PATCH**2 / 12:
         raise InputError(
             "no bare part of the support plane is in view, so objects cannot be told from what lies beside it; leave a "
             "hand's width of it free, or give label images"

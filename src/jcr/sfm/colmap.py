@@ -39,7 +39,7 @@ from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.missing_images import ROUGHLY, model_near_cameras, nearer_to_robot, with_missing_images
 from jcr.sfm.model import (
-    ENOUGH,
+    COST_TOLERANCE,
     adjust_robustly,
     colmap_camera,
     intrinsics_of,
@@ -174,7 +174,7 @@ def reconstruct_near_cameras(
 ) -> Reconstruction | None:
     """Return cameras and tracks adjusted from predicted poses of all images, by matches of the images.
 
-    The result is None where an image has too few points (missing_images.LEAST_POINTS). `intrinsics` are held if
+    The result is None where an image has too few points (missing_images.LEAST_SHARED). `intrinsics` are held if
     `known`, and otherwise are the initial estimate.
     """
     images = [read_image(capture.folder / name) for name in capture.images]
@@ -353,7 +353,7 @@ def _incremental_options(matcher: Matcher) -> pycolmap.IncrementalPipelineOption
     # With one thread a seed fixes the result; the order of sums over threads changes the last bits.
     pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = matcher.seed
     pipeline.num_threads = mapper.num_threads = 1
-    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = ENOUGH
+    pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = COST_TOLERANCE
     refine = not matcher.known
     pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine

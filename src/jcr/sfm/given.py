@@ -14,7 +14,7 @@ from jcr.records import Capture, Intrinsics, Reconstruction
 from jcr.sfm.colmap import matched_database
 from jcr.sfm.model import poses_of, quiet_colmap, tracks_of, triangulated_model
 
-MIN_POINTS = 50
+MODEL_POINTS = 50
 """Least number of points of a reconstruction; with fewer in the model, features are triangulated."""
 
 
@@ -24,7 +24,7 @@ def reconstruct_given(
     """Reconstruct those images of a capture whose camera poses a COLMAP model (folder `cameras`) gives; hold the poses.
 
     Images are identified by their names, with folders where the file name alone is ambiguous. The points are those of
-    the model, or with fewer than MIN_POINTS are triangulated from SIFT matches. Raises InputError when the model
+    the model, or with fewer than MODEL_POINTS are triangulated from SIFT matches. Raises InputError when the model
     contains fewer than three of the images, RejectedError when too few points can be triangulated.
     """
     model = read_model(cameras)
@@ -36,13 +36,13 @@ def reconstruct_given(
     recon_from_camera = poses_of(model, [image_id - 1 for image_id in ids])
     intrinsics = capture.intrinsics or shared_intrinsics(model, ids, capture.image_size, str(cameras))
     tracks = tracks_of(model, ids, capture.image_size)
-    if len(tracks.points_in_recon) < MIN_POINTS:
+    if len(tracks.points_in_recon) < MODEL_POINTS:
         some = capture.of_rows(np.array(known))
         images = [read_image(some.folder / name) for name in some.images]
         with matched_database(some, images, intrinsics, True, "sift", seed, progress) as (database, camera):
             model = triangulated_model(database, camera, dict(enumerate(recon_from_camera)))
             tracks = tracks_of(model, range(1, len(images) + 1), capture.image_size)
-    if len(tracks.points_in_recon) < MIN_POINTS:
+    if len(tracks.points_in_recon) < MODEL_POINTS:
         raise RejectedError(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
             "check that it belongs to these images, or leave it out (--backend colmap)",
@@ -78,17 +78,13 @@ def _images_of(names: Mapping[str, int], images: Sequence[str], where: str) -> d
     for k in range(len(images)):
         like = sorted(by_file.get(Path(images[k]).name, ()) if k not in chosen else ())
         if len(like) > 1:
-            raise InputError(
-                f"{where}: {like[0]} and {like[1]} could both be {images[k]}; name them by their folders"
-            )
+            raise InputError(f"{where}: {like[0]} and {like[1]} may both be {images[k]}; name them by folder")
         if like:
             chosen[k] = like[0]
     owners = dict[str, int]()
     for k, name in sorted(chosen.items()):
         if (owner := owners.setdefault(name, k)) != k:
-            raise InputError(
-                f"{where}: {name} could be {images[owner]} or {images[k]}; name them by their folders"
-            )
+            raise InputError(f"{where}: {name} could be {images[owner]} or {images[k]}; name them by folder")
     return {k: names[name] for k, name in sorted(chosen.items())}
 
 
@@ -99,9 +95,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
             return pycolmap.Reconstruction(folder)
         except Exception as error:  # pycolmap passes on C++ exceptions of many types
             reason = str(error).strip().splitlines()[-1:] or ["damaged"]
-            raise InputError(
-                f"{folder}: not a readable COLMAP model ({reason[0]}); export it again"
-            ) from None
+            raise InputError(f"{folder}: no readable COLMAP model ({reason[0]}); export it again") from None
 
 
 def shared_intrinsics(
@@ -116,7 +110,7 @@ def shared_intrinsics(
     kinds = {(c.model.name, *map(float, (c.width, c.height, *c.params))) for c in cameras}
     if len(kinds) != 1:
         raise InputError(
-            f"{where}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
+            f"{where}: {len(kinds)} different cameras; reconstruct with --ImageReader.single_camera"
         )
     ((name, *numbers),) = kinds
     if name not in COLMAP_MODELS:

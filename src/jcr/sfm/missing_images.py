@@ -25,20 +25,20 @@ PASSES = ((32.0, 1, 4.0), (8.0, 1, 1.0), (4.0, 5, 0.5))
 refinements of the triangulation, and scale (px) of the adjustment's Cauchy loss."""
 ROUGHLY = 1e-3
 """Relative change of the cost that ends these adjustments."""
-LEAST_POINTS = 15
+LEAST_SHARED = 15
 """Least number of points of an image that images of the map see, too; an image with fewer is removed."""
 LEAST_MAPPED = 4
 """Least number of mapped cameras from which the others are predicted."""
 RADII_PX = (8.0, 4.0)
 """Largest distance, px, of a keypoint from the projection of its point in each pass, before an adjustment."""
-RATIO = 0.85
+LOCAL_RATIO = 0.85
 """Largest ratio of the descriptor distances to the best and the second-best keypoint near the projection."""
-LARGEST_PX = 4.0
+MISMATCH_PX = 4.0
 """Reprojection error, px, above which an observation is a mismatch, as in COLMAP."""
 
-CONTRADICTED = 5e-3
+COMPARED_FROM = 5e-3
 """rms error (m) of the better part of the gripper poses from which a map is compared with one near their cameras."""
-BETTER = 3.0
+BETTER_RATIO = 3.0
 """Ratio of the errors of both maps from which the one near the predicted cameras is used."""
 
 
@@ -52,8 +52,8 @@ def nearer_to_robot(
     """Return a map near the cameras that the gripper poses predict, if it agrees with them much better than `model`.
 
     Otherwise `model` is returned. It is kept, too, if it has fewer than LEAST_MAPPED images, or if its rms distance from
-    the gripper poses, over the images that fit best, is below CONTRADICTED (m). Much better means an rms distance
-    smaller by the factor BETTER. The mapper goes astray if its first two images show one plane (two
+    the gripper poses, over the images that fit best, is below COMPARED_FROM (m). Much better means an rms distance
+    smaller by the factor BETTER_RATIO. The mapper goes astray if its first two images show one plane (two
     solutions), or if objects moved while the images were taken. `x` is a rough estimate of gripper_from_camera; matches
     that contradict the predicted cameras are left out.
     """
@@ -61,14 +61,14 @@ def nearer_to_robot(
     if len(rows) < LEAST_MAPPED:
         return model
     error = least_trimmed(base_from_gripper[rows], poses_of(model, rows))[1]
-    if error < CONTRADICTED:
+    if error < COMPARED_FROM:
         return model
     predicted = dict(enumerate(base_from_gripper @ x))
     nearer = model_near_cameras(database, model.camera(1), predicted, matcher.known)
     if (now := rows_of(nearer)) and len(now) >= len(rows):
         _complete_images(nearer, {row + 1 for row in now}, matcher)
         after = least_trimmed(base_from_gripper[now], poses_of(nearer, now))[1]
-        return nearer if BETTER * after < error else model
+        return nearer if BETTER_RATIO * after < error else model
     return model
 
 
@@ -78,7 +78,7 @@ def with_missing_images(
     base_from_gripper: Float[ndarray, "n 4 4"],
     matcher: Matcher,
 ) -> pycolmap.Reconstruction:
-    """Return the model with those missing images whose predicted camera poses are confirmed by LEAST_POINTS points.
+    """Return the model with those missing images whose predicted camera poses are confirmed by LEAST_SHARED points.
 
     The poses are predicted from the gripper poses by the hand-eye transform of the images in the model.
     `base_from_gripper` has a row per image of the matcher. `model` itself is returned if it has fewer than LEAST_MAPPED
@@ -106,15 +106,15 @@ def with_missing_images(
 def _complete_images(model: pycolmap.Reconstruction, images: set[int], matcher: Matcher) -> None:
     """Match the images with COLMAP ids `images` with points near their cameras; adjust all cameras and points.
 
-    `model` is changed. Observations with a reprojection error above LARGEST_PX are removed.
+    `model` is changed. Observations with a reprojection error above MISMATCH_PX are removed.
     """
     filters = pycolmap.ObservationManager(model)
     for radius_px in RADII_PX:
         for image_id in sorted(images):
             _complete(model, image_id, matcher, radius_px)
-        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+        filters.filter_points3D_in_images(MISMATCH_PX, 0.0, images)
         adjust_robustly(model, matcher.known, ROUGHLY, PASSES[-1][2])
-        filters.filter_points3D_in_images(LARGEST_PX, 0.0, images)
+        filters.filter_points3D_in_images(MISMATCH_PX, 0.0, images)
 
 
 def model_near_cameras(
@@ -127,7 +127,7 @@ def model_near_cameras(
     """Return COLMAP's model, adjusted to all verified matches of the database from predicted camera poses.
 
     `recon_from_camera` has the predicted poses by image row. The intrinsics of `camera` are held if `known`. Images
-    with fewer than LEAST_POINTS points are removed. Only points that an image of the rows `mapped` sees are counted, or
+    with fewer than LEAST_SHARED points are removed. Only points that an image of the rows `mapped` sees are counted, or
     all points if `mapped` is None.
     """
     model, cameras = pycolmap.Reconstruction(), dict(recon_from_camera)
@@ -139,7 +139,7 @@ def model_near_cameras(
             if mapped is None or any(row in mapped for row in seen_by):
                 tied.update(seen_by)
         for row in cameras:
-            if tied[row] < LEAST_POINTS:
+            if tied[row] < LEAST_SHARED:
                 model.deregister_frame(model.image(row + 1).frame_id)
         if not model.num_reg_images():
             break
@@ -153,7 +153,8 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     """Add observations to the image with COLMAP id `image_id`: unused keypoints near a projected point.
 
     A keypoint within `radius_px` (working size) is added if its descriptor is the nearest one to the point's mean
-    descriptor. Its distance must be below the features' `farthest` and below RATIO times that of the second nearest.
+    descriptor. Its distance must be below the features' `farthest` and below LOCAL_RATIO times that of the second
+    nearest.
     """
     image, x_px, descriptors = model.image(image_id), matcher.features.x_px, matcher.features.descriptors
     observed = {keypoint.point3D_id for keypoint in image.points2D if keypoint.has_point3D()}
@@ -182,5 +183,5 @@ def _complete(model: pycolmap.Reconstruction, image_id: int, matcher: Matcher, r
     for first, second, keypoint, point_id in sorted(candidates):
         if keypoint not in taken:
             taken.add(keypoint)
-            if first < matcher.features.farthest and first < RATIO * second:
+            if first < matcher.features.farthest and first < LOCAL_RATIO * second:
                 model.add_observation(point_id, pycolmap.TrackElement(image_id, keypoint))

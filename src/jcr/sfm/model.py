@@ -22,7 +22,7 @@ from jcr.features.sift import WORKING_SIZE_PX
 from jcr.geometry import inverse, transform
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
-ENOUGH = 1e-6
+COST_TOLERANCE = 1e-6
 """Relative change of cost that ends an adjustment; COLMAP's 0 takes three times as long and changes 1e-5."""
 
 
@@ -196,7 +196,10 @@ def triangulated_model(
 
 
 def adjust_robustly(
-    model: pycolmap.Reconstruction, fix_intrinsics: bool, enough: float = ENOUGH, scale_px: float = 0.5
+    model: pycolmap.Reconstruction,
+    fix_intrinsics: bool,
+    enough: float = COST_TOLERANCE,
+    scale_px: float = 0.5,
 ) -> None:
     """Adjust all cameras and points of a model, which is changed, under a Cauchy loss of scale `scale_px`.
 

@@ -14,11 +14,11 @@ from jcr.features.sift import WORKING_SIZE_PX, detect, grey_of, matches
 from jcr.geometry import across_lines
 from jcr.records import Intrinsics, Reconstruction
 
-GATE_PX = 3.0
+POSE_GATE_PX = 3.0
 """Reprojection error, px, above which an observation is a mismatch."""
 MIN_PARALLAX = np.radians(1.5)
 """Least angle, rad, between the rays of a point."""
-MIN_POINTS = 30
+POSE_POINTS = 30
 """Least number of points that must agree on a pose; fewer can agree by chance on repeated patterns."""
 
 
@@ -65,7 +65,7 @@ def register(
 ) -> list[CameraPose | int]:
     """Return for each new image its camera pose in the recon frame; if it fails, the number of points that agree.
 
-    It fails with fewer than MIN_POINTS. `older` are the images of the reconstruction's rows. All are of one camera.
+    It fails with fewer than POSE_POINTS. `older` are the images of the reconstruction's rows. All are of one camera.
     """
     camera = reconstruction.intrinsics
     older_features = tuple(features(image, camera) for image in older)
@@ -90,11 +90,11 @@ def registrations(
     image: UInt8[ndarray, "h w 3"],
     camera: Intrinsics,
     focals: Sequence[Literal["given", "free"]] = ("given",),
-    gate_px: float = GATE_PX,
+    gate_px: float = POSE_GATE_PX,
 ) -> list[tuple[Registration | None, int]]:
     """Return for each of `focals` a new image's registration and the number of points that agree on its pose.
 
-    The registration is None if fewer than MIN_POINTS agree. Matches of the image with the known images are triangulated
+    The registration is None if fewer than POSE_POINTS agree. Matches of the image with the known images are triangulated
     from the known images; the pose is the one on which most points agree. The focal length of the new image's
     intrinsics (`camera`) is held (`given`) or estimated (`free`). `gate_px` is the largest error (px) of a point.
     """
@@ -105,7 +105,7 @@ def registrations(
     theirs = list(zip(known.features, (rows for _, rows in of_row), strict=True))
     rays, row_x_px = (np.concatenate([getattr(k, of)[own] for k, own in theirs]) for of in ("rays", "x_px"))
     points, spread, good = triangulated_features(
-        feature, row, rays, known.recon_from_camera, GATE_PX / known.camera.fx, len(new.rays)
+        feature, row, rays, known.recon_from_camera, POSE_GATE_PX / known.camera.fx, len(new.rays)
     )
     seen = good[feature]
     point, row, row_x_px = (np.cumsum(good) - 1)[feature[seen]], row[seen], row_x_px[seen]
@@ -115,17 +115,17 @@ def registrations(
     in_camera = np.einsum("cji,cj->ci", rotation, points[point] - centre)
     near = in_camera[:, 2] > 1e-6
     projected = project(known.camera, np.where(near[:, None], in_camera, [0.0, 0.0, 1.0]))
-    near &= np.linalg.norm(projected - row_x_px, axis=1) < GATE_PX
+    near &= np.linalg.norm(projected - row_x_px, axis=1) < POSE_GATE_PX
     found = list[tuple[Registration | None, int]]()
     for focal in focals:
         std_px, pose, count = 1.0, None, len(points)
         for _ in range(2):  # the noise estimated in the new image is used for the known images
-            if count < MIN_POINTS:
+            if count < POSE_POINTS:
                 break
             covariance = (std_px / known.camera.fx) ** 2 * spread
             pose = absolute_pose(x_px, points, camera, covariance, gate_px, focal)
             std_px, count = (0.0, 0) if pose is None else (pose.std_px, int(pose.inlier.sum()))
-        if pose is None or count < MIN_POINTS:
+        if pose is None or count < POSE_POINTS:
             found.append((None, count))
             continue
         kept = near & pose.inlier[point]

@@ -41,9 +41,9 @@ CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
 """RGB of cameras: of used images, of the selected image, and of rejected images."""
 FREE, COLLIDES, OCCUPIED = (40, 160, 90), (220, 40, 40), (37, 99, 235)
 """RGB of the free and of the colliding sphere, and of occupied space in a slice."""
-GREY = (110, 110, 110)
+UNSEEN_RGB = (110, 110, 110)
 """RGB of unknown space."""
-MOST_POINTS = 150_000
+MOST_DRAWN = 150_000
 """Largest number of points that are drawn of a layer."""
 UNKNOWN_CELLS = 300_000
 """Number of cells for which the map is queried to find the border of unknown space."""
@@ -156,7 +156,7 @@ class Viewer:
             server.scene.add_frame("/robot", show_axes=False)
             self.robot = ViserUrdf(server, robot, root_node_name="/robot")
         report("view", 0.3)
-        layers, self._labels = point_layers(self.scene, self.cloud, MOST_POINTS)
+        layers, self._labels = point_layers(self.scene, self.cloud, MOST_DRAWN)
         self._layers = {layer[0]: layer for layer in layers}
         self._solid = layers[0][1] if layers else self.tracks_in_base
         self._add_points()
@@ -250,7 +250,7 @@ class Viewer:
         if unknown.any() and not unknown.all():
             vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
             in_base, style = low + pitch * (vertices + 0.5), {"opacity": 0.25, "side": "double"}
-            scene.add_mesh_simple("/unknown", in_base, faces, visible=False, color=GREY, **style)
+            scene.add_mesh_simple("/unknown", in_base, faces, visible=False, color=UNSEEN_RGB, **style)
         size, turned = (high - low)[:2].tolist(), (0.0, 1.0, 0.0, 0.0)
         empty = np.zeros((2, 2, 4), np.uint8)
         self._slice = scene.add_image("/slice", empty, *size, wxyz=turned, visible=False)
@@ -327,7 +327,7 @@ class Viewer:
             at, rgba = self.scene.query(x, self.unknown.value), np.zeros((len(x), 4), np.uint8)
             if of == "occupancy":
                 rgba[:, :3], rgba[:, 3] = OCCUPIED, 255 * (0.1 + 0.9 * at.occupancy.clip(0, 1))
-                rgba[at.unknown] = (*GREY, 160)
+                rgba[at.unknown] = (*UNSEEN_RGB, 160)
             else:
                 known = np.isfinite(at.distance)
                 share = (255 * (1 - (at.distance[known] / FAR_M).clip(0, 1))).astype(np.uint8)

@@ -13,7 +13,7 @@ from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, s
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.pose_equations import predicted_gripper_poses
 from jcr.estimation.robust import least_trimmed
-from jcr.features.sift import FARTHEST, detect, grey_of
+from jcr.features.sift import SIFT_DISTANCE, detect, grey_of
 from jcr.findings import Finding, FindingKind, verdict_of
 from jcr.geometry import inverse, largest_motion, scale_translation, step_between
 from jcr.records import Capture
@@ -126,15 +126,16 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 def share_of_twins(image: UInt8[ndarray, "h w 3"]) -> float:
     """Return the fraction of an image's SIFT features that have three or more (TWINS) similar features elsewhere in it.
 
-    Features are similar if their descriptors differ by less than FARTHEST / 2; "elsewhere" means farther than APART_PX.
-    The image (RGB) is first reduced to a long side of TWINS_AT. The result is 0 with fewer than MIN_TWINS features.
+    Features are similar if their descriptors differ by less than SIFT_DISTANCE / 2; "elsewhere" means farther than
+    APART_PX. The image (RGB) is first reduced to a long side of TWINS_AT. The result is 0 with fewer than MIN_TWINS
+    features.
     """
     height, width = image.shape[:2]
     shrunk = min(1.0, TWINS_AT / max(height, width))
     x_px, descriptors = detect(grey_of(image, (round(shrunk * width), round(shrunk * height))))
     if len(x_px) < MIN_TWINS:
         return 0.0
-    is_twin = descriptors @ descriptors.T > 1 - (FARTHEST / 2) ** 2 / 2
+    is_twin = descriptors @ descriptors.T > 1 - (SIFT_DISTANCE / 2) ** 2 / 2
     is_twin &= np.linalg.norm(x_px[:, None] - x_px[None], axis=-1) > APART_PX
     return float((is_twin.sum(1) >= TWINS).mean())
 

@@ -18,9 +18,7 @@ from jcr.capture.documents.nested import require_short
 from jcr.capture.documents.table import MAX_BYTES, MAX_ITEMS, MAX_TABLES, Cell, Table, table_of
 from jcr.errors import InputError, shown
 
-_PICKLE = (
-    "a Python pickle, which may run programs; save numbers, np.save('poses.npy', np.array(poses, float))"
-)
+_PICKLE = "a Python pickle may run programs; save numbers, np.save('poses.npy', np.array(poses, float))"
 _MATLAB_OBJECT = (
     "a MATLAB object such as a table, a cell array or a struct; save a table with writetable(T,'poses.csv'), numbers "
     "with A = cat(3,T{:}); save('poses.mat','A')"
@@ -83,9 +81,7 @@ def _read_npy(file: Path, data: bytes) -> ndarray:
     if dtype.hasobject:
         raise InputError(f"{file}: {_PICKLE}")
     if math.prod(shape) > MAX_ITEMS or math.prod(shape) * dtype.itemsize > len(data):
-        raise InputError(
-            f"{file}: an array of shape {shown(shape)}, too large or cut off; save the poses alone"
-        )
+        raise InputError(f"{file}: array of shape {shown(shape)}, too large or cut off; save the poses alone")
     flat = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
     if dtype.kind == "U" and flat.size and flat.view(dtype.byteorder + "u4").max() > sys.maxunicode:
         raise ValueError("a text with numbers of no characters")  # with which Python fails later

@@ -63,9 +63,7 @@ def parse_content(file: Path, text: str, syntax: str) -> Any:
         place = f" at line {mark.line + 1}" if mark else ""
         _refuse(file, f"not YAML{place} ({str(getattr(error, 'problem', ''))[:80]}); correct it there")
     except json.JSONDecodeError as error:
-        _refuse(
-            file, f"not JSON at line {error.lineno}, column {error.colno} ({error.msg}); correct it there"
-        )
+        _refuse(file, f"not JSON at line {error.lineno}, column {error.colno} ({error.msg}); correct it")
     except RecursionError:
         _refuse(file, f"nested deeper than {MAX_DEPTH}; give a list of poses")
     return documents[0] if len(documents) == 1 else documents or None

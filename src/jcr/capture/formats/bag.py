@@ -24,7 +24,7 @@ from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture, FrameNames, Intrinsics
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -33,14 +33,14 @@ VIDEOS = {
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "ffmpeg",
 }
 """Types of video messages, and the transport of image_transport that decodes each."""
-SUFFIXES = (".bag", ".mcap", ".db3")
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 LATEST_NS = 2**62
 """Largest time stamp (ns): in the year 2116, far enough from the largest int64 for differences of two."""
 
 
 def recognises(path: Path) -> bool:
     """Test whether a path is a bag: a folder with a metadata.yaml, or a .bag, .mcap or .db3 file."""
-    return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
+    return (path / "metadata.yaml").is_file() or path.suffix.lower() in BAG_SUFFIXES
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
@@ -105,7 +105,9 @@ class _Bag:
         infos = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
         every = [c for c in reader.connections if c.msgtype == INFO]
         info = [c for name in infos for c in every if c.topic == name][:1]
-        if not info and len({c.topic for c in reader.connections if c.msgtype in IMAGES}) == 1 == len(every):
+        if not info and len({c.topic for c in reader.connections if c.msgtype in IMAGE_TYPES}) == 1 == len(
+            every
+        ):
             info = every  # the names of Foxglove's topics are free
         span = max(reader.end_time - reader.start_time, 1)
         wanted = [*self.images, *info, *_pose_connections(reader, options, path)]
@@ -226,7 +228,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
     """Return the topic of --camera-topic, or without that option the only topic with colour images."""
-    topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
+    topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGE_TYPES})
     videos = {c.topic: VIDEOS[c.msgtype] for c in reader.connections if c.msgtype in VIDEOS}
     asked = options.camera_topic or (next(iter(videos), "") if not topics else "")
     if (transport := videos.get(asked)) is not None:
@@ -256,9 +258,7 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
             )
             return [c for c in reader.connections if c.topic == topic]
         if not found:
-            raise InputError(
-                f"{path}: no /tf and no poses; give --urdf for joint states, or record tf as well"
-            )
+            raise InputError(f"{path}: no /tf and no poses; give --urdf for joint states, or record tf, too")
         return found
     topics = sorted({c.topic for c in reader.connections if c.msgtype == JOINTS})
     topic = chosen_name(topics, options.joint_topic, topics, f"{path}: the joint states", "--joint-topic")

@@ -173,7 +173,7 @@ def _camera(name: str, entry: CameraEntry, capture: Capture, where: str, used: S
         )
     if watches and entry.mount == "gripper":
         raise InputError(
-            f"{where}: is on the gripper, which the frames' camera watches; make a capture for each"
+            f"{where}: is on the gripper, which the frames' camera watches; make one capture each"
         )
     listed: Sequence[str | None] = entry.images or ()
     if entry.frames is not None:

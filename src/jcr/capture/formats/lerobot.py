@@ -29,7 +29,7 @@ from jcr.records.json_file import read_json, validated_content
 INFO = "meta/info.json"
 CARTESIAN = "observation.state.cartesian_position"
 """Key of the gripper pose in DROID: x, y, z (m), roll, pitch, yaw (rad) in the robot's base frame."""
-STATE = "observation.state"
+STATE_COLUMN = "observation.state"
 USUAL_BYTES, PACKED = 200_000_000, 20
 """Size in memory up to which columns are read from any file, and the largest ratio to the size of their file above it:
 images hardly pack, and a file of LeRobot has 100 MB. Zeros pack to a thousandth."""
@@ -114,11 +114,13 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     what = f"{path}: the wrist camera"
     camera = chosen_name(cameras, options.camera_topic, cameras, what, "--camera-topic")
     states = [key for key, feature in features.items() if feature.dtype.startswith("float")]
-    usual = [key for key in ((STATE,) if options.urdf else (CARTESIAN, STATE)) if key in states][:1]
+    usual = [
+        key for key in ((STATE_COLUMN,) if options.urdf else (CARTESIAN, STATE_COLUMN)) if key in states
+    ][:1]
     key = chosen_name(states, options.joint_topic, usual, f"{path}: the robot's state", "--joint-topic")
     if len(options.episode) != 1:
         raise InputError(
-            f"{path}: {count_of(len(options.episode), 'episode')}; read one, or several one by one with jcr batch"
+            f"{path}: {count_of(len(options.episode), 'episode')}; read one, or all by jcr batch"
         )
     ((index, *_), _) = episodes_of(path, options)
     episode = read_episode(path, info, camera, key, index)
@@ -166,9 +168,7 @@ def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> E
         raise InputError(f"{table}: not there, so there is no episode {index}; they are counted from 0")
     rows = _read_table(table, ["frame_index", "timestamp", key], index)
     if len(rows) > MOST_FRAMES:
-        raise InputError(
-            f"{table}: {len(rows):,} frames in episode {index}; {MOST_FRAMES:,} at most, choose another"
-        )
+        raise InputError(f"{table}: over {MOST_FRAMES:,} frames in episode {index}; choose another")
     rows = rows.to_pydict()
     time_s = _seconds(rows["timestamp"], f"{table}: timestamp of episode {index}")
     try:
@@ -191,9 +191,7 @@ def _seconds(values: Sequence[Any], where: str) -> Float[ndarray, " n"]:
     for row, value in enumerate(values):
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not abs(value) <= LATEST_S:
-            raise InputError(
-                f"{where}: {shown(value)} in row {row} is no time in seconds; choose another episode"
-            )
+            raise InputError(f"{where}: {shown(value)} in row {row} is no time (s); choose another episode")
     return np.array(values, np.float64)
 
 

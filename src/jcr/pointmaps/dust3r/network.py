@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-PATCH = 16
+from jcr.pointmaps.image_grid import PATCH
+
 Tokens = Float[Tensor, "b n c"]
 FeatureMap = Float[Tensor, "b c h w"]
 Rotary = Float[Tensor, "2 n 2 frequencies"]

@@ -24,7 +24,7 @@ PIXELS = 2048
 """Number of pixels used per image: the most confident one of each of as many equal cells."""
 DEPTH_CHUNK = 4096
 """Number of pixels processed at a time, so that their arrays stay in the cache."""
-CONTRADICTION = 4.0
+REPORTED_RATIO = 4.0
 """Ratio of a pair's residual to the median residual above which the user is told of the pair."""
 USELESS = 0.2
 """Median residual of the pairs, relative to the distance, above which the pairs do not belong together."""
@@ -109,7 +109,7 @@ def _dense_alignment(problem: AlignmentProblem, solution: AlignmentSolution, pro
     for o, noise in zip(solution.images, solution.noise, strict=True):
         np.maximum.at(residual, o.pair, np.sqrt(2 * noise.across**2 + noise.along**2))
     middle, notes, warnings = float(np.median(residual)), (), ()
-    if len(bad := np.flatnonzero(residual > CONTRADICTION * middle)):
+    if len(bad := np.flatnonzero(residual > REPORTED_RATIO * middle)):
         names = predictions.names
         pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""

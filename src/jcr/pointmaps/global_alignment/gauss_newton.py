@@ -27,11 +27,11 @@ from jcr.pointmaps.global_alignment.residuals import (
     residual_weights,
 )
 
-TOLERANCE = 1e-4
+STEP_TOLERANCE = 1e-4
 """Largest last step (rad, or relative), a tenth of the noise of the predictions."""
 WEIGHT_ROUNDS, STEPS = 30, 10
 """Largest number of estimates of the weights, and of Gauss-Newton steps with the same weights."""
-ENOUGH = 0.1
+REWEIGHTED_BELOW = 0.1
 """Relative change of the cost below which the weights are estimated again."""
 START_SPREAD = 0.01
 """Initial standard deviation of the pairs' errors, relative to the depth and in radians."""
@@ -90,7 +90,7 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
 
     About `pixels` pixels per image are used. Each round estimates the weights, and at its end the standard deviations
     of the pairs' errors (translation in recon units, rotation in rad). The rounds end when no entry of a camera pose,
-    log focal length or log pair scale changes by more than TOLERANCE. The first camera and the product of the pair
+    log focal length or log pair scale changes by more than STEP_TOLERANCE. The first camera and the product of the pair
     scales are fixed. Raises RejectedError where the pointmaps do not determine the unknowns.
     """
     images = problem.observe_all(pixels)
@@ -111,7 +111,7 @@ def solve(problem: AlignmentProblem, pixels: int) -> AlignmentSolution:
         spread = np.sqrt(squared / NORMAL_SQUARE_MEDIAN / np.maximum(determined, 0.01))
         pair_spread = np.repeat(np.maximum(spread, LEAST_SPREAD), 3)
         settled = all(
-            np.abs(getattr(at[0], name) - getattr(before, name)).max() < TOLERANCE
+            np.abs(getattr(at[0], name) - getattr(before, name)).max() < STEP_TOLERANCE
             for name in ("recon_from_camera", "log_focal", "log_pair_scale")
         )
         if settled:
@@ -169,7 +169,7 @@ def _least_squares(
 
     try:
         at, _, _ = damped_gauss_newton(
-            linearise, step, cost, begin, enough=lambda best: ENOUGH * best, iterations=STEPS
+            linearise, step, cost, begin, enough=lambda best: REWEIGHTED_BELOW * best, iterations=STEPS
         )
     except np.linalg.LinAlgError:
         raise RejectedError("the pointmaps of the pairs have too little in common to be aligned") from None
