@@ -95,7 +95,9 @@ def path_inside(folder: Path, name: str, where: str, *asked: Path) -> Path:
     except (OSError, RuntimeError):
         raise InputError(f"{where}: {shown(name)} is a link back to itself; put a file there") from None
     if not any(place.is_relative_to(root.resolve()) for root in (folder, *asked)):
-        raise InputError(f"{where}: {shown(name)} is a link out of {folder}; copy the file into it")
+        raise InputError(
+            f"{where}: {shown(name)} is a link that leads out of {folder}; copy the file into it"
+        )
     try:
         is_wrong = target.exists() and not target.is_file()  # opening a pipe would block for ever
     except OSError as error:  # a path that is too long as a whole

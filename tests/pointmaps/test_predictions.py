@@ -138,7 +138,7 @@ def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> 
     far = pointmaps["points_in_recon"].copy()
     far[1, 4, 4] = np.inf
     for message, arrays in {
-        "holds neither 'edges'": {"points": np.zeros(3)},
+        "without 'edges'": {"points": np.zeros(3)},
         "6 names for 5 images": {**pointmaps, "images": np.array(list("abcdef"))},
         "no image 'x.png' in the capture": {**pointmaps, "images": np.array([*capture.images[:4], "x.png"])},
         "2 images, the capture has 5": {name: values[:2] for name, values in pointmaps.items()},

@@ -362,7 +362,7 @@ def test_questions_and_clouds_that_make_no_sense_are_refused(scene: "SceneMap", 
     inverted, far = (0.4, -0.4, 0.0, -0.4, 0.4, 0.6), (3.0, 3.0, 3.0, 4.0, 4.0, 4.0)
     for words, points, options in (
         ("points lie in the workspace", cloud, replace(OPTIONS, workspace=far)),
-        ("minimum below", cloud, replace(OPTIONS, workspace=inverted)),
+        ("minima below", cloud, replace(OPTIONS, workspace=inverted)),
     ):
         with refused(words):
             build_scene(points, options)

@@ -118,7 +118,7 @@ def _rows(names: tuple[str, ...], count: int, capture: Capture, source: str) -> 
         return np.arange(count)
     if len(names) != count or len(set(names)) != count:
         raise InputError(
-            f"{source}: 'images' names {len(names)} of {count_of(count, 'image')}; give all names"
+            f"{source}: 'images' has {count_of(len(names), 'name')} for {count_of(count, 'image')}; give one each"
         )
     unknown = [name for name in names if name not in capture.images]
     if unknown:
