@@ -64,7 +64,7 @@ def test_an_angle_that_wraps_is_interpolated_the_shorter_way(tmp_path: Path, uni
 
 
 @pytest.mark.parametrize(("text", "dof", "words"), [
-    (URDF, 5, "no chain with 5 joints; give as many joints per frame as the arm has"),
+    (URDF, 5, "no chain with 5 joints; give one angle for each joint"),
     (URDF, 4, "joint grip is prismatic; errors of arms are modelled for rotating joints only"),
     (MIMIC, 3, "joint roll is coupled to another"),
 ])  # fmt: skip

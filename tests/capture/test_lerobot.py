@@ -126,7 +126,7 @@ def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: P
     got = jcr.read_capture(path, options, into=tmp_path / "frames")
     assert_paired(got, writers.arm_poses(angles))
     writers.assert_joints(got, angles)
-    with refused("if they are degrees, add --pose-units m-deg"):
+    with refused("for degrees add --pose-units m-deg"):
         options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0")
         jcr.read_capture(path, options, into=tmp_path / "more")
     with refused("pan, lift, roll, grip are no pose; give --urdf"):
@@ -163,7 +163,7 @@ def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: Han
     ("options", "words"),
     [
         ({"episode": (3,)}, "there is no episode 3; they are counted from 0"),
-        ({"episode": (0, 1)}, "2 episodes; read one, or several one by one with jcr batch"),
+        ({"episode": (0, 1)}, "2 episodes; read one, or all by jcr batch"),
         (
             {"camera_topic": "front"},
             "the wrist camera: front is not there; choose one with --camera-topic: observation.images.wrist",

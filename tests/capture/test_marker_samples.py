@@ -62,7 +62,7 @@ def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
         (tmp_path / "samples.yaml").write_text(
             f"- {{effector_wrt_world: {pose}, object_wrt_sensor: [1]}}\n" * 3
         )
-        with refused("effector_wrt_world: holds no poses"):
+        with refused("effector_wrt_world holds no poses"):
             read_source(tmp_path / "samples.yaml")
 
 

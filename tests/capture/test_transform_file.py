@@ -52,7 +52,7 @@ def test_several_or_no_transforms_are_refused(tmp_path: Path):
     with refused("several transforms"):
         read_transform(tmp_path / "two.xml")
     (tmp_path / "none.txt").write_text("hello\n1 2 3\n")
-    with refused("holds no transform"):
+    with refused("no transform"):
         read_transform(tmp_path / "none.txt")
 
 

@@ -20,7 +20,7 @@ from jcr.calibration.record import Calibration, read_calibration
 from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.cli.check_verify_compare import CheckCommand, _command_of_remedy
-from jcr.cli.map_query_export_view import PRINTED, read_points
+from jcr.cli.map_query_export_view import PRINTED_POINTS, read_points
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation, transform
 from jcr.live.session import SessionOptions
@@ -176,7 +176,7 @@ def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     answers = json.loads(answered.stdout)
     _, first, second, *more = run_jcr("query", done, points).stdout.splitlines()
     assert f": {1e3 * answers['distance'][0]:.1f} ± " in first and "outside of the mapped" in second
-    assert len(more) == PRINTED - 2
+    assert len(more) == PRINTED_POINTS - 2
     # High over the table everyone looked and saw nothing; nine metres away nobody did; points lie on surfaces.
     assert answers["occupancy"][0] < 0.5 and not answers["unknown"][0]
     assert answers["unknown"][1]

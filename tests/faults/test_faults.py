@@ -122,7 +122,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
     "calibration of a newer format": ("done/calibration.json", other_format, "compare done done", "format"),
     "no map": ("done/map.safetensors", Path.unlink, QUERY, "no map here"),
     "state that is a pipe": ("done/run.json", pipe, "map done --quiet", "a pipe or a device"),
-    "state that is a link to itself": ("done/run.json", linked_to_itself, "map done --quiet", "holds no run"),
+    "state that is a link to itself": ("done/run.json", linked_to_itself, "map done --quiet", "no run"),
     "cameras that are a pipe": (
         "done/reconstruction.npz",
         pipe,
@@ -285,5 +285,5 @@ def test_arrays_larger_than_the_memory_are_refused_unread(tmp_path: Path, monkey
     np.savez_compressed(file, about=np.array("{}"), image_index=np.zeros(1_000_000))
     assert file.stat().st_size < 20_000
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}[name])
-    with refused(r"reconstruction\.npz: unpacks to 0\.0 GB, this machine has 0\.0 GB"):
+    with refused(r"reconstruction\.npz: unpacks to 0\.0 GB of 0\.0 GB here"):
         read_reconstruction(file)

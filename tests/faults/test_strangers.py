@@ -420,7 +420,7 @@ def test_two_images_are_exported_to_two_files(tmp_path: Path, undistort: bool):
 
 @pytest.mark.parametrize(("images", "names", "words"), [
     ("left/1.png left/2.png left/3.png right/1.png", "1.png 2.png 3.png", "1.png could be"),
-    ("1.png 2.png 3.png", "a/1.png b/1.png 2.png 3.png", "could both be 1.png"),
+    ("1.png 2.png 3.png", "a/1.png b/1.png 2.png 3.png", "may both be 1.png"),
 ])  # fmt: skip
 def test_an_image_of_a_model_is_one_of_the_capture(tmp_path: Path, images: str, names: str, words: str):
     import pycolmap

@@ -277,7 +277,7 @@ def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
 
     thread, closed = threading.Thread(target=greet), states()
     thread.start()
-    with refused("not come from a UR"):
+    with refused("no packet of a UR"):
         next(states())
     thread.join(5)
     server.close()

@@ -205,7 +205,7 @@ def test_the_same_cameras_give_the_same_points(tabletop: Path, tmp_path: Path):
         off = np.linalg.norm(project(first.intrinsics, seen) - tracks.x_px[own], axis=1)
         assert np.median(off) < 1.0
     (model / "cameras.bin").write_bytes(b"nonsense")
-    with refused("not a readable COLMAP model"):
+    with refused("no readable COLMAP model"):
         reconstruct_given(capture, model)
 
 

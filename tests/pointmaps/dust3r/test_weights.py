@@ -259,7 +259,7 @@ def test_file_round_trip_and_faults(tmp_path: Path) -> None:
         "negative": {"conf": arrays["conf"] - 3}, "must join two": {"edges": edges + 1},
         "must be integers": {"edges": edges / 1.0}, "fx, fy, cx, cy": {"intrinsics": np.zeros(4)},
         "grid must be": {"grid": np.zeros((4, 2), int)}, "colors must be": {"colors": arrays["colors"][:2]},
-        "must be numbers of shape E H W 3": {"pts3d": arrays["pts3d"][0]},
+        "give numbers E H W 3": {"pts3d": arrays["pts3d"][0]},
     }  # fmt: skip
     for message, change in spoilt.items():
         np.savez(path, **{k: v for k, v in {**arrays, **change}.items() if v is not None})
