@@ -28,7 +28,7 @@ from jcr.records import CellCamera, Intrinsics
 from jcr.result import RunOptions
 from places import SHARED
 from scenes import png_names
-from simulation.problems import TARGET_IN_BASE, HandEyeProblem, hand_eye_problem
+from simulation.problems import TARGET_IN_BASE, hand_eye_problem
 
 pytestmark = pytest.mark.slow
 
@@ -96,22 +96,22 @@ def photographed(sheet: np.ndarray, base_from_camera: np.ndarray, seed: int) -> 
     return np.repeat(grey[..., None], 3, axis=2)
 
 
+PROBLEM = hand_eye_problem(np.random.default_rng(3), 8)
+
+
 @cache
-def photographs(sheet: Callable[[], np.ndarray]) -> tuple[HandEyeProblem, list[np.ndarray]]:
-    """Eight views and their images; each image is drawn once for all tests."""
-    problem = hand_eye_problem(np.random.default_rng(3), 8)
-    base_from_camera = problem.base_from_gripper @ problem.gripper_from_camera
-    return problem, [photographed(sheet(), pose, k) for k, pose in enumerate(base_from_camera)]
+def photograph(sheet: Callable[[], np.ndarray], k: int) -> np.ndarray:
+    """One of eight views of a sheet, drawn once for all tests."""
+    return photographed(sheet(), PROBLEM.base_from_gripper[k] @ PROBLEM.gripper_from_camera, k)
 
 
 def capture_of(folder: Path, sheet: Callable[[], np.ndarray], count: int = 8, known_intrinsics: bool = True):
     """A capture of the sheet's first views, and the true gripper_from_camera."""
-    problem, images = photographs(sheet)
-    for name, image in zip(png_names(count), images[:count], strict=True):
-        write_bytes(folder / name, encode_png(image))
+    for k, name in enumerate(png_names(count)):
+        write_bytes(folder / name, encode_png(photograph(sheet, k)))
     camera = INTRINSICS if known_intrinsics else None
-    capture = scenes.capture_of(problem.base_from_gripper[:count], folder=folder, intrinsics=camera)
-    return capture, problem.gripper_from_camera
+    capture = scenes.capture_of(PROBLEM.base_from_gripper[:count], folder=folder, intrinsics=camera)
+    return capture, PROBLEM.gripper_from_camera
 
 
 def test_calibrates_from_tags(tmp_path):
