@@ -79,13 +79,8 @@ def path_inside(folder: Path, name: str, where: str, *asked: Path) -> Path:
         longest = max(len(part.encode()) for part in parts)
     except ValueError:  # an empty name, or half of a surrogate pair
         longest = LONGEST + 1
-    if (
-        "\0" in name
-        or "\n" in name
-        or longest > LONGEST
-        or len(name) > LONGEST_PATH
-        or Path(name).is_absolute()
-    ):
+    is_odd = "\0" in name or "\n" in name or Path(name).is_absolute()
+    if is_odd or longest > LONGEST or len(name) > LONGEST_PATH:
         raise InputError(f"{where}: {shown(name)} is no path inside the capture; name a file under {folder}")
     if ".." in parts:  # no file need be there yet, whose place could be resolved
         raise InputError(f"{where}: {shown(name)} leads out of {folder} (..); copy the file into it")

@@ -101,8 +101,14 @@ def _slowest(moving: list[Rows], speed: Float[ndarray, " n"], count: int) -> lis
 
 
 def _frames_of_views(views: Rows, base_from_gripper: Poses, at_rest: Bool[ndarray, " n"], count: int) -> Rows:
-    """Return the rows of up to `count` of n `views` that minimise the predicted uncertainty, those at rest first."""
-    information = _pose_information(base_from_gripper)
+    """Return the rows of up to `count` of n `views` that minimise the predicted uncertainty, those at rest first.
+
+    X is assumed to be the identity, the reconstruction frame, which is arbitrary, is the base frame, in metres, and the
+    poses have the random errors ASSUMED_NOISE (m, rad).
+    """
+    _, j = pose_residuals(np.eye(4), 1.0, np.eye(4), base_from_gripper, base_from_gripper)
+    j /= np.repeat(ASSUMED_NOISE, 3)[:, None]
+    information = np.swapaxes(j, 1, 2) @ j
     frames, known = np.zeros(0, int), WEAK_PRIOR * np.eye(13)
     for of_kind in (at_rest, ~at_rest):
         gain = information[of_kind]
@@ -111,24 +117,13 @@ def _frames_of_views(views: Rows, base_from_gripper: Poses, at_rest: Bool[ndarra
     return frames
 
 
-def _pose_information(base_from_gripper: Poses) -> Float[ndarray, "n 13 13"]:
-    """Return the information matrix of X (6), log scale and base_from_recon (6) by each of n gripper poses.
-
-    X is gripper_from_camera, assumed to be the identity. Both transforms have the order translation (m), rotation
-    vector (rad). The poses have the random errors ASSUMED_NOISE (m, rad). The reconstruction frame is arbitrary; here
-    it is the base frame, in metres.
-    """
-    _, j = pose_residuals(np.eye(4), 1.0, np.eye(4), base_from_gripper, base_from_gripper)
-    j /= np.repeat(ASSUMED_NOISE, 3)[:, None]
-    return np.swapaxes(j, 1, 2) @ j
-
-
 def _most_informative(
     gain: Float[ndarray, "n 13 13"], before: Float[ndarray, "13 13"], count: int
 ) -> list[int]:
     """Return the indices of up to `count` of n poses, best first, by greedy selection.
 
-    `gain` are the information matrices of the poses, `before` is that of earlier ones. Each choice reduces most the sum
+    `gain` are the information matrices of X (6: m, rad), log scale and base_from_recon (6) by each pose, `before` is
+    that of earlier ones. Each choice reduces most the sum
     of the variances of gripper_from_camera and log scale in units of 1 mm, 0.1° and 0.2 % (A-optimal design: Pukelsheim,
     Optimal Design of Experiments, 1993, chapter 9).
     """

@@ -186,11 +186,8 @@ class LiveCalibration:
         rows = np.zeros(0, int) if made is None else made.image_index
         robot, case = robot_errors(capture, self._options), None
         findings = [self._blurred[name] for name in names if name in self._blurred]
-        for row in (
-            sorted(set(range(len(names))) - set(self._map.registered))
-            if len(names) >= MIN_PREDICTED_IMAGES
-            else ()
-        ):
+        missing = sorted(set(range(len(names))) - set(self._map.registered))
+        for row in missing if len(names) >= MIN_PREDICTED_IMAGES else ():
             matches = float(self._map.matched_with(row))
             kind = FindingKind.NOT_REGISTERED
             findings.append(Finding.of(kind, "warns", "images", names[row], value=matches))

@@ -70,11 +70,8 @@ class NewImages:
                 raise InputError(f"{name}: {image.dtype} of shape {image.shape}; give RGB (h, w, 3) of uint8")
         poses = np.asarray(base_from_gripper, np.float64)
         angles = None if joints is None else np.asarray(joints, np.float64)
-        if (
-            not pixels
-            or poses.shape != (len(pixels), 4, 4)
-            or (angles is not None and len(angles) != len(pixels))
-        ):
+        has_angles = angles is None or len(angles) == len(pixels)
+        if not pixels or poses.shape != (len(pixels), 4, 4) or not has_angles:
             raise InputError(
                 f"{count_of(len(pixels), 'image')} , poses of shape {poses.shape}; give (n, 4, 4)"
             )

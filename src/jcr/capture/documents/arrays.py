@@ -100,10 +100,8 @@ def _read_npz(file: Path, data: bytes) -> dict[str, ndarray]:
             raise InputError(f"{file}: an archive; unpack it")
         if sum(member.file_size for member in members.values()) > MAX_BYTES:
             raise InputError(f"{file}: more than {MAX_BYTES // 1_000_000} MB; save the poses alone")
-        if any(
-            member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-            for member in members.values()
-        ):
+        methods = {member.compress_type for member in members.values()}
+        if not methods <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             raise InputError(f"{file}: a compression that NumPy does not write; save it with numpy.savez")
         arrays = dict[str, ndarray]()
         for name, member in members.items():
