@@ -89,11 +89,9 @@ def test_a_moved_episode_camera_is_named(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert not moved["0"].reason and "differs by 20.0 mm" in moved["2"].reason
     page = (tmp_path / "out" / "summary.html").read_text()
     for words in (
-        "differs by 20.0 mm",
-        "A: episodes 0 to 1",
-        "B: episode 2",
+        "differs by 20.0 mm", "A: episodes 0 to 1", "B: episode 2",
         "moved by 20.0 mm and 0.00° between episodes 1 and 2",
-    ):
+    ):  # fmt: skip
         assert words in page
     assert [moved[k].camera for k in "012"] == ["A", "A", "B"]
 

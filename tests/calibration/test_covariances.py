@@ -42,10 +42,8 @@ def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: p
     content["uncertainty"]["covariance"] = made(covariance).tolist()
     (tmp_path / "calibration.json").write_text(json.dumps(content))
     for command in (
-        ["compare", tmp_path, ACCEPTED],
-        ["compare", ACCEPTED, tmp_path],
-        ["export", tmp_path, "urdf"],
-    ):
+        ["compare", tmp_path, ACCEPTED], ["compare", ACCEPTED, tmp_path], ["export", tmp_path, "urdf"],
+    ):  # fmt: skip
         assert dispatch([str(word) for word in command]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "calibration.json" in line and words in line

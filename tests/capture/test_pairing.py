@@ -164,11 +164,8 @@ def test_clocks_that_differ_otherwise_are_named_with_the_difference():
 
 def test_names_without_stamps_have_none():
     for names in (
-        ["a.png", "b.png"],
-        ["1.png", "2.png"],
-        ["img_0001.png", "img_0002.png"],
-        ["1700000000.png"] * 2,
-    ):
+        ["a.png", "b.png"], ["1.png", "2.png"], ["img_0001.png", "img_0002.png"], ["1700000000.png"] * 2,
+    ):  # fmt: skip
         assert stamps_of_names(names) is None
 
 

@@ -26,7 +26,6 @@ from jcr.geometry import scale_translation, transform
 from jcr.live.session import SessionOptions
 from jcr.pipeline import run
 from jcr.records import Requirement
-from jcr.result import RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.options import MapOptions
 from places import ROOT
@@ -138,13 +137,10 @@ def test_exit_status_and_last_line_of_a_capture(images, found, until_accurate, s
         assert printed[0].startswith("ACCEPTED" if found.converged else "REJECTED")
 
 
-def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture, small_done, tmp_path, monkeypatch):
+def test_a_map_without_depth_adds_depth_of_a_whole_run(small_capture: Path, small_done: Path, tmp_path: Path):
     capture, stages = jcr.read_capture(small_capture), list[str]()
     shutil.copytree(small_done, tmp_path / "whole")
-    sparse = replace(RunResult(small_done).reconstruction, pointmaps=None)
-    with monkeypatch.context() as matched:
-        matched.setattr("jcr.pipeline.backend_selection.reconstruct", lambda *_: sparse)
-        jcr.calibrate(capture, tmp_path / "out")
+    jcr.calibrate(capture, tmp_path / "out")
     options = MapOptions(max_seconds=1.0, cell=0.03)
     mapped = jcr.build_map(tmp_path / "out", map=options, progress=lambda stage, share: stages.append(stage))
     assert "dense depth" in stages and "matching" not in stages

@@ -588,13 +588,8 @@ def test_a_rejected_calibration_is_exported_by_force_with_its_reason_in_every_fi
     run = tmp_path / "run"
     run.mkdir()
     for name in (
-        "cloud.ply",
-        "map.safetensors",
-        "reconstruction.npz",
-        "run.json",
-        "uncertainty.npz",
-        "depth.npz",
-    ):
+        "cloud.ply", "map.safetensors", "reconstruction.npz", "run.json", "uncertainty.npz", "depth.npz",
+    ):  # fmt: skip
         (run / name).symlink_to(done / name)
     content = json.loads((done / "calibration.json").read_text())
     findings = [

@@ -3,7 +3,6 @@
 Faults of captures are in tests/capture/test_capture.py, those of weights in tests/pointmaps/dust3r/test_weights.py.
 """
 
-import hashlib
 import json
 import os
 import re
@@ -31,6 +30,7 @@ from jcr.geometry import scale_translation
 from jcr.pipeline import stages
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.result import RunResult
+from places import contents
 from refusal import refused
 from simulation.problems import hand_eye_problem
 from waiting import until
@@ -134,27 +134,18 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str, str]] = {
 """File, its change, the command, and words of its error."""
 
 
-def state(folder: Path) -> dict[str, str]:
-    """What every file in a folder holds."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_ends_in_one_line_and_harms_nothing(place: Path, fault: str, monkeypatch, capsys):
     file, change, command, words = FAULTS[fault]
     monkeypatch.chdir(place)
     Path("points.csv").write_text("x,y,z\n0.4,0,0.2\n")
     change(place / file)
-    before = state(place)
+    before = contents(place)
     assert dispatch(command.split()) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and said.count("\n") == 1 and re.search(words, said), said
     # Nothing half-written is left, no empty folder, and no code of a file was run.
-    assert state(place) == before and not Path("out").is_dir()
+    assert contents(place) == before and not Path("out").is_dir()
 
 
 @pytest.mark.parametrize("name", ["reconstruction.npz", "depth.npz"])
@@ -162,11 +153,11 @@ def test_a_damaged_reconstruction_is_named_others_stay(tmp_path: Path, small_don
     copy = tmp_path / "done"
     shutil.copytree(small_done, copy)
     cut(copy / name)
-    before = state(copy)
+    before = contents(copy)
     assert dispatch(["map", str(copy), "--quiet"]) == 2
     said = capsys.readouterr().err
     assert f"{name}: damaged" in said and said.count("\n") == 1
-    assert state(copy) == before
+    assert contents(copy) == before
 
 
 @pytest.mark.usefixtures("nothing_found")
@@ -209,11 +200,11 @@ def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, small_done: Path
     try:
         shutil.copytree(small_done, disk, dirs_exist_ok=True)
         (disk / "filler").write_bytes(b"x" * (1 << 20))
-        before = state(disk)
+        before = contents(disk)
         assert dispatch(["map", str(disk), "--max-seconds", "1", "--quiet"]) == 2
         said = capsys.readouterr().err
         assert "No space left" in said and said.count("\n") == 1
-        changed = {name for name, digest in state(disk).items() if before.get(name) != digest}
+        changed = {name for name, digest in contents(disk).items() if before.get(name) != digest}
         assert changed <= {"calibration.json", "log.txt", "run.json"}, "a result was lost or is half-written"
         assert read_calibration(disk).converged
     finally:

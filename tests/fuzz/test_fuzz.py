@@ -234,14 +234,8 @@ def test_a_reconstruction_of_other_numbers_is_refused_or_has_its_points(targets:
     for name, array in ((name, array) for name, array in arrays.items() if array.dtype.kind in "if"):
         whole = array.astype(np.int64)
         for other in (
-            array[:0],
-            array[:-1],
-            -array - 1,
-            array * np.nan,
-            array.astype(str),
-            whole + 10**6,
-            array[None],
-        ):
+            array[:0], array[:-1], -array - 1, array * np.nan, array.astype(str), whole + 10**6, array[None],
+        ):  # fmt: skip
             file = targets["reconstruction.npz"].file.with_name("other.npz")
             np.savez(file, allow_pickle=False, **arrays | {name: other})
             try:
