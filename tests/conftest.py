@@ -19,7 +19,6 @@ import shape_checks
 from chromium import Chromium
 from in_process import run_jcr
 from jcr.backends import Backend
-from jcr.errors import RejectedError
 from jcr.geometry import apply, transform
 from places import ROOT, SHARED
 from sift_once import find_sift_once
@@ -123,16 +122,6 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
     monkeypatch.setattr("jcr.backends.xfeat_is_installed", lambda: "xfeat" in names)
     return names
-
-
-@pytest.fixture
-def nothing_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every back end reject its images at once, as COLMAP rejects images of noise after seconds."""
-
-    def reject(*_: object) -> NoReturn:
-        raise RejectedError("0 of 5 images registered")
-
-    monkeypatch.setattr("jcr.pipeline.backend_selection.reconstruct", reject)
 
 
 @pytest.fixture(scope="session")

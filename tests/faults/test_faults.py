@@ -160,7 +160,6 @@ def test_a_damaged_reconstruction_is_named_others_stay(tmp_path: Path, small_don
     assert contents(copy) == before
 
 
-@pytest.mark.usefixtures("nothing_found")
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, small_done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(small_done, out)

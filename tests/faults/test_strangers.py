@@ -80,14 +80,13 @@ def table_capture(folder: Path, named: Callable[[str], str]) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("nothing_found")
 def test_no_name_in_a_file_is_written_outside_of_the_run_folder(tmp_path, capsys):
     """The names lead out of the capture and back in, and out of the run folder for good."""
     capture = table_capture(tmp_path / "in/cap", lambda name: f"../../in/cap/{name}")
     (tmp_path / "results/deep").mkdir(parents=True)
     before = contents(tmp_path)
     made = tmp_path / "results/deep/out"
-    # The images are found by their last names inside the capture, and rejected.
+    # The images are found by their last names inside the capture, and noise is rejected.
     assert dispatch(["calibrate", str(capture), str(made), "--backend", "colmap", "--quiet"]) == 3
     capsys.readouterr()
     after = contents(tmp_path)
