@@ -131,7 +131,7 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
 
 def test_an_adopted_effect_keeps_earlier_findings_and_states_whether_its_adjustment_settled(monkeypatch):
     capture, reconstruction = reconstructed(
-        faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0]), estimated=False
+        faulty_capture(np.random.default_rng(3), 8, NAMED["zoom"][0]), estimated=False
     )
     robot, options = errors_of(capture.base_from_gripper), CalibrateOptions()
     start = fitted_case(capture, reconstruction, options, robot)

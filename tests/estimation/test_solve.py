@@ -24,7 +24,7 @@ NOISE = (5e-4, np.radians(0.1))
 
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_exact_poses_give_the_exact_answer(count):
-    for seed in range(4):
+    for seed in range(2):
         problem = hand_eye_problem(np.random.default_rng(seed), count)
         x, scale, _ = closed_form(problem.base_from_gripper, problem.recon_from_camera)
         assert np.abs(error(problem, x, scale)).max() < 1e-7
