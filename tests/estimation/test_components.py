@@ -169,5 +169,5 @@ def test_motions_that_determine_nothing_leave_a_covariance_and_a_reason():
         assert values.min() > -1e-9 * values.max()
         turned = gripper @ transform(rotation_exp(rng.uniform(-1, 1, (count, 1)) * [0, 0, 1]), np.zeros(3))
         for poses_of, scale in ((gripper, None), (gripper, 1.0), (turned, 1.0), (gripper[[0] * count], None)):
-            found = jcr.solve_hand_eye(poses_of, poses_of @ offset, scale=scale)
+            found = solve_hand_eye(poses_of, poses_of @ offset, scale=scale)
             assert found.verdict == "rejected" and "unobservable" in str(found.doubt)
