@@ -27,7 +27,7 @@ from jcr.records import Capture, Reading
 
 POSE_WORDS = re.compile(r"pos|tcp|robot|ee|arm|hand|flange|matri|end|gripper", re.IGNORECASE)
 """Parts of names of files that probably hold the poses."""
-ROUNDING = 1e-4
+SAME_POSES = 1e-4
 """Largest difference (m, and of the entries of a rotation) of the same poses in two files with rounded numbers."""
 _Poses = Float[ndarray, "r 4 4"]
 
@@ -99,7 +99,7 @@ def _without_copies(sources: list[_Source]) -> list[_Source]:
     for source in sorted(sources, key=lambda one: len(one.candidates)):
         known = [poses for one in kept for _, poses in one.candidates]
         is_copy = any(
-            poses.shape == other.shape and np.allclose(poses, other, rtol=0, atol=ROUNDING, equal_nan=True)
+            poses.shape == other.shape and np.allclose(poses, other, rtol=0, atol=SAME_POSES, equal_nan=True)
             for _, poses in source.candidates
             for other in known
         )

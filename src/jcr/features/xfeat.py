@@ -32,7 +32,7 @@ LONG_SIDE_PX = 1024
 """Largest long side of an image in which keypoints are found, px; larger images are reduced to it."""
 XFEAT_KEYPOINTS = 800
 """Largest number of keypoints of an image; with 1280 a pair takes twice the time, and X is no more accurate."""
-CELL_PX = 8
+OUTPUT_CELL = 8
 """Side, px, of the cells of the network's keypoint output."""
 MULTIPLE = 32
 """Divisor, px, of the image sides that the network accepts."""
@@ -93,7 +93,7 @@ def detect(
     to the centroid of its 3x3 neighbourhood in the heat map, because calibration needs fractions of a pixel.
     """
     features, logits, reliability = network(image[None])
-    heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL_PX**2], CELL_PX)
+    heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : OUTPUT_CELL**2], OUTPUT_CELL)
     is_peak = (heat == F.max_pool2d(heat, 5, stride=1, padding=2)) & (heat > LEAST_SCORE)
     is_peak[..., :2, :] = is_peak[..., -2:, :] = is_peak[..., :2] = is_peak[..., -2:] = False
     y, x = is_peak[0, 0].nonzero(as_tuple=True)

@@ -37,7 +37,7 @@ from jcr.photometric.coarse_to_fine import (
 )
 from jcr.photometric.hand_eye_search import HEIGHTS, search
 from jcr.photometric.residuals import (
-    LEAST_CONTRAST,
+    LOCATED_FROM,
     Cameras,
     Level,
     Points,
@@ -133,7 +133,7 @@ def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
     The brightness of two images is compared at points of one that the other shows within twice BEFORE_GAINS.sigma. The
     logs of the factors have mean 0.
     """
-    factor, dark, images = np.ones(level.count), 10 * LEAST_CONTRAST, np.arange(level.count)
+    factor, dark, images = np.ones(level.count), 10 * LOCATED_FROM, np.arange(level.count)
     for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
         _, points = align_photometrically(even, cameras, BEFORE_GAINS, np.zeros((7, 0)))

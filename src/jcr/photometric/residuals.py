@@ -23,7 +23,7 @@ SEEN_BY = 0.6
 """Share of the other images, those of least cost, that the cost of a depth counts; others may not see the point."""
 LEAST_DEPTH = 0.05
 """Least depth of a point in front of a camera, m."""
-LEAST_CONTRAST = 2.0 / 255
+LOCATED_FROM = 2.0 / 255
 """Change of colour (0 to 1) per pixel below which a pixel has too little contrast to be located."""
 _BORDER_PX = 2
 _KEEP_DEPTH = 1e-3
@@ -125,7 +125,7 @@ def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[
     """Return image row and pixel (u, v) of k strong edges, at most `per_image` in each image.
 
     Each is the pixel of the largest change of colour in a square block. The blocks with the largest changes are taken;
-    changes below LEAST_CONTRAST per pixel are left out.
+    changes below LOCATED_FROM per pixel are left out.
     """
     n, h, w = level.count, level.grid.height, level.grid.width
     block = max(2, int(np.sqrt(h * w / (3 * per_image))))
@@ -137,7 +137,7 @@ def strong_edges(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[
     blocks = blocks.swapaxes(2, 3).reshape(n, rows * columns, block * block)
     inside, best = blocks.argmax(-1), blocks.max(-1)
     cell = np.argsort(-best, axis=1, kind="stable")[:, :per_image]
-    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > LEAST_CONTRAST**2)
+    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > LOCATED_FROM**2)
     cell = cell[host, rank]
     inside = inside[host, cell]
     u, v = cell % columns * block + inside % block, cell // columns * block + inside // block

@@ -73,7 +73,7 @@ class NewImages:
         has_angles = angles is None or len(angles) == len(pixels)
         if not pixels or poses.shape != (len(pixels), 4, 4) or not has_angles:
             raise InputError(
-                f"{count_of(len(pixels), 'image')} , poses of shape {poses.shape}; give (n, 4, 4)"
+                f"{count_of(len(pixels), 'image')}, poses of shape {poses.shape}; give (n, 4, 4)"
             )
         for name, pose in zip(names, poses, strict=True):
             require_rigid(pose, f"base_from_gripper of {name}")
